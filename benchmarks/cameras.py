@@ -2,10 +2,10 @@
 
     python benchmarks/cameras.py FOLDER CAPTURE... [--preset static] [--seed 0] [--refine never,always,auto] [key=value]
 
-In a copy of each capture (those with transforms*.json) the cameras of all training pictures are turned by 0.5 degrees
+In a copy of each capture (those with transforms*.json) the cameras of all training images are turned by 0.5 degrees
 around a random axis and shifted in a random direction by 1 % of their mean distance from their middle; test cameras
-stay. The preset is trained on the capture as it is and on the copy, and scored on the test pictures: from their given
-poses, and from poses refined on the pictures themselves. FOLDER keeps copies and runs, which are reused.
+stay. The preset is trained on the capture as it is and on the copy, and scored on the test images: from their given
+poses, and from poses refined on the images themselves. FOLDER keeps copies and runs, which are reused.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.files.write import write_text
 from dyngs.runs.checkpoint import load_run
 
-DEGREES, SHARE = 0.5, 0.01
+DEGREES, FRACTION = 0.5, 0.01
 
 
 def disturb(capture: Path, out: Path, seed: int) -> None:
@@ -31,7 +31,7 @@ def disturb(capture: Path, out: Path, seed: int) -> None:
     shutil.copytree(capture, out)
     views = read_capture(DataConfig(root=out)).splits["train"]
     centers = np.stack([np.linalg.inv(view.cam_from_world)[:3, 3] for view in views])
-    shift = SHARE * float(np.linalg.norm(centers - centers.mean(0), axis=1).mean())
+    shift = FRACTION * float(np.linalg.norm(centers - centers.mean(0), axis=1).mean())
     trained_on, random = {view.image_path.resolve() for view in views}, np.random.default_rng(seed)
     for path in sorted(out.glob("transforms*.json")):
         content = json.loads(path.read_text())

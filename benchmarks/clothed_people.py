@@ -65,7 +65,7 @@ RADIUS, TRAVEL = 3.0, 0.3
 TRAINING_HEIGHTS, TEST_HEIGHTS = (0.9, 1.6), (0.6, 1.25, 1.9, 1.45)
 """Heights of the cameras in their order around the ring, repeated, m."""
 MARGIN = 0.03
-"""Least distance of the person to the border of a picture, as a share of its width."""
+"""Least distance of the person to the border of an image, as a fraction of its width."""
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("ankle", "foot"))
 LIMBS += (("shoulder", "elbow"), ("elbow", "wrist"), ("wrist", "middle1"))
 LIMBS += tuple((f"{f}{i}", f"{f}{i + 1}") for f in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2))
@@ -234,7 +234,7 @@ def _nearest(ours: np.ndarray, theirs: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @dataclass(frozen=True)
 class Lens:
-    """Square pictures of ``size`` pixels, centred, of focal length ``focal`` in pixels."""
+    """Square images of ``size`` pixels, centred, of focal length ``focal`` in pixels."""
 
     size: int
     focal: float
@@ -322,16 +322,16 @@ class Shots:
 
 
 def write_split(out: Path, split: str, avatar: Avatar, shots: Shots, lens: Lens, light: Light) -> list[float]:
-    """Write pictures and JSON of a split; return the overlap of the fit's silhouette with each mask."""
+    """Write images and JSON of a split; return the overlap of the fit's silhouette with each mask."""
     body, clip, frames, overlaps = default_template(), shots.clip, [], []
     fit = posed_vertices(body, shots.fit.poses, shots.fit.trans, scale=shots.fit.scale).double().numpy()
     for i in range(len(clip.joints)):
         posed = posed_mesh(avatar, clip.rotations[i], clip.joints[i])
         for camera, pose in shots.cameras.items():
             name = f"images/{split}/f{i:03d}_c{camera:02d}.png"
-            picture = draw(avatar, posed, pose, lens, light)
-            write_image(out / name, picture)
-            mask, other = picture[..., 3] >= 0.5, covered(body, fit[i], pose, lens)
+            image = draw(avatar, posed, pose, lens, light)
+            write_image(out / name, image)
+            mask, other = image[..., 3] >= 0.5, covered(body, fit[i], pose, lens)
             overlaps.append(float((mask & other).sum() / (mask | other).sum()))
             entry: dict[str, object] = {"file_path": name, "frame": i, "camera": camera}
             frames.append(entry | {"time": i / max(len(clip.joints) - 1, 1), "transform_matrix": pose.tolist()})
@@ -368,7 +368,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--gamma", type=float, default=1.0, help="power of the textures' values; below 1 for dark clothes"
     )
-    parser.add_argument("--size", type=int, default=400, help="of the pictures, pixels")
+    parser.add_argument("--size", type=int, default=400, help="of the images, pixels")
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--new-frames", type=int, default=8)
     return parser.parse_args()
@@ -393,7 +393,7 @@ def main() -> None:
         shots = Shots(seen_by[ring_of], clips[which], fits[which])
         overlaps = write_split(given.out, split, avatar, shots, lens, light)
         iou[split] = {"mean": round(fmean(overlaps), 4), "min": round(min(overlaps), 4), "images": len(overlaps)}
-        print(f"{split}: {len(overlaps)} pictures, overlap of the fit {fmean(overlaps):.3f}", flush=True)
+        print(f"{split}: {len(overlaps)} images, overlap of the fit {fmean(overlaps):.3f}", flush=True)
     for split, motion in fits.items():
         write_amass(motion, given.out / f"body_{split}.npz")
     joints = {split: truth(avatar, clip) for split, clip in clips.items()}

@@ -2,11 +2,11 @@
 
     python benchmarks/exposure.py FOLDER CAPTURE... [--seed 0] [--exposure never,always,auto] [key=value ...]
 
-In a copy of each capture every training picture has its own random gain (0.6 to 1.6) and white balance (each channel
-0.85 to 1.18), applied to the stored values and cut off at white as a camera does; test pictures are as they were. The
+In a copy of each capture every training image has its own random gain (0.6 to 1.6) and white balance (each channel
+0.85 to 1.18), applied to the stored values and cut off at white as a camera does; test images are as they were. The
 preset (static, with the overrides) is trained on the capture as it is and on the copy. All are measured on the same
-untouched test pictures: as they are, after one affine colour for all of them (the scene has the colours of the mean
-picture), and right halves after an affine colour fitted on left halves. FOLDER keeps copies and runs, which are reused.
+untouched test images: as they are, after one affine colour for all of them (the scene has the colours of the mean
+image), and right halves after an affine colour fitted on left halves. FOLDER keeps copies and runs, which are reused.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ import numpy as np
 import torch
 from disturbed import Study, print_table
 
-from dyngs.colour.affine import fitted_affine, recoloured
 from dyngs.config import Config, DataConfig
-from dyngs.data.loader import PictureLoader
-from dyngs.data.pictures.images import read_picture
+from dyngs.data.images.images import read_image
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.report import split_views
 from dyngs.files.write import write_image
+from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.scene import render_options
 from dyngs.metrics import psnr
 from dyngs.runs.checkpoint import load_run
-from dyngs.scene import render_options
 from dyngs.training.background import evaluation_background
 
 GAINS, WHITE_BALANCE = (0.6, 1.6), (0.85, 1.18)
 
 
 def disturb(capture: Path, out: Path, seed: int) -> None:
-    """Write a copy of ``capture`` whose training pictures have a gain and a white balance of their own."""
+    """Write a copy of ``capture`` whose training images have a gain and a white balance of their own."""
     shutil.copytree(capture, out)
     random = np.random.default_rng(seed)
     for view in read_capture(DataConfig(root=out)).splits["train"]:
         gain = _between(random, GAINS, 1) * _between(random, WHITE_BALANCE, 3)
-        pixels = read_picture(view.image_path).numpy().astype(np.float32)
+        pixels = read_image(view.image_path).numpy().astype(np.float32)
         pixels[..., :3] = np.clip(pixels[..., :3] * gain, 0, 255)
         write_image(view.image_path, np.round(pixels).astype(np.uint8))
 
@@ -53,20 +53,20 @@ def _between(random: np.random.Generator, limits: tuple[float, float], count: in
 
 @torch.no_grad()
 def scores(run: Path) -> list[str]:
-    """Return the cells of a run: what was used, and PSNR of test pictures.
+    """Return the cells of a run: what was used, and PSNR of test images.
 
     As they are, after one affine colour for all, of halves as they are, and of halves fitted.
     """
     loaded = load_run(run)
     config: Config = loaded.config
     capture = read_capture(config.data)
-    pictures = PictureLoader(split_views(capture, "test"), config.data)
+    images = ImageLoader(split_views(capture, "test"), config.data)
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     options = render_options(config.model)
     shown = []
-    for picture in (pictures[i] for i in range(len(pictures))):
-        rendering = loaded.scene.render(picture.cameras, picture.time, options=options, background=background)
-        shown.append((picture, rendering))
+    for image in (images[i] for i in range(len(images))):
+        rendering = loaded.scene.render(image.cameras, image.time, options=options, background=background)
+        shown.append((image, rendering))
     one = fitted_affine(shown, background)
     plain = [psnr(r.rgb[0], p.composite(background), p.mask) for p, r in shown]
     fitted = [psnr(recoloured(one, p, r, background), p.composite(background), p.mask) for p, r in shown]
@@ -77,7 +77,7 @@ def scores(run: Path) -> list[str]:
 
 STUDY = Study(
     text=__doc__ or "",
-    worse="pictures",
+    worse="images",
     given="untouched",
     key="train.exposure",
     disturb=disturb,

@@ -1,10 +1,10 @@
-"""Rendering on a CUDA card, forward and backward, beside gsplat where it is installed.
+"""Rendering on a CUDA GPU, forward and backward, beside gsplat where it is installed.
 
     python benchmarks/gpu.py [--points garden.npz | --splat FILE] [--gaussians N ..] [--sizes WxH ..] [--repeats 50]
 
 Both are called with the same arguments (gsplat 1.5's ``rasterization``; dyngs has its signature), and how far their
-pictures are apart is printed. Times are medians of CUDA events after a tenth as many calls that do not count, of a card
-that nothing else uses. Memory is the most that torch had allocated during a call. Without a card that can be used it
+images are apart is printed. Times are medians of CUDA events after a tenth as many calls that do not count, of a GPU
+that nothing else uses. Memory is the most that torch had allocated during a call. Without a GPU that can be used it
 says why in one line and measures nothing.
 
 The workload of gsplat's benchmark, 1 and 5 million Gaussians, and a file at three sizes:
@@ -29,7 +29,7 @@ from torch import Tensor
 from dyngs.bench.rasterize import Workload, garden_workload, random_workload
 from dyngs.camera import Cameras
 from dyngs.compat import rasterization
-from dyngs.ops.device import why_no_card
+from dyngs.ops.device import why_no_gpu
 from dyngs.output.orbit import frame_orbit_for_points
 from dyngs.output.render_job import axis
 from dyngs.splats.formats import read_splats
@@ -52,7 +52,7 @@ def repeated(workload: Workload, count: int) -> Workload:
 
 
 def resized(cameras: Cameras, width: int, height: int) -> Cameras:
-    """The same cameras with pictures of another size: the shorter side shows as much as before."""
+    """The same cameras with images of another size: the shorter side shows as much as before."""
     scale = min(width, height) / min(cameras.width, cameras.height)
     lens = cameras.intrinsics.clone()
     lens[:, :2] *= scale
@@ -88,8 +88,8 @@ def seen_by(cameras: Cameras) -> Arguments:
     return {"viewmats": cameras.cam_from_world, "Ks": cameras.intrinsics} | size
 
 
-def on_card(arguments: Arguments) -> Arguments:
-    """The same on the card; Gaussians collect gradients."""
+def on_gpu(arguments: Arguments) -> Arguments:
+    """The same on the GPU; Gaussians collect gradients."""
     fixed = ("viewmats", "Ks")
     return {
         name: x.to("cuda").requires_grad_(name not in fixed) if isinstance(x, Tensor) else x
@@ -112,7 +112,7 @@ def milliseconds(call: Callable[[], object], repeats: int) -> float:
 
 
 def measured(name: str, rasterize: Rasterize, arguments: Arguments, repeats: int) -> tuple[str, Tensor]:
-    """A line about one rasterizer, milliseconds forward, with backward, and megabytes; and its picture."""
+    """A line about one rasterizer, milliseconds forward, with backward, and megabytes; and its image."""
     leaves = [x for x in arguments.values() if isinstance(x, Tensor) and x.requires_grad]
 
     def forward() -> Tensor:
@@ -141,7 +141,7 @@ def compared(arguments: Arguments, repeats: int) -> None:
         return
     line, theirs = measured("gsplat", import_module("gsplat").rasterization, arguments, repeats)
     apart = (ours - theirs).abs()
-    print(f"{line}\npictures differ by {float(apart.max()):.1e} at most, {float(apart.mean()):.1e} on average\n")
+    print(f"{line}\nimages differ by {float(apart.max()):.1e} at most, {float(apart.mean()):.1e} on average\n")
 
 
 def workloads(options: argparse.Namespace) -> Iterator[Arguments]:
@@ -164,15 +164,15 @@ def main() -> None:
     parser.add_argument("--points", type=Path, metavar="NPZ", help="points and cameras of gsplat's benchmark")
     parser.add_argument("--splat", type=Path, metavar="FILE", help="a file of Gaussians instead")
     parser.add_argument("--gaussians", type=int, nargs="+", metavar="N", help="repeat the points to so many")
-    parser.add_argument("--sizes", nargs="+", default=[], metavar="WxH", help="of the picture, px")
+    parser.add_argument("--sizes", nargs="+", default=[], metavar="WxH", help="of the image, px")
     parser.add_argument("--repeats", type=int, default=50, metavar="N")
     options = parser.parse_args()
-    reason = why_no_card()
+    reason = why_no_gpu()
     if reason is not None:
         print(f"nothing measured: {reason}")
         return
     for arguments in workloads(options):
-        compared(on_card(arguments), options.repeats)
+        compared(on_gpu(arguments), options.repeats)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""How far a CUDA card is from the CPU, op by op: the largest difference over the largest value, values and gradients.
+"""How far a CUDA GPU is from the CPU, op by op: the largest difference over the largest value, values and gradients.
 
     python benchmarks/gpu_agreement.py
 
-On a card that can be used; without one on the emulation of tests/, which needs a C++ compiler and nanobind. Inputs are
-the same float32 numbers everywhere. Beside the card's distance from the CPU's float64 stands that of the CPU's float32.
+On a GPU that can be used; without one on the emulation of tests/, which needs a C++ compiler and nanobind. Inputs are
+the same float32 numbers everywhere. Beside the GPU's distance from the CPU's float64 stands that of the CPU's float32.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.adam import adam_step_
-from dyngs.ops.device import why_no_card
+from dyngs.ops.device import why_no_gpu
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.skinning import blend_skinning
-from dyngs.rendering import RenderOptions, render
 
 COUNT, SIDE = 3000, 96
 Given = dict[str, Tensor]
@@ -63,7 +63,7 @@ def scene() -> Given:
 
 
 def drawn(given: Given) -> Found:
-    """A picture with depth; no threshold that rounding could cross."""
+    """An image with depth; no threshold that rounding could cross."""
     gaussians = Gaussians(**{name: x for name, x in given.items() if name not in ("pose", "lens")})
     options = RenderOptions(depth="expected", alpha_min=1e-6, transmittance_min=1e-6)
     made = render(gaussians, Cameras(given["pose"], given["lens"], SIDE, SIDE), options)
@@ -72,8 +72,8 @@ def drawn(given: Given) -> Found:
 
 
 def compared(given: Given) -> Found:
-    """L1 and SSIM of two pictures."""
-    return with_gradients(given, {"loss": l1_ssim_loss(given["picture"], given["truth"], 0.2)})
+    """L1 and SSIM of two images."""
+    return with_gradients(given, {"loss": l1_ssim_loss(given["image"], given["truth"], 0.2)})
 
 
 def updated(given: Given) -> Found:
@@ -122,12 +122,12 @@ def network() -> Given:
 
 def cases() -> dict[str, tuple[Callable[[Given], Found], Given]]:
     """What is computed, of what, by name."""
-    trained, pictures = torch.Tensor.requires_grad_, [numbers(SIDE, SIDE, 3, seed=i).sigmoid() for i in range(2)]
+    trained, images = torch.Tensor.requires_grad_, [numbers(SIDE, SIDE, 3, seed=i).sigmoid() for i in range(2)]
     motion = torch.cat([numbers(50, 3, seed=5, scale=0.1), numbers(50, 4, seed=6) + torch.tensor([4.0, 0, 0, 0])], 1)
     transforms = torch.cat([torch.eye(3).expand(24, 3, 3) + numbers(24, 3, 3, scale=0.2), numbers(24, 3, 1)], 2)
     return {
         "render": (drawn, scene()),
-        "loss": (compared, {"picture": trained(pictures[0]), "truth": pictures[1]}),
+        "loss": (compared, {"image": trained(images[0]), "truth": images[1]}),
         "Adam": (updated, {"x": numbers(COUNT, 3), "gradient": numbers(COUNT, 3, seed=1)}),
         "grids": (
             looked_up,
@@ -177,18 +177,18 @@ def distance(found: Tensor, wanted: Tensor) -> float:
 
 
 @contextmanager
-def card() -> Iterator[tuple[str, str]]:
-    """Where ops run on a card: the device of their tensors, and its name."""
-    reason = why_no_card()
+def gpu() -> Iterator[tuple[str, str]]:
+    """Where ops run on a GPU: the device of their tensors, and its name."""
+    reason = why_no_gpu()
     if reason is None:
         yield "cuda", torch.cuda.get_device_name()
         return
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     pytest: Any = __import__("pytest")
-    emulated: Any = __import__("emulated_card")
+    emulated: Any = __import__("emulated_gpu")
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         module = emulated.build_module(Path(folder), Path(folder))
-        emulated.on_emulated_card(patch, module)
+        emulated.on_emulated_gpu(patch, module)
         yield "cpu", f"emulated, since {reason}"
 
 
@@ -197,10 +197,10 @@ def main() -> None:
     chosen = cases()
     exact = {name: compute(on(given, "cpu", torch.float64)) for name, (compute, given) in chosen.items()}
     cpu = {name: compute(on(given, "cpu", torch.float32)) for name, (compute, given) in chosen.items()}
-    with card() as (device, called):
+    with gpu() as (device, called):
         there = {name: compute(on(given, device, torch.float32)) for name, (compute, given) in chosen.items()}
-        print(f"card: {called}\n")
-    print("| op | result | card, to the CPU's float64 | CPU's float32, to its float64 | card, to the CPU's float32 |")
+        print(f"GPU: {called}\n")
+    print("| op | result | GPU, to the CPU's float64 | CPU's float32, to its float64 | GPU, to the CPU's float32 |")
     print("|---|---|---|---|---|")
     for name, parts in exact.items():
         for part, wanted in parts.items():

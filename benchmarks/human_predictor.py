@@ -4,14 +4,14 @@
 
 People differ in body shape, clothes, light and clips. Usual clothes are worn by every other training person, and by the
 second half of the held-out ones. FOLDER keeps the captures and the run, which are reused. Printed per held-out person,
-for other cameras (`test`) and another clip (`pose`): PSNR in the box of the person / of the whole picture, from three
-pictures of one time or from one, by
+for other cameras (`test`) and another clip (`pose`): PSNR in the box of the person / of the whole image, from three
+images of one time or from one, by
 
 - network: the result of `dyngs predict`;
-- as trained: the same without adaptation to the pictures (`--steps 0`);
-- seen, else nearby: the template with the colours of the three pictures where visible, elsewhere with colours nearby;
+- as trained: the same without adaptation to the images (`--steps 0`);
+- seen, else nearby: the template with the colours of the three images where visible, elsewhere with colours nearby;
 - mean texture: the template with the mean texture of the training people;
-and the seconds from pictures in memory or on disk to Gaussians.
+and the seconds from images in memory or on disk to Gaussians.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ FIRST_HELD_OUT = 101
 SPLITS = ("test", "pose")
 
 ADAPTED = 10
-"""Steps on the pictures of a person, as `dyngs predict` has it."""
+"""Steps on the images of a person, as `dyngs predict` has it."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Results of one method for one person: name, PSNR by split (box, whole picture), seconds."""
+    """Results of one method for one person: name, PSNR by split (box, whole image), seconds."""
 
     name: str
     psnr: dict[str, tuple[float, float]]
@@ -77,7 +77,7 @@ def scored(name: str, run: Path, seconds: float) -> Row:
 
 
 def predicted(network: Path, capture: Path, out: Path, views: int, steps: int) -> Row:
-    """The result of `dyngs predict` from so many pictures, after so many steps on these."""
+    """The result of `dyngs predict` from so many images, after so many steps on these."""
     name = f"network, {views} views" + ("" if steps else ", as trained")
     run = out / f"network_{views}_{steps}"
     if not checkpoint_paths(run):
@@ -98,7 +98,7 @@ def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
         maps = person.look(spread_views(person.sitter, count))
         if name == "mean texture":
             maps = replace(maps, seen=torch.zeros_like(maps.seen), nearby=from_atlas(mean, person.sitter.texels))
-        avatar = predict_gaussians(person.sitter, maps, mean, None, bare.min_silhouette_share)
+        avatar = predict_gaussians(person.sitter, maps, mean, None, bare.min_silhouette_fraction)
         seconds = time.perf_counter() - start
         run = out / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(run):

@@ -2,8 +2,8 @@
 
     python benchmarks/lenses.py FOLDER [--degrees 120] [--side 160] [--views 24] [key=value ...]
 
-Ray-traced pictures of a furnished corner (`dyngs/data/synthetic`): training through an equidistant fisheye of so many
-degrees across, and as many through a pinhole of the same focal length, to compare with. Test pictures are the truth
+Ray-traced images of a furnished corner (`dyngs/data/synthetic`): training through an equidistant fisheye of so many
+degrees across, and as many through a pinhole of the same focal length, to compare with. Test images are the truth
 from poses in between, through pinholes 60 and 100 degrees across, which no lens touched. FOLDER keeps captures and
 runs, which are reused.
 """
@@ -24,7 +24,7 @@ from dyngs.api.train import train
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Lens
 from dyngs.data.geometry.intrinsics import pinhole_matrix
-from dyngs.data.pictures.lens import undistorted_points
+from dyngs.data.images.lens import undistorted_points
 from dyngs.data.synthetic import raytrace
 from dyngs.data.synthetic.scenes import scene_at
 from dyngs.evaluate.report import evaluate_run
@@ -47,8 +47,8 @@ def directions(lens: Lens, focal: float, size: tuple[int, int], shift: tuple[flo
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def picture(pose: np.ndarray, lens: Lens, focal: float, size: tuple[int, int]) -> np.ndarray:
-    """Return the (H, W, 3) uint8 picture of the room from an OpenGL pose."""
+def image(pose: np.ndarray, lens: Lens, focal: float, size: tuple[int, int]) -> np.ndarray:
+    """Return the (H, W, 3) uint8 image of the room from an OpenGL pose."""
     scene, total = scene_at("room", 0.3), np.zeros((size[0] * size[1], 3), np.float32)
     for a, b in np.ndindex(SAMPLES, SAMPLES):
         rays = directions(lens, focal, size, ((a + 0.5) / SAMPLES, (b + 0.5) / SAMPLES)) @ pose[:3, :3].T
@@ -75,14 +75,14 @@ def poses(count: int, seed: int) -> np.ndarray:
 
 
 def write_capture(out: Path, lens: Lens, focal: float, options: argparse.Namespace) -> None:
-    """Write training pictures through ``lens``, and test pictures through wide pinholes."""
+    """Write training images through ``lens``, and test images through wide pinholes."""
     size = (options.side, options.side * 3 // 4)
     tested = [(0.5 * size[0] / np.tan(np.radians(degrees / 2)), Lens()) for degrees in (60, 100)]
     for split, count, lenses in (("train", options.views, [(focal, lens)]), ("test", 8, tested)):
         frames = []
         for i, pose in enumerate(poses(count, 0 if split == "train" else 1)):
             own_focal, own = lenses[i % len(lenses)]
-            write_image(out / split / f"{i:03d}.png", picture(pose, own, own_focal, size))
+            write_image(out / split / f"{i:03d}.png", image(pose, own, own_focal, size))
             frames.append(
                 {
                     "file_path": f"{split}/{i:03d}.png",

@@ -6,7 +6,7 @@ For each scene two models are trained for the same number of steps and measured 
 (configs/dynamic.yaml with the overrides), and an oracle. The oracle's Gaussians begin on the true surfaces, with labels
 of what they belong to, and a field moves them by the scene's own description: each rigid body and the cloth. The
 rasterizer, the strategy, the learning rates and the harmonics are the preset's, the base colours of what moves may
-change over time, and pictures have their full size from the start. The gap is what it costs to find the motion; shading
+change over time, and images have their full size from the start. The gap is what it costs to find the motion; shading
 and shadows hold back both. FOLDER keeps captures and runs of the preset, which are reused.
 """
 
@@ -30,13 +30,13 @@ from dyngs.config import Config, PointsInit, RandomInit, StaticModel, Trajectory
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.raytrace import Primitive, Sheet, is_seen
 from dyngs.data.synthetic.raytrace import Scene as TrueScene
 from dyngs.data.synthetic.scenes import SceneName, scene_at
-from dyngs.data.synthetic.tracks import is_in_picture
+from dyngs.data.synthetic.tracks import is_in_image
 from dyngs.data.true_tracks import read_true_tracks
 from dyngs.deform.field import FieldSetup, Offsets, chosen
 from dyngs.deform.random_gaussians import box_of
@@ -47,10 +47,10 @@ from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import score_views
 from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.scene import Scene
 from dyngs.metrics import Lpips
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.scene import Scene
 from dyngs.static.init import StartValues, initial_gaussians
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
@@ -218,13 +218,13 @@ def _seen(name: SceneName, label: int, local: np.ndarray, looks: Sequence[View])
         if label < len(scene.primitives):
             pose = np.linalg.inv(view.cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])
             points = scene.primitives[label].placed(local)
-            seen |= is_in_picture(points, pose) & is_seen(scene, points, pose)
+            seen |= is_in_image(points, pose) & is_seen(scene, points, pose)
     return seen
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is printed of a model: PSNR in dB of whole pictures and of parts, tracks in px, and Gaussians."""
+    """What is printed of a model: PSNR in dB of whole images and of parts, tracks in px, and Gaussians."""
 
     psnr: float
     foreground: float | None
@@ -252,10 +252,10 @@ def measured(scene: Scene, config: Config) -> Row:
     capture = read_capture(config.data)
     views = split_views(capture, "test")
     background = scene.background if scene.background is not None else torch.zeros(3, device="cpu")
-    loader = PictureLoader(views, config.data)
+    loader = ImageLoader(views, config.data)
     regions = Regions(views, loader, background)
-    pictures = (loader[i] for i in range(len(loader)))
-    scores, _ = score_views(scene, pictures, scene.options, background, Lpips("alex", "not measured"), regions)
+    images = (loader[i] for i in range(len(loader)))
+    scores, _ = score_views(scene, images, scene.options, background, Lpips("alex", "not measured"), regions)
     cameras = training_cameras(views, config.data)
     truth = read_true_tracks(capture.root, capture.world_offset)
     pairs = list(zip(views, cameras, strict=True))
@@ -264,7 +264,7 @@ def measured(scene: Scene, config: Config) -> Row:
         psnr=fmean(score.psnr for score in scores),
         foreground=_mean(score.psnr_foreground for score in scores),
         moving=_mean(score.psnr_moving for score in scores),
-        still=_mean(score.psnr_still for score in scores),
+        still=_mean(score.psnr_static for score in scores),
         tracks=tracks.error_px,
         gaussians=len(scene),
     )
@@ -280,7 +280,7 @@ def preset_row(config: Config, run: Path) -> Row:
     if not checkpoint_paths(run):
         train(config)
     report = evaluate_run(run)
-    parts = report.psnr_foreground, report.psnr_moving, report.psnr_still
+    parts = report.psnr_foreground, report.psnr_moving, report.psnr_static
     return Row(report.psnr, *parts, report.track_error_px, report.num_gaussians)
 
 

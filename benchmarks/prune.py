@@ -3,7 +3,7 @@
     python benchmarks/prune.py RUN FOLDER [key=value ...] [--rows promise|where|stages|parts|scores] [--threads 1]
 
 FOLDER keeps the pruned runs, which are reused. `promise`: `dyngs prune --max-loss X` for each of --max-loss, drawn from
-the file. `where`: the bytes of each tensor, and the time of each part of a picture. `stages`: a share of 0.8 pruned,
+the file. `where`: the bytes of each tensor, and the time of each part of an image. `stages`: a fraction of 0.8 pruned,
 fine-tuned, and stored by `dyngs export --format dyngs`. `parts` compares pruning alone, masks alone and both, with and
 without fine-tuning (one step); `scores` compares the scores. Overrides (prune.steps=500, ...) apply to all rows.
 Columns: Gaussians, PSNR of 20 training views and of the whole test split, speed relative to RUN, MB as float32 and as
@@ -21,7 +21,7 @@ from statistics import median
 import torch
 
 from dyngs.api.prune import file_of, prune_run, prune_within
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.comparison import Cost, compared
 from dyngs.evaluate.report import evaluate_run, scene_of_split, split_views
@@ -32,7 +32,7 @@ from dyngs.storage.drawable import drawable
 from dyngs.storage.file import read_scene
 
 ONCE = "prune.steps=1"
-NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.share=0"
+NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.fraction=0"
 ROWS = {
     "stages": {"pruned": (ONCE,), "fine-tuned": ()},
     "parts": {
@@ -76,7 +76,7 @@ def promises(given: argparse.Namespace) -> None:
 
 
 def where(given: argparse.Namespace) -> None:
-    """Print bytes by tensor, and the time of a picture by part (processor time of one thread, medians)."""
+    """Print bytes by tensor, and the time of an image by part (processor time of one thread, medians)."""
     run, folder = load_run(given.run_dir), given.folder / "stored"
     file = read_scene(write_scene_file(given.run_dir, folder).path)
     exact = {name: x.numel() * x.itemsize for name, x in drawable(run.scene).items()}
@@ -85,17 +85,17 @@ def where(given: argparse.Namespace) -> None:
         print(f"| {name} | {exact.get(name, 0)} | {size} |")
     print(f"| all | {sum(exact.values())} | {file.num_bytes} |")
     capture = read_capture(run.config.data)
-    loader = PictureLoader(split_views(capture, "test"), run.config.data)
-    pictures = [loader[i] for i in range(min(len(loader), 10))]
+    loader = ImageLoader(split_views(capture, "test"), run.config.data)
+    images = [loader[i] for i in range(min(len(loader), 10))]
     whole = scene_of_split(run, capture, "test")
     one = whole.select(torch.arange(1))
     print("\n| | ms |\n|---|---|")
     with torch.no_grad(), kernel_threads(1):
         for name, scene in (("all", whole), ("one Gaussian: calls", one)):
-            moments = [scene.moment(p.time) for p in pictures]
-            moved = milliseconds([lambda p=p, s=scene: s.moment(p.time) for p in pictures])
+            moments = [scene.moment(p.time) for p in images]
+            moved = milliseconds([lambda p=p, s=scene: s.moment(p.time) for p in images])
             drawn = milliseconds(
-                [lambda p=p, m=m, s=scene: s.render(p.cameras, m) for p, m in zip(pictures, moments, strict=True)]
+                [lambda p=p, m=m, s=scene: s.render(p.cameras, m) for p, m in zip(images, moments, strict=True)]
             )
             print(f"| {name}: moved to its time | {moved:.2f} |\n| {name}: drawn | {drawn:.2f} |")
 
@@ -129,7 +129,7 @@ def main() -> None:
     for name, asked in ROWS[given.rows].items():
         out = given.folder / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(out):
-            common = ("prune.share=0.8", f"run.threads={given.threads}")
+            common = ("prune.fraction=0.8", f"run.threads={given.threads}")
             prune_run(given.run_dir, out, (*common, *given.overrides, *asked))
         before, after = compared([given.run_dir, out], given.threads)
         print(line(name, out, after, before, given.threads), end="", flush=True)

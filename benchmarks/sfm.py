@@ -2,10 +2,10 @@
 
     python benchmarks/sfm.py FOLDER CAPTURE... [--video NAME,...] [--train STEPS] [--side PX] [--threads N] [key=value]
 
-The pictures of each capture are copied, shrunk to PX on their longest side, without their poses; those of captures
+The images of each capture are copied, shrunk to PX on their longest side, without their poses; those of captures
 named by --video become a video. Poses are estimated, aligned with the given ones by a similarity, and compared: the
-distance of camera centres as a share of the span (the largest distance of two given centres). With --train both are
-trained at PX with the given overrides and measured on the same pictures: every eighth one. FOLDER keeps all of it.
+distance of camera centres as a fraction of the span (the largest distance of two given centres). With --train both are
+trained at PX with the given overrides and measured on the same images: every eighth one. FOLDER keeps all of it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from dyngs.api.train import train
+from dyngs.capture.sfm import SfmOptions, estimate_poses
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
-from dyngs.data.pictures.images import area_downscale, read_picture, target_size
-from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
+from dyngs.data.images.images import area_downscale, read_image, target_size
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.files.write import to_uint8, write_image
@@ -38,14 +38,14 @@ FPS = 24
 
 
 def shrunk(view: View, side: int) -> np.ndarray:
-    """Return the stored picture of a view, (H, W, 3) uint8, shrunk to ``side``."""
-    pixels = read_picture(view.image_path)[..., :3].float() / 255
+    """Return the stored image of a view, (H, W, 3) uint8, shrunk to ``side``."""
+    pixels = read_image(view.image_path)[..., :3].float() / 255
     size = target_size(pixels.shape[1], pixels.shape[0], longest_side=side)
     return to_uint8(area_downscale(pixels, *size).numpy())
 
 
 def unposed(views: Sequence[View], folder: Path, side: int, video: bool) -> Path:
-    """Write the pictures without their poses; return the folder or the video, whose frames are sorted by name."""
+    """Write the images without their poses; return the folder or the video, whose frames are sorted by name."""
     if video:
         path = folder.with_suffix(".mp4")
         if not path.exists():
@@ -67,7 +67,7 @@ def centres(views: Sequence[View], names: Sequence[str]) -> dict[str, np.ndarray
 
 
 def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> np.ndarray:
-    """Return distances of centres after a similarity, as shares of the span of the given ones."""
+    """Return distances of centres after a similarity, as fractions of the span of the given ones."""
     names = sorted(found.keys() & given.keys())
     x, y = (np.array([centre[name] for name in names]) for centre in (found, given))
     a, b = x - x.mean(0), y - y.mean(0)
@@ -78,7 +78,7 @@ def errors(found: dict[str, np.ndarray], given: dict[str, np.ndarray]) -> np.nda
 
 
 def trained(root: Path, run: Path, preset: str, overrides: Sequence[str]) -> float:
-    """Return the PSNR on the test pictures of a run, trained where it is not there."""
+    """Return the PSNR on the test images of a run, trained where it is not there."""
     if not checkpoint_paths(run):
         keys = [f"data.root={root}", f"run.dir={run}", "data.test_every=8", *overrides]
         train(load_config(CONFIGS / f"{preset}.yaml", keys))
@@ -119,7 +119,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("words", nargs="+", help="captures, and key=value")
-    parser.add_argument("--video", default="", help="names of captures whose pictures become a video")
+    parser.add_argument("--video", default="", help="names of captures whose images become a video")
     parser.add_argument("--train", type=int, default=0, metavar="STEPS")
     parser.add_argument("--side", type=int, default=200)
     parser.add_argument("--threads", type=int, default=1)

@@ -29,7 +29,7 @@ class Avatar:
         uv: (M, 2), the origin at the top left.
         faces: (T, 3).
         paint: (T,) index into ``textures``.
-        textures: pictures (H, W, 3) of sRGB values in [0, 1].
+        textures: images (H, W, 3) of sRGB values in [0, 1].
         weights: (M, S), rows sum to 1.
         joints: (S, 3).
         parents: (S,), -1 for a root.
@@ -106,12 +106,12 @@ def _add_piece(
     """Add the vertices of a primitive, skinned by ``rest`` (S', 4, 4) of the joints ``rows`` (S') of all ``joints``."""
     given = piece["attributes"]
     points, normals = (file.numbers(given[key], "VEC3") for key in ("POSITION", "NORMAL"))
-    share = file.numbers(given["WEIGHTS_0"], "VEC4")
+    fraction = file.numbers(given["WEIGHTS_0"], "VEC4")
     owner = file.numbers(given["JOINTS_0"], "VEC4").astype(np.int64)
     weights = np.zeros((len(points), joints))
-    share = share / share.sum(axis=1, keepdims=True)
-    np.add.at(weights, (np.arange(len(points))[:, None], np.array(rows)[owner]), share)
-    blended = np.einsum("mk,mkij->mij", share, rest[owner])
+    fraction = fraction / fraction.sum(axis=1, keepdims=True)
+    np.add.at(weights, (np.arange(len(points))[:, None], np.array(rows)[owner]), fraction)
+    blended = np.einsum("mk,mkij->mij", fraction, rest[owner])
     parts["vertices"].append(np.einsum("mij,mj->mi", blended[:, :3, :3], points) + blended[:, :3, 3])
     parts["normals"].append(normalized(np.einsum("mij,mj->mi", blended[:, :3, :3], normals)))
     parts["uv"].append(file.numbers(given["TEXCOORD_0"], "VEC2"))
@@ -131,9 +131,9 @@ def _texture(document: dict, binary: bytes, material: int) -> np.ndarray:
     view = document["images"][document["textures"][base["baseColorTexture"]["index"]]["source"]]["bufferView"]
     place = document["bufferViews"][view]
     start = place.get("byteOffset", 0)
-    picture = Image.open(io.BytesIO(binary[start : start + place["byteLength"]])).convert("RGB")
-    picture = picture.reduce(max(1, max(picture.size) // 1024))
-    return np.asarray(picture, np.float64) / 255.0
+    image = Image.open(io.BytesIO(binary[start : start + place["byteLength"]])).convert("RGB")
+    image = image.reduce(max(1, max(image.size) // 1024))
+    return np.asarray(image, np.float64) / 255.0
 
 
 def _node_matrices(file: GltfFile) -> list[np.ndarray]:

@@ -217,9 +217,9 @@ def left_alone(words: str, out: Path) -> End:
 
 def killed(words: str, out: Path, kind: str, dice: random.Random, reference: Reference) -> End:
     """Run a command and kill it; return how it ended."""
-    share = dice.uniform(0, 0.6) if checkpoint_paths(out) else dice.random()  # the rest takes less than the whole
-    at = 1 + int(share * reference.end.operations)
-    after = share * reference.end.seconds if kind == "any moment" else dice.uniform(0, 0.004)
+    fraction = dice.uniform(0, 0.6) if checkpoint_paths(out) else dice.random()  # the rest takes less than the whole
+    at = 1 + int(fraction * reference.end.operations)
+    after = fraction * reference.end.seconds if kind == "any moment" else dice.uniform(0, 0.004)
 
     def at_once() -> None:
         Trap(out, at, lambda: os.kill(os.getpid(), signal.SIGKILL))

@@ -1,10 +1,10 @@
-"""How fast the viewer is: pictures drawn per second, and how many of them a browser shows.
+"""How fast the viewer is: images drawn per second, and how many of them a browser shows.
 
     python benchmarks/viewer.py RUN... [--size 1000x600] [--seconds 6]
 
 Opens each run or file in Debian's chromium without a window (WebGL on the CPU) and measures while the mouse orbits,
 and, where something moves, while time plays. Needs `pip install '.[test]'` and chromium. The browser takes time of the
-same cores: with a GPU, or a browser elsewhere, there is more for the pictures.
+same cores: with a GPU, or a browser elsewhere, there is more for the images.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dyngs.view.server import Browsing, Serving, Viewer
 from dyngs.view.source import first_of, open_source
 
 WARM_UP = 3.0
-"""Seconds before measuring, in which the picture finds its size."""
+"""Seconds before measuring, in which the image finds its size."""
 COUNT_UPLOADS = """
 window.uploads = 0;
 for (const name of ["texImage2D", "texSubImage2D"]) {
@@ -34,11 +34,11 @@ for (const name of ["texImage2D", "texSubImage2D"]) {
   };
 }
 """
-"""Counts pictures that reach the GPU of the page, real or not."""
+"""Counts images that reach the GPU of the page, real or not."""
 
 
 def measure(page: Page, browsing: Browsing, act: Callable[[int], None], seconds: float) -> tuple[float, float]:
-    """Return the pictures per second that were sent and shown while ``act`` is called with 0, 1, ..."""
+    """Return the images per second that were sent and shown while ``act`` is called with 0, 1, ..."""
     for length in (WARM_UP, seconds):
         sent, shown, start, count = browsing.num_sent, page.evaluate("window.uploads"), time.monotonic(), 0
         while time.monotonic() < start + length:

@@ -1,10 +1,10 @@
-"""What people who walk through a still scene cost, and what masks found in training (`train.robust`) win back.
+"""What people who walk through a static scene cost, and what masks found in training (`train.robust`) win back.
 
     python benchmarks/walkers.py FOLDER CAPTURE... [--share 0.33] [--seed 0] [--robust never,always] [key=value ...]
 
-In a copy of each capture drawn people stand at random places in a share of the training pictures; test pictures are
+In a copy of each capture drawn people stand at random places in a fraction of the training images; test images are
 as they were, and `walkers/` holds the true masks. The preset (configs/static.yaml with the overrides) is trained on the
-capture as it is and on the copy, without and with masks, and all are measured on the same clean test pictures. FOLDER
+capture as it is and on the copy, without and with masks, and all are measured on the same clean test images. FOLDER
 keeps copies and runs, which are reused.
 """
 
@@ -22,7 +22,7 @@ import torch
 from dyngs.api.train import train
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config
-from dyngs.data.pictures.images import read_picture
+from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.files.write import write_image
@@ -39,12 +39,12 @@ PEOPLE = (
 SKIN, STRIPE = (0.78, 0.58, 0.46), 0.55
 """Colour of heads, and how dark every second stripe of a shirt is."""
 HEIGHTS = (0.4, 0.8)
-"""Height of a person as a share of the picture's."""
+"""Height of a person as a fraction of the image's."""
 
 
 @dataclass(frozen=True)
 class Person:
-    """A drawn person: the middle of the feet as shares of the picture's size, the height as one of its height."""
+    """A drawn person: the middle of the feet as fractions of the image's size, the height as one of its height."""
 
     x: float
     feet: float
@@ -80,17 +80,17 @@ def _ellipse(up: np.ndarray, aside: np.ndarray, tall: float, wide: float) -> np.
     return (np.hypot(up / tall, aside / wide) - 1) * min(tall, wide)
 
 
-def compose(capture: Path, out: Path, share: float, seed: int) -> None:
-    """Write a copy of ``capture`` with people in ``share`` of its training pictures, and their masks to ``walkers/``.
+def compose(capture: Path, out: Path, fraction: float, seed: int) -> None:
+    """Write a copy of ``capture`` with people in ``share`` of its training images, and their masks to ``walkers/``.
 
     PNG stays lossless; other formats are encoded anew.
     """
     shutil.copytree(capture, out)
     views = read_capture(DataConfig(root=out)).splits["train"]
     random = np.random.default_rng(seed)
-    for index in sorted(random.permutation(len(views))[: round(share * len(views))].tolist()):
+    for index in sorted(random.permutation(len(views))[: round(fraction * len(views))].tolist()):
         path = views[index].image_path
-        pixels = read_picture(path).numpy().astype(np.float32) / 255
+        pixels = read_image(path).numpy().astype(np.float32) / 255
         tall = random.uniform(*HEIGHTS)
         person = Person(random.uniform(0.1, 0.9), random.uniform(0.7, 1.1), tall, int(random.integers(len(PEOPLE))))
         colours, inside = person.drawn(pixels.shape[1], pixels.shape[0])
@@ -103,7 +103,7 @@ def compose(capture: Path, out: Path, share: float, seed: int) -> None:
 
 
 def row(root: Path, run: Path, robust: str, overrides: Sequence[str]) -> tuple[float, float, int, float]:
-    """Return PSNR and SSIM on the test pictures, Gaussians and seconds of a run, trained where it is not there."""
+    """Return PSNR and SSIM on the test images, Gaussians and seconds of a run, trained where it is not there."""
     if not checkpoint_paths(run):
         keys = [f"data.root={root}", f"run.dir={run}", f"train.robust={robust}", *overrides]
         train(load_config(PRESET, keys))
@@ -121,18 +121,18 @@ def main(words: Sequence[str] | None = None) -> None:
     options = parser.parse_intermixed_args(words)
     captures = [Path(word) for word in options.words if "=" not in word]
     overrides = [word for word in options.words if "=" in word]
-    print("| capture | pictures | train.robust | PSNR / SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|")
+    print("| capture | images | train.robust | PSNR / SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|")
     with kernel_threads(torch.get_num_threads()):
         for capture in captures:
             busy = options.folder / f"{capture.name}_walkers"
             if not busy.exists():
-                compose(capture, busy, options.share, options.seed)
-            for root, pictures in ((capture, "clean"), (busy, "walkers")):
+                compose(capture, busy, options.fraction, options.seed)
+            for root, images in ((capture, "clean"), (busy, "walkers")):
                 for robust in options.robust.split(","):
-                    run = options.folder / f"{capture.name}_{pictures}_{robust}"
+                    run = options.folder / f"{capture.name}_{images}_{robust}"
                     psnr, ssim, count, seconds = row(root, run, robust, overrides)
                     shown = f"{psnr:.2f} dB / {ssim:.3f} | {count:,} | {seconds:.0f}"
-                    print(f"| {capture.name} | {pictures} | {robust} | {shown} |", flush=True)
+                    print(f"| {capture.name} | {images} | {robust} | {shown} |", flush=True)
 
 
 if __name__ == "__main__":

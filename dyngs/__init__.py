@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
     from dyngs.gaussians import Gaussians
-    from dyngs.rendering import Rendering, RenderOptions, contributions, render
-    from dyngs.scene import Scene
+    from dyngs.gaussians.rendering import Rendering, RenderOptions, contributions, render
+    from dyngs.gaussians.scene import Scene
 
 __version__ = "0.1.0"
 __all__ = [
@@ -41,15 +41,15 @@ _HOMES = {
     "Cameras": "dyngs.camera",
     "DyngsError": "dyngs.errors",
     "Gaussians": "dyngs.gaussians",
-    "RenderOptions": "dyngs.rendering",
-    "Rendering": "dyngs.rendering",
-    "Scene": "dyngs.scene",
-    "contributions": "dyngs.rendering",
+    "RenderOptions": "dyngs.gaussians.rendering",
+    "Rendering": "dyngs.gaussians.rendering",
+    "Scene": "dyngs.gaussians.scene",
+    "contributions": "dyngs.gaussians.rendering",
     "load": "dyngs.api.load",
     "load_config": "dyngs.config.io",
     "rasterization": "dyngs.compat",
     "read_capture": "dyngs.data.read",
-    "render": "dyngs.rendering",
+    "render": "dyngs.gaussians.rendering",
     "train": "dyngs.api.train",
 }
 

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from typing_extensions import assert_never
 
-from dyngs.colour.network import box_around, network_of
-from dyngs.colour.training import AutoTraining, ColourTraining, NetworkTraining
+from dyngs.capture.first_points import with_first_points
+from dyngs.capture.inspection.scene_problems import before_training
 from dyngs.config import (
     AutoColour,
     Config,
@@ -38,18 +38,20 @@ from dyngs.data.ahead import usual_threads
 from dyngs.data.capture import Capture
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.geometry.frusta import outside_of_cube
-from dyngs.data.inspection.scene_problems import before_training
-from dyngs.data.loader import PictureLoader
-from dyngs.data.prepare.first_points import with_first_points
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.deform.compared_views import ComparedViews
-from dyngs.deform.given_masks import moving_share_of
+from dyngs.deform.fixed_cameras.changes import Footage, footage_of
+from dyngs.deform.given_masks import moving_fraction_of
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.standing.changes import Footage, footage_of
 from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.colour.network import box_around, network_of
+from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, NetworkTraining
+from dyngs.gaussians.rendering import RenderOptions, Shader
+from dyngs.gaussians.scene import Scene, SceneTraining, render_options
 from dyngs.human.avatar.fine_limbs import pixel_size, surface_gaussians, surface_texels
 from dyngs.human.avatar.light import rest_normals
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes
@@ -59,8 +61,6 @@ from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.template.load import load_template, rest_shape
 from dyngs.ops.device import device_for
-from dyngs.rendering import RenderOptions, Shader
-from dyngs.scene import Scene, SceneTraining, render_options
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.fixed import FixedDensifier
 from dyngs.static.init import StartValues, initial_gaussians
@@ -69,20 +69,20 @@ from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.scene import StaticScene
 from dyngs.static.training import FilterUpdate, StaticTraining
 from dyngs.training.background import (
-    PICTURES,
+    IMAGES,
     AlphaWeight,
     background_colour,
     evaluation_background,
     measured_alpha_weight,
 )
-from dyngs.training.camera_refinement import CameraRefinement
-from dyngs.training.exposure import exposures_of
+from dyngs.training.corrections.camera_refinement import CameraRefinement
+from dyngs.training.corrections.exposure import exposures_of
+from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
 from dyngs.training.prediction import assemble_network
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
-from dyngs.training.robust import RobustMasks
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import (
     deform_schedule,
@@ -91,7 +91,7 @@ from dyngs.training.schedule import (
     grad_threshold,
     growth_per_change,
     hold_out_until,
-    picture_divisor,
+    image_divisor,
     rates_of,
 )
 from dyngs.training.state import OTHER_CONFIG, Checkpoint
@@ -111,7 +111,7 @@ _TOLD: set[tuple[Path, str]] = set()
 _FIRST_POINTS: dict[str, tuple[Capture, list[str]]] = {}
 """The last capture with its first points, and lines on them: a run and the small ones beside it begin with the same."""
 FIRST_VIEWS = 50
-"""Number of pictures from which a person's first colours are taken."""
+"""Number of images from which a person's first colours are taken."""
 
 
 @dataclass(frozen=True)
@@ -157,11 +157,11 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
     config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
     views = capture.splits["train"]
-    pictures = PictureLoader(views, config.data, with_maps=True, decoding_threads=usual_threads())
-    priors = _priors(config, capture, pictures)
+    images = ImageLoader(views, config.data, with_maps=True, decoding_threads=usual_threads())
+    priors = _priors(config, capture, images)
     if not priors.masks:
-        pictures = pictures.without_motion_masks()
-    first = _first(config, start, capture, pictures, generator)
+        images = images.without_motion_masks()
+    first = _first(config, start, capture, images, generator)
     background, extent = resolved_background(config, capture), surroundings(capture).extent
     optimizer = GaussianOptimizer(first.scene.gaussians, config.optim)
     scene = replace(
@@ -171,7 +171,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         background=evaluation_background(config.data.background, capture.has_alpha)[1],
     )
     x, y, z = (float(value) for value in capture.world_offset)
-    refinement = _refinement(config, pictures, extent)  # before what asks the pictures for corrected cameras
+    refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
     trainer = Trainer(
         config=config,
         scene=scene,
@@ -179,53 +179,53 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         optimizer=optimizer,
         densifier=_densifier(config, background, extent),
         colours=first.colours,
-        pictures=pictures,
-        sampler=ViewSampler(len(pictures)),
+        images=images,
+        sampler=ViewSampler(len(images)),
         options=_training_options(config),
         background=background,
         extent=extent,
         world_offset=(x, y, z),
         has_test_views=bool(capture.splits.get("test")),
-        alpha=_alpha_weight(config, capture, pictures),
+        alpha=_alpha_weight(config, capture, images),
         generator=generator,
         held_out=held_out_views(capture.splits["train"], config.train.hold_out_every),
         held_out_until=hold_out_until(config.train),
         priors=priors,
-        robust=_robust(config, capture, pictures),
-        exposures=exposures_of(config.train, pictures),
+        robust=_robust(config, capture, images),
+        exposures=exposures_of(config.train, images),
         refinement=refinement,
     )
     trainer.place(device)
     return trainer
 
 
-def _priors(config: Config, capture: Capture, pictures: PictureLoader) -> UsedPriors:
+def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors:
     """Return the priors of the capture that are used; none for people, whose poses say how they move."""
     match config.model:
         case StaticModel():
-            return used_priors(config, capture, pictures, moves=False)
+            return used_priors(config, capture, images, moves=False)
         case DynamicModel():
-            return used_priors(config, capture, pictures, moves=len(set(training_times(capture))) > 1)
+            return used_priors(config, capture, images, moves=len(set(training_times(capture))) > 1)
         case _:
             return UsedPriors()
 
 
-def _robust(config: Config, capture: Capture, pictures: PictureLoader) -> RobustMasks | None:
-    """Return the masks of what disagrees between views of a still scene, if they are asked for."""
+def _robust(config: Config, capture: Capture, images: ImageLoader) -> RobustMasks | None:
+    """Return the masks of what disagrees between views of a static scene, if they are asked for."""
     match config.model:
         case StaticModel() if config.train.robust == "always":
             cameras = training_cameras(capture.splits["train"], config.data)
-            return RobustMasks(pictures, cameras, config.train.steps, pictures.corrected)
+            return RobustMasks(images, cameras, config.train.steps, images.corrected)
         case _:
             return None
 
 
-def _refinement(config: Config, pictures: PictureLoader, size: float) -> CameraRefinement | None:
-    """Return the refinement of the training cameras, if it is asked for; ``pictures`` have corrected cameras then."""
+def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefinement | None:
+    """Return the refinement of the training cameras, if it is asked for; ``images`` have corrected cameras then."""
     if config.camera.refine != "always":
         return None
-    refinement = CameraRefinement(pictures.views, size, config.train.steps)
-    pictures.corrected = refinement.corrections.applied
+    refinement = CameraRefinement(images.views, size, config.train.steps)
+    images.corrected = refinement.corrections.applied
     return refinement
 
 
@@ -274,14 +274,14 @@ def with_points(capture: Capture, config: Config) -> Capture:
         case _:
             pass
     for line in [*lines, *before_training(capture)]:
-        if (capture.root, line) not in _TOLD:  # a run may train a still model of the same capture, too
+        if (capture.root, line) not in _TOLD:  # a run may train a static model of the same capture, too
             print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)
             _TOLD.add((capture.root, line))
     return capture
 
 
 def _with_known_points(capture: Capture, options: DataConfig, init: PointsInit) -> tuple[Capture, list[str]]:
-    """Return ``capture`` with its first points, and lines on them; found once for all sizes of its pictures."""
+    """Return ``capture`` with its first points, and lines on them; found once for all sizes of its images."""
     read_as = options.model_dump_json(exclude={"downscale", "longest_side", "cache_mb"})
     key = f"{read_as} {init.triangulate} {init.half_extent}"
     if key not in _FIRST_POINTS:
@@ -301,11 +301,11 @@ class _First:
 
 
 def _first(
-    config: Config, start: StartValues, capture: Capture, pictures: PictureLoader, generator: torch.Generator
+    config: Config, start: StartValues, capture: Capture, images: ImageLoader, generator: torch.Generator
 ) -> _First:
     match config.model:
         case HumanModel():
-            gaussians, subject = human_start(config, config.model, capture, pictures)
+            gaussians, subject = human_start(config, config.model, capture, images)
             colours = _colours(config, capture, gaussians, generator)
             filmed = capture.splits["train"]
             cameras = training_cameras(filmed, config.data)
@@ -318,7 +318,7 @@ def _first(
             degree = stored_sh_degree(config)
             gaussians = initial_gaussians(surroundings(capture), config.init, start, degree, generator)
             colours = _colours(config, capture, gaussians, generator)
-            training = _static_or_dynamic(config, config.model, capture, pictures, colours, generator)
+            training = _static_or_dynamic(config, config.model, capture, images, colours, generator)
             return _First(training.first_scene(gaussians), training, colours)
         case HumanPredictorModel():
             raise ValueError("a network is no scene")
@@ -330,7 +330,7 @@ def _static_or_dynamic(
     config: Config,
     model: StaticModel | DynamicModel,
     capture: Capture,
-    pictures: PictureLoader,
+    images: ImageLoader,
     colours: ColourTraining,
     generator: torch.Generator,
 ) -> StaticTraining | DynamicTraining:
@@ -339,28 +339,26 @@ def _static_or_dynamic(
     update = FilterUpdate(cameras if model.filter_3d else [], filter_steps(config.strategy, config.train.steps))
     match model:
         case DynamicModel() if len(set(training_times(capture))) > 1:
-            views = _training_views(config, model, capture, pictures, colours)
+            views = _training_views(config, model, capture, images, colours)
             return DynamicTraining(model, deform_schedule(model, rates_of(config)), views, update, generator)
         case _:
             return StaticTraining(update)
 
 
-def _alpha_weight(config: Config, capture: Capture, pictures: PictureLoader) -> AlphaWeight:
+def _alpha_weight(config: Config, capture: Capture, images: ImageLoader) -> AlphaWeight:
     """Return how much silhouettes count: what was asked for, or what moving things before this background need."""
     asked, background = config.train.alpha_weight, resolved_background(config, capture)
     if asked is not None:
         return AlphaWeight(asked)
     match config.model:
         case DynamicModel() if capture.has_alpha and background != "random" and len(set(training_times(capture))) > 1:
-            shown = (pictures[i] for i in evenly_spaced(len(pictures), PICTURES))
+            shown = (images[i] for i in evenly_spaced(len(images), IMAGES))
             return measured_alpha_weight(shown, background_colour(background))
         case _:
             return AlphaWeight()
 
 
-def human_start(
-    config: Config, model: HumanModel, capture: Capture, pictures: PictureLoader
-) -> tuple[Gaussians, Subject]:
+def human_start(config: Config, model: HumanModel, capture: Capture, images: ImageLoader) -> tuple[Gaussians, Subject]:
     """Return the first Gaussians of a person, and the person.
 
     Raises:
@@ -378,26 +376,26 @@ def human_start(
     parts = surface_texels(body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0]))
     gaussians, anchors, normals = surface_gaussians(parts, sorted(set(model.scaffold_heights)), sh_degree)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
-    shown = (pictures[i] for i in evenly_spaced(len(pictures), FIRST_VIEWS))
-    return first_look(gaussians, normals, subject, shown, model.min_silhouette_share)
+    shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
+    return first_look(gaussians, normals, subject, shown, model.min_silhouette_fraction)
 
 
 def _training_views(
-    config: Config, model: DynamicModel, capture: Capture, pictures: PictureLoader, colours: ColourTraining
+    config: Config, model: DynamicModel, capture: Capture, images: ImageLoader, colours: ColourTraining
 ) -> TrainingViews:
     """Return the properties of the capture that training a dynamic scene needs."""
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
-    divisor = picture_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
+    divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
     looked_at, options = views_to_compare(views), _training_options(config)
 
     def shader(time: float) -> Shader | None:
         return None if colours.network is None else colours.network.shader(time)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
-        shown = [pictures.shrunk(i, divisor) for i in looked_at]
-        if any(picture.moves is not None for picture in shown):
-            return moving_share_of(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
+        shown = [images.shrunk(i, divisor) for i in looked_at]
+        if any(image.moves is not None for image in shown):
+            return moving_fraction_of(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
         return still_errors(gaussians_at, shown, options, background, shader)
 
     cameras, extent = training_cameras(views, config.data), surroundings(capture).extent
@@ -405,11 +403,11 @@ def _training_views(
 
     def standing() -> list[Footage]:
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
-        return [footage_of((pictures[i] for i in seen), background, sum(map(len, used))) for seen in used]
+        return [footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used]
 
     left_out = held_out_views(views, config.train.hold_out_every)
-    trained_on = [i for i in range(len(pictures)) if i not in left_out]
-    held_out = ComparedViews(pictures, sorted(left_out), options, background, shader)
+    trained_on = [i for i in range(len(images)) if i not in left_out]
+    held_out = ComparedViews(images, sorted(left_out), options, background, shader)
     return TrainingViews(
         training_times(capture),
         cameras,

@@ -47,7 +47,7 @@ class Cameras:
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         """Return the same cameras on another device or in another precision."""
         pose, intrinsics = (
-            x.to(device=device, dtype=dtype, non_blocking=x.device.type == "cpu")  # no card waits for them
+            x.to(device=device, dtype=dtype, non_blocking=x.device.type == "cpu")  # no GPU waits for them
             for x in (self.cam_from_world, self.intrinsics)
         )
         return Cameras(pose, intrinsics, self.width, self.height)

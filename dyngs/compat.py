@@ -14,12 +14,12 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE
 from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import check_focal_lengths
 from dyngs.ops.finite import check_finite
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.options import LARGEST_COUNT, check_choice, check_count, check_near_and_far, check_number
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import MAX_CHANNELS, TILE, BlendOptions, TileEntries, bin_tiles, rasterize
-from dyngs.rendering import check_focal_lengths
 
 GSPLAT_ALPHA_MAX = 0.999
 """Largest alpha of gsplat 1.5 (dyngs and 3DGS: 0.99)."""
@@ -63,7 +63,7 @@ def rasterization(
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Return pictures (C, H, W, D), their alphas (C, H, W, 1), and a dict of intermediate results.
+    """Return images (C, H, W, D), their alphas (C, H, W, 1), and a dict of intermediate results.
 
     Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. ``meta["means2d"]`` may be
     asked to ``retain_grad()``; with ``absgrad`` it also gets an attribute ``absgrad`` in the backward pass.
@@ -81,7 +81,7 @@ def rasterization(
         radius_clip: splats with no larger half extent are skipped, px.
         eps2d: 2D low-pass variance, px^2.
         sh_degree: degree to use; None if colors are values.
-        packed: ``meta`` lists the visible (camera, Gaussian) pairs instead of (C, N) arrays. Pictures are the same.
+        packed: ``meta`` lists the visible (camera, Gaussian) pairs instead of (C, N) arrays. Images are the same.
         backgrounds: (C, D).
         render_mode: colour, accumulated depth (D), expected depth (ED), or both; depth is the last channel.
         absgrad: see above.
@@ -124,11 +124,11 @@ def rasterization(
     channels, backgrounds = _with_depth(shades, splats.projection.depths, backgrounds, render_mode)
     options = BlendOptions(alpha_max=GSPLAT_ALPHA_MAX, absgrad=absgrad)
     entries = bin_tiles(splats.projection, splats.opacities, (width, height), options)
-    picture, alpha = _blend(splats, channels, entries, backgrounds, (width, height), options, channel_chunk)
+    image, alpha = _blend(splats, channels, entries, backgrounds, (width, height), options, channel_chunk)
     if render_mode in ("ED", "RGB+ED"):
-        expected = picture[..., -1:] / alpha.clamp(min=1e-10)
-        picture = torch.cat([picture[..., :-1], expected], dim=-1)
-    return picture, alpha, _meta(splats, entries, cameras)
+        expected = image[..., -1:] / alpha.clamp(min=1e-10)
+        image = torch.cat([image[..., :-1], expected], dim=-1)
+    return image, alpha, _meta(splats, entries, cameras)
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _project(
         per_view = per_view * projection.compensations
     if not packed:
         return _Splats(projection, per_view, projection.means2d, None, None)
-    # The user may ask the packed tensor for its gradient, so the picture has to depend on it.
+    # The user may ask the packed tensor for its gradient, so the image has to depend on it.
     camera_ids, gaussian_ids = torch.nonzero((projection.radii > 0).all(-1), as_tuple=True)
     visible = projection.means2d[camera_ids, gaussian_ids]
     dense = torch.zeros_like(projection.means2d).index_put((camera_ids, gaussian_ids), visible)
@@ -261,10 +261,10 @@ def _blend(
     options: BlendOptions,
     channel_chunk: int,
 ) -> tuple[Tensor, Tensor]:
-    """Return picture (C, H, W, D) and alpha (C, H, W, 1), drawn in passes of ``channel_chunk`` channels."""
+    """Return image (C, H, W, D) and alpha (C, H, W, 1), drawn in passes of ``channel_chunk`` channels."""
     chunk = min(channel_chunk, MAX_CHANNELS)
     probe = _absgrad_probe(splats) if options.absgrad else None
-    pictures, transmittance = [], None
+    images, transmittance = [], None
     for start in range(0, channels.shape[-1], chunk):
         part = slice(start, start + chunk)
         background = None if backgrounds is None else backgrounds[:, part]
@@ -278,10 +278,10 @@ def _blend(
             options=options,
             entries=entries,
         )
-        pictures.append(blended.color)
+        images.append(blended.color)
         transmittance = blended.transmittance if transmittance is None else transmittance
     assert transmittance is not None  # D >= 1
-    return torch.cat(pictures, dim=-1), (1 - transmittance)[..., None]
+    return torch.cat(images, dim=-1), (1 - transmittance)[..., None]
 
 
 def _absgrad_probe(splats: _Splats) -> Tensor:

@@ -34,8 +34,8 @@ class DemoOptions:
     Attributes:
         steps: training steps.
         threads: 0 = all cores.
-        size: width and height of the pictures, pixels.
-        num_times: number of training pictures, one camera and one time each.
+        size: width and height of the images, pixels.
+        num_times: number of training images, one camera and one time each.
         num_points: number of random initial points.
         num_frames: number of frames of the video.
     """
@@ -54,7 +54,7 @@ class DemoResult:
 
     Attributes:
         folder: folder of everything below.
-        capture, run_dir, pictures: folders of the input, the run, and the rendered test views.
+        capture, run_dir, images: folders of the input, the run, and the rendered test views.
         sheet, video, ply: contact sheet, orbit video, and the model for other programs.
         report: metrics of the test views.
         seconds: total time.
@@ -63,7 +63,7 @@ class DemoResult:
     folder: Path
     capture: Path
     run_dir: Path
-    pictures: Path
+    images: Path
     sheet: Path
     video: Path
     ply: Path
@@ -83,22 +83,22 @@ def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> D
 
 
 def _run_demo(folder: Path, options: DemoOptions, start: float) -> DemoResult:
-    capture, run_dir, pictures = folder / "capture", folder / "run", folder / "pictures"
-    print(f"[1/4] ray tracing the pictures of the demo scene into {capture}", flush=True)
+    capture, run_dir, images = folder / "capture", folder / "run", folder / "images"
+    print(f"[1/4] ray tracing the images of the demo scene into {capture}", flush=True)
     write_dynamic_capture("spin", capture, DynamicOptions(size=options.size, num_times=options.num_times, samples=3))
     print(f"[2/4] training {options.steps} steps into {run_dir}", flush=True)
     train(demo_config(capture, run_dir, options))
     print("[3/4] evaluating on held-out views", flush=True)
     report = evaluate_run(run_dir, threads=options.threads)
     print("[4/4] rendering the test views and an orbit around the moving scene", flush=True)
-    write_split_images(run_dir, "test", pictures)
+    write_split_images(run_dir, "test", images)
     job = job_of_run(run_dir, RenderJobOptions("orbit", options.num_frames))
     video = folder / "orbit.mp4"
     output = OutputOptions(video=video)
     write_job_images(job, None, output)
     ply = export_ply(run_dir, folder / "splats.ply")
     seconds = time.perf_counter() - start
-    return DemoResult(folder, capture, run_dir, pictures, pictures / "sheet.png", video, ply, report, seconds)
+    return DemoResult(folder, capture, run_dir, images, images / "sheet.png", video, ply, report, seconds)
 
 
 def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
@@ -109,7 +109,7 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
         f"model.num_random_moving={options.num_points // 3}",
         f"train.steps={options.steps}",
         "model.compare_with_still=false",  # the scene is made to move
-        "train.initial_downscale=2",  # the pictures are small
+        "train.initial_downscale=2",  # the images are small
         "run.name=demo",
         f"run.threads={options.threads}",
     )
@@ -162,7 +162,7 @@ def result_table(result: DemoResult) -> Table:
         "PSNR dB": f"{report.psnr:.2f}",
         "SSIM": f"{report.ssim:.4f}",
         "Gaussians": f"{report.num_gaussians:,}",
-        "moving": f"{report.moving_share:.0%}",
+        "moving": f"{report.moving_fraction:.0%}",
         "MB": f"{report.model_mb:.1f}",
         "frames/s": f"{report.fps:.0f}",
         "training s": f"{report.seconds_train:.1f}",

@@ -1,6 +1,6 @@
 """Image metrics: PSNR, SSIM, FLIP and LPIPS, with the conventions written out.
 
-All functions take pictures (H, W, 3), display-referred sRGB, clamped here to [0, 1]; nothing is rounded to 8 bit.
+All functions take images (H, W, 3), display-referred sRGB, clamped here to [0, 1]; nothing is rounded to 8 bit.
 ``mask`` (H, W) holds weights in [0, 1], 1 = counts, 0 = ignore; a mask of zeros gives NaN. FLIP and LPIPS depend on
 optional packages: where one is missing, the result is a ``MetricValue`` with the reason and no value. Nothing is ever
 downloaded.
@@ -21,7 +21,7 @@ from torch import Tensor
 LpipsNet = Literal["alex", "vgg", "squeeze"]
 
 MAX_PSNR = 100.0
-"""Reported for pictures that agree to a mean squared error of 1e-10 or better, so that no infinity enters a mean."""
+"""Reported for images that agree to a mean squared error of 1e-10 or better, so that no infinity enters a mean."""
 
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
@@ -56,7 +56,7 @@ def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
     """Return (H, W, 3) structural similarity per pixel and channel; see ``ssim``.
 
-    By way of the difference d and the sum s, whose variances do not cancel where the pictures agree or are white: with
+    By way of the difference d and the sum s, whose variances do not cancel where the images agree or are white: with
     P = mean_a^2 + mean_b^2 + C1 and Q = var_a + var_b + C2 it is (1 - mean_d^2 / P) (1 - var_d / Q).
     """
     a, b = (_clamped(x).permute(2, 0, 1)[:, None] for x in (rendered, truth))
@@ -98,7 +98,7 @@ def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricV
 
 
 def masked(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
-    """Return (H, W, 3) the rendered picture with ignored pixels replaced by the truth."""
+    """Return (H, W, 3) the rendered image with ignored pixels replaced by the truth."""
     return rendered if mask is None else torch.lerp(truth, rendered, mask[..., None].to(rendered.dtype))
 
 
@@ -109,7 +109,7 @@ class Lpips:
     Attributes:
         net: backbone.
         reason: one line where ``distance`` is None.
-        distance: maps two pictures (1, 3, H, W) in [-1, 1] to the distance, or None.
+        distance: maps two images (1, 3, H, W) in [-1, 1] to the distance, or None.
     """
 
     net: LpipsNet
@@ -125,7 +125,7 @@ class Lpips:
             with torch.no_grad():
                 return MetricValue(self.distance(a, b).item())
         except RuntimeError:
-            return MetricValue(None, f"pictures of {a.shape[3]}x{a.shape[2]} are too small for LPIPS ({self.net})")
+            return MetricValue(None, f"images of {a.shape[3]}x{a.shape[2]} are too small for LPIPS ({self.net})")
 
 
 def load_lpips(net: LpipsNet = "alex", device: torch.device | str = "cpu") -> Lpips:

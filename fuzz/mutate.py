@@ -8,8 +8,8 @@ from random import Random
 from fuzz.arrays import npy_changed, npz_changed
 from fuzz.blobs import TEXTS, bytes_changed, text_changed
 from fuzz.case import Case
+from fuzz.images import exr_changed, jpeg_changed, png_changed, video_changed
 from fuzz.opcodes import pickle_changed
-from fuzz.pictures import exr_changed, jpeg_changed, png_changed, video_changed
 from fuzz.scenes import (
     bvh_changed,
     colmap_changed,
@@ -51,7 +51,7 @@ CHANGES: Mapping[str, Change] = {
 }
 """Mutations of files by suffix."""
 
-_PICTURES = (".png", ".jpg", ".exr", ".tif", ".bmp", ".webp")
+_IMAGES = (".png", ".jpg", ".exr", ".tif", ".bmp", ".webp")
 _LINKS = ("..", "../precious", ".", "../precious/keep.txt", "none", "/dev/zero", "/dev/null", "../capture")
 
 
@@ -74,10 +74,10 @@ def _file_changed(case: Case, rng: Random) -> Case:
 
 
 def _chosen(case: Case, rng: Random) -> str | None:
-    """Choose a file; all pictures together count as one, so that files that describe them are mutated more often."""
-    pictures = [name for name in sorted(case.files) if name.endswith(_PICTURES)]
-    others = [name for name in sorted(case.files) if not name.endswith(_PICTURES)]
-    choices = others + ([rng.choice(pictures)] if pictures else [])
+    """Choose a file; all images together count as one, so that files that describe them are mutated more often."""
+    images = [name for name in sorted(case.files) if name.endswith(_IMAGES)]
+    others = [name for name in sorted(case.files) if not name.endswith(_IMAGES)]
+    choices = others + ([rng.choice(images)] if images else [])
     return rng.choice(choices) if choices else None
 
 

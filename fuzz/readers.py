@@ -29,9 +29,9 @@ from fuzz.seeds import (
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
+    from dyngs.gaussians.rendering import Rendering
+    from dyngs.gaussians.scene import Scene
     from dyngs.human.template.body import BodyTemplate
-    from dyngs.rendering import Rendering
-    from dyngs.scene import Scene
 
 Read = Callable[[Path], object]
 """Reads the input in a folder and uses it; returns values that must be finite."""
@@ -57,10 +57,10 @@ class Reader:
 
 
 def read_whole_capture(root: Path) -> object:
-    """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body, pictures."""
+    """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body, images."""
+    from dyngs.capture.inspection.report import format_report, inspect_capture
     from dyngs.config import DataConfig
-    from dyngs.data.inspection.report import format_report, inspect_capture
-    from dyngs.data.loader import PictureLoader
+    from dyngs.data.loader import ImageLoader
     from dyngs.data.read import read_capture
     from dyngs.data.tracks import read_tracks
     from dyngs.errors import DyngsError
@@ -87,10 +87,10 @@ def read_whole_capture(root: Path) -> object:
         ]
     if capture.tracks_path is not None:
         found.append(read_tracks(capture.tracks_path))
-    loader = PictureLoader(views, options, with_maps=True)
-    pictures = [loader[i] for i in range(min(len(loader), 2))]
+    loader = ImageLoader(views, options, with_maps=True)
+    images = [loader[i] for i in range(min(len(loader), 2))]
     # NaN in flow means unknown.
-    found += [p if p.flow is None else replace(p, flow=p.flow.nan_to_num(0.0)) for p in pictures]
+    found += [p if p.flow is None else replace(p, flow=p.flow.nan_to_num(0.0)) for p in images]
     return found
 
 
@@ -100,17 +100,17 @@ def require_lines(report: str) -> None:
     assert not bad, f"control characters in a report: {bad[0]!r}"
 
 
-def read_a_picture(root: Path) -> object:
-    """Read header and pixels of a picture."""
-    from dyngs.data.pictures.images import check_picture, read_picture
+def read_a_image(root: Path) -> object:
+    """Read header and pixels of an image."""
+    from dyngs.data.images.images import check_image, read_image
 
     path = only(root)
-    return check_picture(path), read_picture(path)
+    return check_image(path), read_image(path)
 
 
 def read_a_depth_map(root: Path) -> object:
-    """Read a depth map, and the same file as labels where it is a picture."""
-    from dyngs.data.pictures.depth import read_depth, read_labels
+    """Read a depth map, and the same file as labels where it is an image."""
+    from dyngs.data.images.depth import read_depth, read_labels
 
     path = only(root)
     return read_depth(path), read_labels(path) if path.suffix == ".png" else None
@@ -118,7 +118,7 @@ def read_a_depth_map(root: Path) -> object:
 
 def read_a_flow_field(root: Path) -> object:
     """Read optical flow; NaN in it is no failure: it means unknown."""
-    from dyngs.data.pictures.flow import read_flow
+    from dyngs.data.images.flow import read_flow
 
     return read_flow(only(root)).nan_to_num(0.0)
 
@@ -146,7 +146,7 @@ def read_known_tracks(root: Path) -> object:
 
 def read_a_video(root: Path) -> object:
     """Read size, length and first frames of a video."""
-    from dyngs.data.pictures.video import probe_video, read_frames
+    from dyngs.data.images.video import probe_video, read_frames
 
     path = only(root)
     info = probe_video(path)
@@ -187,21 +187,21 @@ def read_a_motion(root: Path) -> object:
 
 
 def read_given_joints(root: Path) -> object:
-    """Read 3D joints, for two pictures of a capture."""
+    """Read 3D joints, for two images of a capture."""
     from dyngs.human.fit.joints3d import read_joints
 
-    return read_joints(only(root), two_pictures(root), small_body(24))
+    return read_joints(only(root), two_images(root), small_body(24))
 
 
 def read_2d_key_points(root: Path) -> object:
-    """Read key points of two pictures."""
+    """Read key points of two images."""
     from dyngs.human.fit.keypoints import read_keypoints
 
-    return read_keypoints(only(root), two_pictures(root).splits["train"])
+    return read_keypoints(only(root), two_images(root).splits["train"])
 
 
-def two_pictures(root: Path) -> Capture:
-    """Return a capture of two views, whose pictures do not exist."""
+def two_images(root: Path) -> Capture:
+    """Return a capture of two views, whose images do not exist."""
     import numpy as np
 
     from dyngs.data.capture import Capture, View
@@ -225,8 +225,8 @@ def read_splats(root: Path) -> object:
 
 def read_a_run(root: Path) -> object:
     """Read a run, and render it at two times."""
+    from dyngs.gaussians.scene import render_options
     from dyngs.runs.checkpoint import load_run, seconds_at
-    from dyngs.scene import render_options
 
     run = load_run(root)
     return seconds_at(root, 7), run.info, played(run.scene, render_options(run.config.model))
@@ -235,7 +235,7 @@ def read_a_run(root: Path) -> object:
 def read_a_person(root: Path) -> object:
     """Read an avatar and render it."""
     from dyngs.export.avatar import read_avatar
-    from dyngs.scene import render_options
+    from dyngs.gaussians.scene import render_options
 
     run = read_avatar(only(root))
     return run.info, played(run.scene, render_options(run.config.model))
@@ -317,10 +317,10 @@ def words(root: Path) -> list[str]:
 
 
 def drawn(gaussians: object, options: object) -> Rendering:
-    """Render a small picture of Gaussians."""
+    """Render a small image of Gaussians."""
     from moving_scene import camera
 
-    from dyngs.rendering import render
+    from dyngs.gaussians.rendering import render
 
     return render(gaussians, camera(8, 6), options)  # type: ignore[arg-type]
 
@@ -366,8 +366,8 @@ _JOINTS: dict[str, Seed] = {
     "frame_data": files.write_frame_data,
     "sam_3d_body": files.write_sam_3d_body,
 }
-_PICTURES: dict[str, Seed] = {"png": files.write_png, "png16": files.write_png16, "jpeg": files.write_jpeg}
-_PICTURES |= {"exr": files.write_exr, "tiff": files.write_tiff}
+_IMAGES: dict[str, Seed] = {"png": files.write_png, "png16": files.write_png16, "jpeg": files.write_jpeg}
+_IMAGES |= {"exr": files.write_exr, "tiff": files.write_tiff}
 _BODIES: dict[str, Seed] = {
     "npz": files.write_smpl_npz,
     "pickle": files.write_smpl_pickle,
@@ -376,7 +376,7 @@ _BODIES: dict[str, Seed] = {
 
 READERS: dict[str, Reader] = {
     **{name: Reader(seeds, read_whole_capture, needs=_NEEDS.get(name)) for name, seeds in CAPTURES.items()},
-    "pictures": Reader(_PICTURES, read_a_picture),
+    "images": Reader(_IMAGES, read_a_image),
     "depth": Reader({"png16": files.write_png16, "npz": files.write_depth_npz}, read_a_depth_map),
     "flow": Reader({"npy": files.write_flow_npy, "flo": files.write_flo}, read_a_flow_field),
     "tracks": Reader({"npz": files.write_tracks}, read_2d_tracks),

@@ -1,4 +1,4 @@
-"""Seeds that are no captures: pictures, bodies, motions, runs, configurations, text."""
+"""Seeds that are no captures: images, bodies, motions, runs, configurations, text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from motion_files import Clip, as_local, glb_of, random_motion, skeleton, tiny_body, write_bvh
 from moving_scene import camera, row_of_balls
 from synthetic_bodies import model, write_npz, write_obj, write_pickle
-from tiny_captures import random_pixels, write_picture, write_video
+from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
 from dyngs.build import restored_scene
@@ -22,11 +22,11 @@ from dyngs.data.true_tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.export.avatar import _KIND as AVATAR_KIND
 from dyngs.files.tensor_file import write_tensors
+from dyngs.gaussians.scene import Scene
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.output.camera_paths import CameraPath, write_path
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.scene import Scene
 from dyngs.splats import formats
 from dyngs.splats.ply import write_ply
 from dyngs.splats.splat_file import SplatFile, with_degree
@@ -38,17 +38,17 @@ _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
 def write_png(root: Path) -> None:
     """Write a PNG with alpha."""
-    write_picture(root / "a.png", random_pixels(5, 7, 4))
+    write_image(root / "a.png", random_pixels(5, 7, 4))
 
 
 def write_png16(root: Path) -> None:
     """Write a PNG of 16 bits, grey."""
-    write_picture(root / "a.png", random_pixels(5, 7, 1).astype(np.uint16) * 257)
+    write_image(root / "a.png", random_pixels(5, 7, 1).astype(np.uint16) * 257)
 
 
 def write_jpeg(root: Path) -> None:
     """Write a JPEG."""
-    write_picture(root / "a.jpg", random_pixels(9, 17, 3))
+    write_image(root / "a.jpg", random_pixels(9, 17, 3))
 
 
 def write_joints_npz(root: Path) -> None:
@@ -58,7 +58,7 @@ def write_joints_npz(root: Path) -> None:
 
 
 def write_joints_json(root: Path) -> None:
-    """Write 3D joints by the names of pictures."""
+    """Write 3D joints by the names of images."""
     joints = {f"p{i}": row.tolist() for i, row in enumerate(random_places(2, 25, 3))}
     (root / "a.json").write_text(json.dumps({"order": "openpose25", "space": "camera", "joints": joints}))
 
@@ -75,21 +75,21 @@ def write_frame_data(root: Path) -> None:
 
 
 def write_sam_3d_body(root: Path) -> None:
-    """Write the 3D key points of a picture as SAM 3D Body has them."""
+    """Write the 3D key points of an image as SAM 3D Body has them."""
     (root / "a").mkdir()
     fields = {"pred_keypoints_3d": random_places(1, 70, 3)[0], "pred_cam_t": np.array([0.0, 0.1, 4.0])}
     np.savez(root / "a" / "p0.npz", **fields)  # pyright: ignore[reportArgumentType]
 
 
 def write_openpose(root: Path) -> None:
-    """Write 2D key points of a picture as OpenPose does."""
+    """Write 2D key points of an image as OpenPose does."""
     (root / "a").mkdir()
     points = random_places(1, 25, 3)[0].ravel().tolist()
     (root / "a" / "p0_keypoints.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": points}]}))
 
 
 def write_coco(root: Path) -> None:
-    """Write 2D key points of a picture as COCO has them."""
+    """Write 2D key points of an image as COCO has them."""
     points = np.abs(random_places(1, 17, 3)[0]).ravel().tolist()
     fields = {"images": [{"id": 1, "file_name": "p0.png"}], "annotations": [{"image_id": 1, "keypoints": points}]}
     (root / "a.json").write_text(json.dumps(fields))
@@ -119,7 +119,7 @@ def write_flo(root: Path) -> None:
 
 
 def write_tracks(root: Path) -> None:
-    """Write two tracks in three pictures."""
+    """Write two tracks in three images."""
     names = np.array(["0", "1", "2"])
     np.savez(root / "a.npz", xy=np.ones((3, 2, 2), np.float32), visible=np.ones((3, 2), bool), names=names)
 
@@ -133,12 +133,12 @@ def write_known_tracks(root: Path) -> None:
 
 def write_exr(root: Path) -> None:
     """Write an EXR of floats with alpha."""
-    write_picture(root / "a.exr", random_pixels(5, 7, 4).astype(np.float32) / 255)
+    write_image(root / "a.exr", random_pixels(5, 7, 4).astype(np.float32) / 255)
 
 
 def write_tiff(root: Path) -> None:
     """Write a TIFF."""
-    write_picture(root / "a.tif", random_pixels(5, 7, 3))
+    write_image(root / "a.tif", random_pixels(5, 7, 3))
 
 
 def write_mp4(root: Path) -> None:
@@ -229,7 +229,7 @@ def write_packed(name: str, root: Path) -> None:
 
 
 def write_still_run(root: Path) -> None:
-    """Write a run of a still scene."""
+    """Write a run of a static scene."""
     save_config(Config(data=DataConfig.model_validate({"root": "capture"}), model=StaticModel()), root / RESOLVED_NAME)
     save_checkpoint(root, Checkpoint(_INFO, _gaussians()), 1.0)
 

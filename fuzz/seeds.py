@@ -18,8 +18,8 @@ from tiny_captures import (
     write_colmap,
     write_folder,
     write_frames,
+    write_image,
     write_nerfies,
-    write_picture,
     write_poses_bounds,
     write_video,
 )
@@ -31,20 +31,20 @@ _LENS = {"w": 6, "h": 4, "fl_x": 5.0, "fl_y": 5.0, "cx": 3.0, "cy": 2.0}
 
 
 def write_blender(root: Path) -> None:
-    """Write three training pictures and one for testing, with alpha and times."""
+    """Write three training images and one for testing, with alpha and times."""
     for split, count in (("train", 3), ("test", 1)):
         names = [f"./{split}/r_{i}" for i in range(count)]
         for i, name in enumerate(names):
-            write_picture(root / f"{name}.png", random_pixels(4, 6, 4, seed=i))
+            write_image(root / f"{name}.png", random_pixels(4, 6, 4, seed=i))
         write_frames(root / f"transforms_{split}.json", names, {"camera_angle_x": 0.7})
 
 
 def write_nerfstudio(root: Path) -> None:
-    """Write three JPEG pictures with a lens, times, a mask, points, and every kind of prior."""
+    """Write three JPEG images with a lens, times, a mask, points, and every kind of prior."""
     names = [f"images/{i:02d}.jpg" for i in range(3)]
     for i, name in enumerate(names):
-        write_picture(root / name, random_pixels(4, 6, 3, seed=i))
-        write_picture(root / f"masks/{i:02d}.png", random_pixels(4, 6, 1, seed=i))
+        write_image(root / name, random_pixels(4, 6, 3, seed=i))
+        write_image(root / f"masks/{i:02d}.png", random_pixels(4, 6, 1, seed=i))
     fields = {**_LENS, "camera_model": "OPENCV", "k1": 0.1, "p2": -0.01, "ply_file_path": "points.ply"}
     write_frames(root / "transforms.json", names, {**fields, "applied_transform": np.eye(4)[:3].tolist()})
     content = json.loads((root / "transforms.json").read_text())
@@ -63,22 +63,22 @@ def write_nerfstudio(root: Path) -> None:
 
 
 def write_colmap_binary(root: Path) -> None:
-    """Write a binary COLMAP model with four pictures."""
+    """Write a binary COLMAP model with four images."""
     write_colmap(root, "bin", "OPENCV", (10, 11, 6, 4, 0.1, 0, 0, 0), count=4)
 
 
 def write_colmap_text(root: Path) -> None:
-    """Write a COLMAP model as text with four pictures."""
+    """Write a COLMAP model as text with four images."""
     write_colmap(root, "txt", count=4)
 
 
 def write_small_nerfies(root: Path) -> None:
-    """Write a Nerfies capture with four pictures."""
+    """Write a Nerfies capture with four images."""
     write_nerfies(root, count=4)
 
 
 def write_llff(root: Path) -> None:
-    """Write three cameras with two pictures each."""
+    """Write three cameras with two images each."""
     write_poses_bounds(root, 3)
     for i in range(3):
         write_folder(root / f"cam0{i}" / "images", range(2))
@@ -110,8 +110,8 @@ def write_zju(root: Path) -> None:
     }
     frames = [{"ims": [f"Camera_B{camera + 1}/{frame:06d}.jpg" for camera in range(3)]} for frame in range(2)]
     for name in (name for frame in frames for name in frame["ims"]):
-        write_picture(root / name, random_pixels(HEIGHT, WIDTH, 3))
-        write_picture((root / "mask_cihp" / name).with_suffix(".png"), random_pixels(HEIGHT, WIDTH, 1))
+        write_image(root / name, random_pixels(HEIGHT, WIDTH, 3))
+        write_image((root / "mask_cihp" / name).with_suffix(".png"), random_pixels(HEIGHT, WIDTH, 1))
     for frame in range(2):
         _save_object(root / "new_params" / f"{frame}.npy", _smpl_of(frame) | {"shapes": np.ones((1, 10))})
     _save_object(root / "annots.npy", {"cams": cams, "ims": frames})
@@ -126,15 +126,15 @@ def write_zju_single(root: Path) -> None:
         cameras[name] = {"intrinsics": _intrinsics(), "extrinsics": _cam_from_world(1)[0], "distortions": np.zeros(5)}
         own = {key: value[0] for key, value in _smpl_of(frame).items()}
         meshes[name] = {**own, "joints": joints + 1, "tpose_joints": joints}
-        write_picture(root / "images" / f"{name}.png", random_pixels(HEIGHT, WIDTH, 3))
-        write_picture(root / "masks" / f"{name}.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
+        write_image(root / "images" / f"{name}.png", random_pixels(HEIGHT, WIDTH, 3))
+        write_image(root / "masks" / f"{name}.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
     (root / "cameras.pkl").write_bytes(pickle.dumps(cameras))
     (root / "mesh_infos.pkl").write_bytes(pickle.dumps(meshes, 2))
 
 
 def write_neuman(root: Path) -> None:
-    """Write four pictures with ROMP's fits and their alignments."""
-    _write_neuman_pictures(root)
+    """Write four images with ROMP's fits and their alignments."""
+    _write_neuman_images(root)
     fit = {"pose": np.full((4, 72), 0.1, np.float32), "betas": np.ones((4, 10), np.float32)}
     (root / "smpl_output_romp.pkl").write_bytes(pickle.dumps({1: fit}))
     alignment = np.concatenate([0.5 * np.eye(3), [[0.1, 0.2, 0.3]]]).astype(np.float32)
@@ -143,8 +143,8 @@ def write_neuman(root: Path) -> None:
 
 
 def write_neuman_aligned(root: Path) -> None:
-    """Write four pictures with refined fits."""
-    _write_neuman_pictures(root)
+    """Write four images with refined fits."""
+    _write_neuman_images(root)
     fields: dict[str, Any] = {"global_orient": np.full((4, 3), 0.1), "body_pose": np.full((4, 69), 0.2)}
     fields |= {"betas": np.ones((4, 10)), "transl": np.arange(4)[:, None] * np.ones(3), "scale": np.full(4, 0.7)}
     (root / "4d_humans").mkdir()
@@ -184,17 +184,17 @@ def write_body_json(root: Path) -> None:
         content = json.loads(path.read_text())
         for i, own in enumerate(content["frames"]):
             own |= {"frame": i // len(cameras), "camera": cameras[i % len(cameras)], "time": float(i // len(cameras))}
-            write_picture(root / names[i], random_pixels(4, 6, 4, seed=i))
+            write_image(root / names[i], random_pixels(4, 6, 4, seed=i))
         path.write_text(json.dumps(content))
     numbers = np.arange(2, dtype=np.float32)[:, None]
     fields: dict[str, Any] = {"poses": numbers * np.ones(165), "trans": numbers * np.ones(3), "betas": np.zeros(10)}
     np.savez(root / "body_train.npz", **fields, scale=1.5, mocap_frame_rate=12.0, surface_model_type="smplx")
 
 
-def _write_neuman_pictures(root: Path) -> None:
+def _write_neuman_images(root: Path) -> None:
     write_colmap(root, "txt", count=4)
     for i in range(4):
-        write_picture(root / "segmentations" / f"{i:02d}.jpg", np.zeros((8, 12, 1), np.uint8))
+        write_image(root / "segmentations" / f"{i:02d}.jpg", np.zeros((8, 12, 1), np.uint8))
 
 
 def _cam_from_world(count: int) -> list[np.ndarray]:

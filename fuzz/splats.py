@@ -38,7 +38,7 @@ def spz_changed(data: bytes, rng: Random) -> bytes:
 
 
 def sog_changed(data: bytes, rng: Random) -> bytes:
-    """Return a .sog after one mutation of a picture, of meta.json or of the archive."""
+    """Return a .sog after one mutation of an image, of meta.json or of the archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}

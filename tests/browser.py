@@ -5,7 +5,7 @@
         with Browser() as browser:
             page = browser.open("file:///tmp/page.html")
             page.wait_for("window.ready === true")
-            picture = page.screenshot()
+            image = page.screenshot()
             assert page.errors == [] and page.requests == ["file:///tmp/page.html"]
 
 Several pages of one ``Browser`` are strangers to each other, as in private windows. WebGL runs on the CPU

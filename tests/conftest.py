@@ -25,7 +25,7 @@ import pytest
 import torch
 from hypothesis import settings
 from scenes import Scene, random_scene
-from tiny_captures import random_pixels, write_colmap, write_frames, write_picture
+from tiny_captures import random_pixels, write_colmap, write_frames, write_image
 from tiny_fields import write_tiny_capture
 
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
@@ -89,7 +89,7 @@ def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def one_thread(set_threads: Callable[[int], None]) -> None:
-    """For tests of tiny pictures, where waking threads would take most of the time, above all on a busy machine."""
+    """For tests of tiny images, where waking threads would take most of the time, above all on a busy machine."""
     set_threads(1)
 
 
@@ -103,7 +103,7 @@ def set_threads() -> Iterator[Callable[[int], None]]:
 
 @pytest.fixture(scope="session")
 def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four pictures of 16 px; nothing moves."""
+    """Four images of 16 px; nothing moves."""
     folder = tmp_path_factory.mktemp("capture")
     write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
     return folder
@@ -124,21 +124,21 @@ def person(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def blender_root(tmp_path: Path) -> Path:
-    """16 train and 2 test RGBA pictures of 12x8."""
+    """16 train and 2 test RGBA images of 12x8."""
     for split, count in (("train", 16), ("test", 2)):
         names = [f"./{split}/r_{i}" for i in range(count)]
         for i, name in enumerate(names):
-            write_picture(tmp_path / f"{name}.png", random_pixels(8, 12, 4, seed=i))
+            write_image(tmp_path / f"{name}.png", random_pixels(8, 12, 4, seed=i))
         write_frames(tmp_path / f"transforms_{split}.json", names, {"camera_angle_x": 0.7})
     return tmp_path
 
 
 @pytest.fixture
 def nerfstudio_root(tmp_path: Path) -> Path:
-    """10 JPEG pictures of 12x8 with OPENCV distortion."""
+    """10 JPEG images of 12x8 with OPENCV distortion."""
     names = [f"images/{i:02d}.jpg" for i in range(10)]
     for i, name in enumerate(names):
-        write_picture(tmp_path / name, random_pixels(8, 12, 3, seed=i))
+        write_image(tmp_path / name, random_pixels(8, 12, 3, seed=i))
     fields = {"w": 12, "h": 8, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.5, "cy": 3.5, "camera_model": "OPENCV"}
     write_frames(tmp_path / "transforms.json", names, {**fields, "k1": 0.1, "p2": -0.01})
     return tmp_path
@@ -146,7 +146,7 @@ def nerfstudio_root(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def colmap_root(tmp_path: Path) -> Path:
-    """Nine pictures in two subfolders, binary model."""
+    """Nine images in two subfolders, binary model."""
     return write_colmap(tmp_path)
 
 

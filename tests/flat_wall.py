@@ -1,4 +1,4 @@
-"""A wall whose pictures are known: cameras that stand side by side before it, and what they and a model see."""
+"""A wall whose images are known: cameras that stand side by side before it, and what they and a model see."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
-from dyngs.rendering import Rendering
+from dyngs.data.loader import Image
+from dyngs.gaussians.rendering import Rendering
 
 SIZE = (80, 60)
-"""Width and height of the pictures."""
+"""Width and height of the images."""
 DISTANCE, FOCAL = 5.0, 80.0
 BLACK = torch.zeros(3)
 
@@ -39,21 +39,21 @@ def places(camera: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def wall(camera: Cameras) -> Tensor:
-    """Return the (H, W, 3) picture of a wall of soft colours."""
+    """Return the (H, W, 3) image of a wall of soft colours."""
     x, y = places(camera)
     return torch.stack([0.5 + 0.2 * torch.sin(2 * x), 0.5 + 0.2 * torch.cos(1.5 * y + x), 0.5 + 0 * x], -1)
 
 
-def seen_from(cameras: Sequence[Cameras]) -> list[Picture]:
-    """Return the pictures of the wall."""
-    return [Picture(f"{i}", camera, wall(camera), None, None, None) for i, camera in enumerate(cameras)]
+def seen_from(cameras: Sequence[Cameras]) -> list[Image]:
+    """Return the images of the wall."""
+    return [Image(f"{i}", camera, wall(camera), None, None, None) for i, camera in enumerate(cameras)]
 
 
-def with_block(picture: Picture, rows: slice, columns: slice) -> Picture:
-    """Return ``picture`` with a red block in front."""
-    rgb = picture.rgb_premultiplied.clone()
+def with_block(image: Image, rows: slice, columns: slice) -> Image:
+    """Return ``image`` with a red block in front."""
+    rgb = image.rgb_premultiplied.clone()
     rgb[rows, columns] = torch.tensor([0.9, 0.05, 0.05])
-    return replace(picture, rgb_premultiplied=rgb)
+    return replace(image, rgb_premultiplied=rgb)
 
 
 def with_depth(cameras: Cameras) -> Rendering:
@@ -64,6 +64,6 @@ def with_depth(cameras: Cameras) -> Rendering:
 
 
 def learned(camera: Cameras, error: float = 0.004) -> Tensor:
-    """Return the picture of a model that has learned the wall but for waves of an ``error``."""
+    """Return the image of a model that has learned the wall but for waves of an ``error``."""
     x, y = places(camera)
     return wall(camera) + error * (torch.sin(9 * x) * torch.cos(7 * y))[..., None]

@@ -13,16 +13,16 @@ from moving_scene import camera
 from tiny_fields import KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.colour.training import NetworkTraining
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
-from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene
+from dyngs.gaussians.colour.training import NetworkTraining
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import prefixed, tensors_of
 from dyngs.storage.coding import compressed
 from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, SceneInfo, _Header, _stored
 from dyngs.storage.tensors import Coding, Kind
-from dyngs.visibility import VisibilityMasks
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]
@@ -113,11 +113,11 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
 
 
 def require_drawable(scene: Scene) -> None:
-    """Nothing, if the pictures of a scene are finite; raises what drawing it raises."""
+    """Nothing, if the images of a scene are finite; raises what drawing it raises."""
     for time in (None, 0.0, 0.37, 1.0):
         for options in (RenderOptions(), RenderOptions(near=0.01, depth="expected")):
             drawn = scene.render(camera(), time, options=options, background=torch.ones(3))
-            assert bool(drawn.rgb.isfinite().all()), "a picture is not finite"
+            assert bool(drawn.rgb.isfinite().all()), "an image is not finite"
 
 
 def one_line(error: Exception, path: Path) -> None:

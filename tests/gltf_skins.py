@@ -49,7 +49,7 @@ class SkinnedGlb:
         """The numbers of an attribute of the primitive."""
         return self.numbers(self.primitive["attributes"][name])
 
-    def picture(self) -> np.ndarray:
+    def image(self) -> np.ndarray:
         """The first image, (H, W, 3)."""
         view = self.json["bufferViews"][self.json["images"][0]["bufferView"]]
         start = view["byteOffset"]

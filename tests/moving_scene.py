@@ -17,7 +17,7 @@ from dyngs.deform.field import DeformationField, FieldSetup, NetworkField, Offse
 from dyngs.deform.fields import field_state, new_field
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
-from dyngs.parameters import Parameters
+from dyngs.gaussians.parameters import Parameters
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.state import tensors_of
 from dyngs.static.scene import StaticScene
@@ -85,7 +85,7 @@ def camera(width: int = 20, height: int = 14) -> Cameras:
 
 
 def write_timed_capture(root: Path, *, standing: bool = False) -> Path:
-    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test pictures from one pose."""
+    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test images from one pose."""
     options = StillOptions(size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1)
     write_still_capture(root, options)
     for split, times in (("train", TRAIN_TIMES), ("test", TEST_TIMES)):

@@ -8,10 +8,12 @@ from tiny_fields import KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.camera import Cameras
-from dyngs.colour.network import ColourNetwork, box_around
 from dyngs.config import DynamicModel, HumanModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.colour.network import ColourNetwork, box_around
+from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
@@ -23,11 +25,9 @@ from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import default_template
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
-from dyngs.scene import Scene
 from dyngs.state import State, part_of, tensors_of
 from dyngs.static.rates import Rates
 from dyngs.static.scene import StaticScene
-from dyngs.visibility import VisibilityMasks
 
 KINDS = ("static", *FIELDS, "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])

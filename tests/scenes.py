@@ -91,7 +91,7 @@ def look_around(views: int, dtype: torch.dtype = torch.float64) -> Tensor:
 def random_scene(
     n: int = 20, views: int = 2, size: tuple[int, int] = (37, 29), seed: int = 0, degree: int = 1
 ) -> Scene:
-    """Gaussians of 1 to 10 px around the origin, float64; no dimension of the picture is a multiple of the tile."""
+    """Gaussians of 1 to 10 px around the origin, float64; no dimension of the image is a multiple of the tile."""
     g = torch.Generator().manual_seed(seed)
     width, height = size
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 
 from dyngs import build
 from dyngs.api.following import together
@@ -91,10 +91,10 @@ def trained(configs: list[Config], fails: str = "") -> int:
     return together(lead)
 
 
-def trained_on_card(configs: list[Config]) -> int:
-    """As ``trained``, with the scene on the pretended card."""
-    build.device_for = lambda _: CARD
-    with pretend_card():
+def trained_on_gpu(configs: list[Config]) -> int:
+    """As ``trained``, with the scene on the pretended GPU."""
+    build.device_for = lambda _: GPU
+    with pretend_gpu():
         return trained(configs)
 
 
@@ -145,7 +145,7 @@ def _before_step(step: int, act: Callable[[Trainer], object]) -> None:
 
 
 def _refuse(trainer: Trainer) -> None:
-    raise DyngsError("picture 3 is damaged")
+    raise DyngsError("image 3 is damaged")
 
 
 def _nudge(trainer: Trainer) -> None:

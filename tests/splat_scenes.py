@@ -1,4 +1,4 @@
-"""Gaussians of every kind for the tests of file formats, and pictures of them."""
+"""Gaussians of every kind for the tests of file formats, and images of them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from two_balls import cameras_around
 from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import render
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.rendering import render
 from dyngs.splats.formats import FORMATS, Format
 
 AROUND = cameras_around(3, 48, 36)
@@ -31,7 +31,7 @@ def cloud(count: int = 400, degree: int = 3, seed: int = 0) -> Gaussians:
 
 
 def seen(gaussians: Gaussians, cameras: Cameras = AROUND) -> torch.Tensor:
-    """Return pictures (V, H, W, 3) in [0, 1]."""
+    """Return images (V, H, W, 3) in [0, 1]."""
     return render(gaussians, cameras).rgb.clamp(0, 1)
 
 

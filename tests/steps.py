@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 import torch
 from moving_scene import camera
 
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.training.events import StepDone, StepReport
 from dyngs.training.loop import Loop, Stopwatch
 from dyngs.training.state import Checkpoint, CheckpointInfo
 
-PICTURE = Picture("view", camera(2, 2), torch.zeros(2, 2, 3), None, None, None)
+IMAGE = Image("view", camera(2, 2), torch.zeros(2, 2, 3), None, None, None)
 
 
 @dataclass
@@ -43,9 +43,9 @@ class Counting:
 
 
 def report_of(step: int, difference: float = 0.1, finding: str | None = None) -> StepReport:
-    """The report of ``step``: a loss of 0.5 and a picture that is wrong by ``difference`` everywhere."""
+    """The report of ``step``: a loss of 0.5 and an image that is wrong by ``difference`` everywhere."""
     truth = torch.zeros(2, 2, 3)
-    return StepReport(step, 0.5, PICTURE, truth + difference, truth, finding)
+    return StepReport(step, 0.5, IMAGE, truth + difference, truth, finding)
 
 
 def step_done(step: int, total: int, difference: float = 0.1) -> StepDone:

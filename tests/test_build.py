@@ -32,7 +32,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.conventions import RasterizeMode
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
 from dyngs.deform.scene import DynamicScene
@@ -53,14 +53,14 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_training_cameras_are_those_of_the_pictures(capture: Path) -> None:
+def test_training_cameras_are_those_of_the_images(capture: Path) -> None:
     options = DataConfig(root=capture, downscale=2)
     views = read_capture(options).splits["train"]
-    pictures = PictureLoader(views, options)
-    for camera, picture in zip(training_cameras(views, options), (pictures[i] for i in range(5)), strict=True):
-        assert (camera.width, camera.height) == (picture.cameras.width, picture.cameras.height) == (8, 8)
-        assert torch.equal(camera.intrinsics, picture.cameras.intrinsics)
-        assert torch.equal(camera.cam_from_world, picture.cameras.cam_from_world)
+    images = ImageLoader(views, options)
+    for camera, image in zip(training_cameras(views, options), (images[i] for i in range(5)), strict=True):
+        assert (camera.width, camera.height) == (image.cameras.width, image.cameras.height) == (8, 8)
+        assert torch.equal(camera.intrinsics, image.cameras.intrinsics)
+        assert torch.equal(camera.cam_from_world, image.cameras.cam_from_world)
 
 
 def test_surroundings_of_a_blender_capture(capture: Path) -> None:
@@ -83,7 +83,7 @@ def test_parts_follow_the_config(capture: Path) -> None:
     assert trainer.options.absgrad
     assert trainer.options.alpha_min == 0.01
     assert trainer.scene.gaussians.sh.shape == (40, 9, 3)
-    assert (trainer.background, trainer.has_test_views, len(trainer.pictures)) == ("white", True, 5)
+    assert (trainer.background, trainer.has_test_views, len(trainer.images)) == ("white", True, 5)
     mcmc = assemble(config.model_copy(update={"strategy": McmcStrategy(max_gaussians=30)}))
     assert isinstance(mcmc.densifier, McmcDensifier)
     assert len(mcmc.optimizer.parameters) == 30
@@ -114,7 +114,7 @@ def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
 
 
 def _with_times(capture: Path, out: Path, times: list[float] | None) -> Path:
-    """A copy of the capture whose training pictures have these times, and whose test pictures are taken at 0.5."""
+    """A copy of the capture whose training images have these times, and whose test images are taken at 0.5."""
     shutil.copytree(capture, out)
     for split in ("train", "test"):
         file = out / f"transforms_{split}.json"
@@ -185,15 +185,15 @@ def test_without_times_a_dynamic_config_is_a_static_one(
     assert all(torch.equal(x, results[1].tensors[name]) for name, x in results[0].tensors.items())
 
 
-def test_motion_is_looked_for_in_pictures_from_all_over_the_clip(capture: Path, tmp_path: Path) -> None:
+def test_motion_is_looked_for_in_images_from_all_over_the_clip(capture: Path, tmp_path: Path) -> None:
     """Drawn as in training, on the background of the evaluation."""
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
     assert isinstance(trainer.training, DynamicTraining)
     gaussians = trainer.scene.gaussians.detach()
     found = trainer.training.capture.still_errors(lambda _: gaussians)
-    pictures = [trainer.pictures[i] for i in range(5)]
-    expected = still_errors(lambda _: gaussians, pictures, trainer.options, torch.ones(3))
+    images = [trainer.images[i] for i in range(5)]
+    expected = still_errors(lambda _: gaussians, images, trainer.options, torch.ones(3))
     assert torch.equal(found.most, expected.most)
     assert torch.equal(found.usual, expected.usual)
     assert found.most.shape == (50,)

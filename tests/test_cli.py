@@ -142,8 +142,8 @@ def test_without_debug_there_is_only_the_line(monkeypatch: pytest.MonkeyPatch, c
 
 
 def test_a_line_holds_nothing_that_a_terminal_obeys(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    make_doctor(monkeypatch, raising(DyngsError("a\x1b[2J.png: no such\npicture")))
-    assert "a\\x1b[2J.png: no such picture" in error_line(capsys, "doctor")
+    make_doctor(monkeypatch, raising(DyngsError("a\x1b[2J.png: no such\nimage")))
+    assert "a\\x1b[2J.png: no such image" in error_line(capsys, "doctor")
 
 
 def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ def test_wrong_usage_and_missing_input_end_in_one_line(
         (PermissionError(errno.EACCES, "Permission denied", "b"), "b: Permission denied; choose another folder"),
         (BrokenPipeError(errno.EPIPE, "Broken pipe"), "Broken pipe"),
         (MemoryError(), "out of memory"),
-        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "the card is out of memory; lower strategy.max"),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), "the GPU is out of memory; lower strategy.max"),
     ],
 )
 def test_errors_of_the_world_end_in_one_line(
@@ -426,19 +426,19 @@ def test_eval_of_a_still_run_says_nothing_about_time(run_dir: Path, capsys: Capt
 
 
 def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> None:
-    def pictures(name: str, *words: str) -> int:
+    def images(name: str, *words: str) -> int:
         assert main(["render", str(moving_run), "--out", str(tmp_path / name), *words]) == 0
         return len(list((tmp_path / name).glob("*.png")))
 
-    assert pictures("orbit", "--path", "orbit", "--frames", "3") == 3
+    assert images("orbit", "--path", "orbit", "--frames", "3") == 3
     assert "note: time runs from 0 to 1 along the path" in capsys.readouterr().out
-    assert pictures("frozen", "--path", "orbit", "--frames", "3", "--time", "0.5") == 3
-    assert pictures("together", "--path", "spiral", "--times", "0:1:4") == 4
-    assert pictures("one", "--time", "0.5") == 1
-    assert pictures("many", "--times", "0:1:4", "--view", "r_001", "--size", "8x8", "--background", "black") == 4
-    assert pictures("view", "--view", "1", "--split", "train") == 1
+    assert images("frozen", "--path", "orbit", "--frames", "3", "--time", "0.5") == 3
+    assert images("together", "--path", "spiral", "--times", "0:1:4") == 4
+    assert images("one", "--time", "0.5") == 1
+    assert images("many", "--times", "0:1:4", "--view", "r_001", "--size", "8x8", "--background", "black") == 4
+    assert images("view", "--view", "1", "--split", "train") == 1
     assert capsys.readouterr().err == ""
-    assert pictures("clamped", "--time", "7") == 1
+    assert images("clamped", "--time", "7") == 1
     output = capsys.readouterr()
     assert re.fullmatch(r"dyngs: warning: .*clamped\n", output.err)
     assert "no view 'r_9'" in error_line(capsys, "render", moving_run, "--out", tmp_path, "--view", "r_9")
@@ -509,10 +509,10 @@ def test_export_of_tracks(moving_run: Path, tmp_path: Path, capsys: Capture) -> 
 
 
 def test_inspect(capture: Path, tmp_path: Path, capsys: Capture) -> None:
-    picture = tmp_path / "cameras.png"
-    assert main(["data", "inspect", str(capture), "--picture", str(picture), "--deep"]) == 0
+    image = tmp_path / "cameras.png"
+    assert main(["data", "inspect", str(capture), "--image", str(image), "--deep"]) == 0
     assert "blender" in capsys.readouterr().out
-    assert picture.stat().st_size > 0
+    assert image.stat().st_size > 0
 
 
 def test_synth_leaves_a_used_folder_alone(capture: Path, capsys: Capture) -> None:
@@ -580,17 +580,17 @@ def test_long_words_are_cut_in_messages(capsys: pytest.CaptureFixture[str]) -> N
     assert len(error_line(capsys, "render", ".", "--time", "9" * 5000)) < 600
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a card")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 @pytest.mark.parametrize(
     "words",
     [
         ["train", "static", "data.root=nothing", "--device", "cuda"],
         ["train", "static", "data.root=nothing", "run.device=cuda"],
-        ["render", "nothing.ply", "--out", "pictures", "--device", "cuda"],
+        ["render", "nothing.ply", "--out", "images", "--device", "cuda"],
         ["eval", "nothing", "--device", "cuda"],
     ],
 )
-def test_a_card_that_is_not_there_is_told_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gpu_that_is_not_there_is_told_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     Path("nothing.ply").touch()
     assert main(words) == 2
     printed = capsys.readouterr()

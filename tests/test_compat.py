@@ -20,10 +20,10 @@ from torch import Tensor
 import dyngs
 from dyngs.compat import rasterization
 from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions
-from dyngs.rendering import RenderOptions, render
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -57,7 +57,7 @@ def call(scene: Scene, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
 
 
 def near_scene() -> Scene:
-    """Some Gaussians close to the camera and some beside the picture, so that the clamp of the Jacobian matters."""
+    """Some Gaussians close to the camera and some beside the image, so that the clamp of the Jacobian matters."""
     scene = random_scene(n=60, views=3, seed=8, degree=3)
     return replace(scene, means=2 * scene.means)
 
@@ -166,7 +166,7 @@ def test_equals_render(render_mode: str, rasterize_mode: str, packed: bool) -> N
     depth = {"D": "accumulated", "ED": "expected"}.get(render_mode.rpartition("+")[2], "none")
     options = RenderOptions(near=0.01, alpha_max=0.999, mode=rasterize_mode, depth=depth)
     truth = render(scene.gaussians, scene.cameras, options, background=scene.background)
-    picture, alpha, _ = call(
+    image, alpha, _ = call(
         scene,
         colors=scene.sh,
         sh_degree=3,
@@ -178,24 +178,24 @@ def test_equals_render(render_mode: str, rasterize_mode: str, packed: bool) -> N
     parts = [truth.rgb] if "RGB" in render_mode else []
     parts += [truth.depth[..., None]] if truth.depth is not None else []
     # 1e-9, not bitwise: render() gets scales and opacities through log and logit
-    torch.testing.assert_close(picture, torch.cat(parts, -1), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(image, torch.cat(parts, -1), rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(alpha, truth.alpha[..., None], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 7, 32, 33, 100])
 @pytest.mark.parametrize("per_camera", [False, True])
 def test_any_number_of_channels(channels: int, per_camera: bool) -> None:
-    """Channels do not know of each other: each equals a picture of its own."""
+    """Channels do not know of each other: each equals an image of its own."""
     scene = random_scene(n=10)
     shape = (2, 10, channels) if per_camera else (10, channels)
     colors = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     backgrounds = torch.rand(2, channels, dtype=torch.float64)
-    picture, alpha, _ = call(scene, colors=colors, backgrounds=backgrounds)
-    assert picture.shape == (2, 29, 37, channels)
+    image, alpha, _ = call(scene, colors=colors, backgrounds=backgrounds)
+    assert image.shape == (2, 29, 37, channels)
     assert alpha.shape == (2, 29, 37, 1)
     last = slice(channels - 1, channels)
     alone, _, _ = call(scene, colors=colors[..., last], backgrounds=backgrounds[:, last])
-    torch.testing.assert_close(picture[..., last], alone, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(image[..., last], alone, rtol=1e-12, atol=1e-14)
 
 
 def test_coefficients_per_camera() -> None:
@@ -246,9 +246,9 @@ def test_means2d_keeps_its_gradient(packed: bool) -> None:
     """What gsplat's densification reads; signed and absolute parts are those of the probe."""
     scene = near_scene()
     means = scene.means.requires_grad_()
-    picture, _, meta = call(replace(scene, means=means), packed=packed, absgrad=True)
+    image, _, meta = call(replace(scene, means=means), packed=packed, absgrad=True)
     meta["means2d"].retain_grad()
-    (picture * weights(picture)).sum().backward()
+    (image * weights(image)).sum().backward()
     probe = torch.zeros(3, 60, 4, dtype=torch.float64, requires_grad=True)
     p = project(means.detach(), scene.quats, scene.scales, scene.opacities, scene.cameras, GSPLAT_LIMITS)
     again = rasterize_with_probe(scene, p, probe)
@@ -278,10 +278,10 @@ def test_gradcheck(packed: bool) -> None:
 
     def run(*tensors: Tensor) -> tuple[Tensor, Tensor]:
         moved = replace(scene, **dict(zip(names, tensors, strict=True)))
-        picture, alpha, _ = call(
+        image, alpha, _ = call(
             moved, colors=moved.sh, sh_degree=1, backgrounds=moved.background, render_mode="RGB+ED", packed=packed
         )
-        return picture, alpha
+        return image, alpha
 
     inputs = [getattr(scene, name).detach().clone().requires_grad_() for name in names]
     assert torch.autograd.gradcheck(run, inputs)
@@ -340,7 +340,7 @@ NUMBERS: dict[str, list[Any]] = {
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in NUMBERS.items() for value in values])
 def test_numbers_out_of_range_are_refused_by_name(name: str, value: Any) -> None:
-    """Some gave an empty picture, some a mirrored one, some an error of another library."""
+    """Some gave an empty image, some a mirrored one, some an error of another library."""
     scene = random_scene(degree=3)
     said = {"near_plane": "near", "far_plane": "far"}.get(name, name)
     sizes = {"width": scene.width, "height": scene.height} | ({name: value} if name in ("width", "height") else {})
@@ -376,8 +376,8 @@ def test_backgrounds_fit_cameras_and_channels(backgrounds: Tensor, scene: Scene)
     for mode in ("RGB", "RGB+D"):
         with pytest.raises(DyngsError, match=r"backgrounds must be \(2, 3\)"):
             call(scene, backgrounds=backgrounds.double(), render_mode=mode)
-    picture, _, _ = call(scene, backgrounds=backgrounds.double(), render_mode="D")
-    assert torch.equal(picture, call(scene, render_mode="D")[0])
+    image, _, _ = call(scene, backgrounds=backgrounds.double(), render_mode="D")
+    assert torch.equal(image, call(scene, render_mode="D")[0])
 
 
 def test_what_is_no_tensor_is_named(scene: Scene) -> None:
@@ -408,7 +408,7 @@ EXTREMES: dict[str, list[float]] = {
     st.sampled_from(["classic", "antialiased"]),
     st.sampled_from(["RGB", "RGB+ED", "D"]),
 )
-def test_extreme_numbers_give_finite_pictures_or_one_line(
+def test_extreme_numbers_give_finite_images_or_one_line(
     limits: dict[str, float], focal: float, dtype: torch.dtype, rasterize_mode: str, render_mode: str
 ) -> None:
     scene = random_scene(n=8, views=1).to(dtype)
@@ -417,13 +417,13 @@ def test_extreme_numbers_give_finite_pictures_or_one_line(
     scene = replace(scene, intrinsics=intrinsics)
     leaves = scene.leaves()
     try:
-        picture, alpha, _ = call(leaves, rasterize_mode=rasterize_mode, render_mode=render_mode, **limits)
+        image, alpha, _ = call(leaves, rasterize_mode=rasterize_mode, render_mode=render_mode, **limits)
     except DyngsError:
         assert limits["far_plane"] <= limits["near_plane"] or not 1e-6 <= float(intrinsics[0, 0, 0]) <= 1e12
         return
-    assert bool(picture.isfinite().all())
+    assert bool(image.isfinite().all())
     assert 0 <= float(alpha.detach().min()) <= float(alpha.detach().max()) <= 1
-    picture.sum().backward()
+    image.sum().backward()
     for name in ("means", "quats", "scales", "opacities"):
         grad = getattr(leaves, name).grad
         assert grad is None or bool(grad.isfinite().all()), name
@@ -444,8 +444,8 @@ def test_no_gaussians() -> None:
     scene = random_scene(n=0)
     colors = torch.zeros(0, 3, dtype=torch.float64)
     for packed in (True, False):
-        picture, alpha, meta = call(scene, colors=colors, backgrounds=scene.background, packed=packed)
-        assert torch.equal(picture, scene.background[:, None, None].expand(2, 29, 37, 3))
+        image, alpha, meta = call(scene, colors=colors, backgrounds=scene.background, packed=packed)
+        assert torch.equal(image, scene.background[:, None, None].expand(2, 29, 37, 3))
         assert not alpha.any()
         assert meta["flatten_ids"].numel() == 0
 

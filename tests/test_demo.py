@@ -16,7 +16,7 @@ TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 
 def test_everything_that_is_promised_lies_there(tmp_path: Path) -> None:
     result = run_demo(tmp_path / "demo", TINY)
-    for path in (result.capture, result.run_dir, result.pictures, result.sheet, result.video, result.ply):
+    for path in (result.capture, result.run_dir, result.images, result.sheet, result.video, result.ply):
         assert path.exists()
         assert (tmp_path / "demo") in path.parents
     assert json.loads((result.run_dir / "metrics.json").read_text())["psnr"] == result.report.psnr

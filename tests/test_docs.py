@@ -45,7 +45,7 @@ SHORTER = {
 NOT_RUN = {
     "demo": "trains 3,000 steps; tests/test_demo.py runs it with fewer",
     "bench": "takes half a minute; tests/bench runs it on less",
-    "data sfm": "needs photos with something to match; tests/data/prepare/test_sfm.py has some",
+    "data sfm": "needs photos with something to match; tests/capture/test_sfm.py has some",
     "view": "serves a page until it is stopped; tests/view opens it in a browser",
     "predict": "needs a trained network; tests/cli/test_predict.py has one",
     "prune": "fine-tunes a dozen candidates; tests/cli/test_prune.py does it with fewer steps",

@@ -14,7 +14,7 @@ from dyngs import metrics
 from dyngs.metrics import MAX_PSNR, Lpips, flip, load_lpips, psnr, ssim, ssim_map
 
 
-def picture(height: int = 24, width: int = 32, seed: int = 0) -> torch.Tensor:
+def image(height: int = 24, width: int = 32, seed: int = 0) -> torch.Tensor:
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
 
 
@@ -25,7 +25,7 @@ def noisy(truth: torch.Tensor, sigma: float, seed: int = 1) -> torch.Tensor:
 
 def test_psnr_known_answers() -> None:
     grey = torch.full((4, 5, 3), 0.5)
-    assert psnr(grey + 0.1, grey) == pytest.approx(20.0, abs=1e-5)  # float32 pictures
+    assert psnr(grey + 0.1, grey) == pytest.approx(20.0, abs=1e-5)  # float32 images
     assert psnr(torch.zeros(4, 5, 3), torch.ones(4, 5, 3)) == 0.0
     assert psnr(grey, grey) == MAX_PSNR
     assert psnr(grey * 6, torch.ones(4, 5, 3)) == MAX_PSNR  # values above 1 are clamped
@@ -34,16 +34,16 @@ def test_psnr_known_answers() -> None:
 
 def test_psnr_is_that_of_skimage() -> None:
     skimage = pytest.importorskip("skimage.metrics")
-    a, b = picture(), noisy(picture(), 0.1)
+    a, b = image(), noisy(image(), 0.1)
     assert psnr(b, a) == pytest.approx(skimage.peak_signal_noise_ratio(a.numpy(), b.numpy(), data_range=1), abs=1e-5)
 
 
 @settings(max_examples=15, deadline=None)
 @given(height=st.integers(1, 16), width=st.integers(1, 16), seed=st.integers(0, 99))
 def test_masks_ignore_and_weight(height, width, seed) -> None:
-    truth = picture(height, width, seed)
+    truth = image(height, width, seed)
     rendered = noisy(truth, 0.2, seed)
-    mask = (picture(height, width, seed + 1)[..., 0] > 0.4).float()
+    mask = (image(height, width, seed + 1)[..., 0] > 0.4).float()
     mask[0, 0] = 1
     spoiled = torch.where(mask[..., None] == 1, rendered, torch.rand(()))
     for metric in (psnr, ssim):
@@ -56,10 +56,10 @@ def test_masks_ignore_and_weight(height, width, seed) -> None:
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 1e-3, 0.05, 1.0])
-def test_ssim_of_white_pictures_keeps_its_digits(amplitude: float) -> None:
+def test_ssim_of_white_images_keeps_its_digits(amplitude: float) -> None:
     """White is where the variance of float32 squares cancels: a map off by up to 6e-4, by way of E[x^2] - E[x]^2."""
     white = torch.ones(40, 40, 3)
-    rendered = white - amplitude * picture(40, 40)
+    rendered = white - amplitude * image(40, 40)
     found, wanted = ssim_map(rendered, white), ssim_map(rendered.double(), white.double())
     # The sum less 1, at most 1 in square, is rounded some 16 times before half its variance is left, beside C2 = 9e-4.
     allowed = 16 * torch.finfo(torch.float32).eps / 2 / (2 * 9e-4) * (1 - wanted) + 1e-6
@@ -67,9 +67,9 @@ def test_ssim_of_white_pictures_keeps_its_digits(amplitude: float) -> None:
     assert amplitude > 0 or ssim(rendered, white) == 1
 
 
-def test_extreme_pictures_have_a_metric() -> None:
-    """Metrics are those of the picture as displayed: clamped, so that one pixel of 1e30 is one of 1."""
-    truth = picture()
+def test_extreme_images_have_a_metric() -> None:
+    """Metrics are those of the image as displayed: clamped, so that one pixel of 1e30 is one of 1."""
+    truth = image()
     rendered = truth.clone()
     rendered[3, 4] = 1e30
     clipped = truth.clone()
@@ -81,7 +81,7 @@ def test_extreme_pictures_have_a_metric() -> None:
 
 def test_ssim_is_that_of_skimage_inside() -> None:
     skimage = pytest.importorskip("skimage.metrics")
-    a, b = picture(40, 50), noisy(picture(40, 50), 0.15)
+    a, b = image(40, 50), noisy(image(40, 50), 0.15)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
     a64, b64 = a.numpy().astype(np.float64), b.numpy().astype(np.float64)
     _, wanted = skimage.structural_similarity(a64, b64, channel_axis=2, full=True, **options)
@@ -91,7 +91,7 @@ def test_ssim_is_that_of_skimage_inside() -> None:
 
 
 def test_ssim_pads_with_zeros() -> None:
-    """At a corner, a constant picture's blurred value is the part of the window that lies inside."""
+    """At a corner, a constant image's blurred value is the part of the window that lies inside."""
     a, b = torch.full((9, 9, 3), 0.8), torch.full((9, 9, 3), 0.4)
     window = np.exp(-((np.arange(11) - 5) ** 2) / 4.5)
     inside = (window[5:].sum() / window.sum()) ** 2
@@ -103,7 +103,7 @@ def test_ssim_pads_with_zeros() -> None:
 
 
 def test_ssim_bounds() -> None:
-    a = picture()
+    a = image()
     assert ssim(a, a) == pytest.approx(1.0, abs=1e-6)
     assert -1 <= ssim(1 - a, a) < ssim(noisy(a, 0.1), a) < 1
     assert ssim(a[:1, :1], a[:1, :1]) == pytest.approx(1.0, abs=1e-6)
@@ -111,7 +111,7 @@ def test_ssim_bounds() -> None:
 
 def test_flip() -> None:
     pytest.importorskip("flip_evaluator")
-    a = picture()
+    a = image()
     assert flip(a, a).value == 0.0
     small, large = flip(noisy(a, 0.05), a).value, flip(noisy(a, 0.3), a).value
     assert small is not None
@@ -127,18 +127,18 @@ def test_flip() -> None:
 
 def test_flip_is_the_packages_own_default() -> None:
     package = pytest.importorskip("flip_evaluator")
-    a, b = picture(), noisy(picture(), 0.1)
+    a, b = image(), noisy(image(), 0.1)
     _, mean, _ = package.evaluate(a.numpy(), b.numpy(), "LDR", applyMagma=False, parameters={})
     assert flip(b, a).value == pytest.approx(mean, rel=1e-5)
 
 
 def test_missing_packages_give_a_reason(monkeypatch) -> None:
     monkeypatch.setattr(metrics, "find_spec", lambda name: None)
-    value = flip(picture(), picture())
+    value = flip(image(), image())
     assert value.value is None
     assert "flip-evaluator is not installed" in str(value.reason)
     lpips = load_lpips("vgg")
-    assert lpips(picture(), picture()).value is None
+    assert lpips(image(), image()).value is None
     assert "not installed" in str(lpips.reason)
 
 
@@ -165,7 +165,7 @@ def test_lpips_scales_and_masks_its_input() -> None:
     assert lpips(black, white, torch.zeros(4, 6)).value == 0.0
 
 
-def test_lpips_of_tiny_pictures_has_a_reason() -> None:
+def test_lpips_of_tiny_images_has_a_reason() -> None:
     def too_small(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("output size is too small")
 

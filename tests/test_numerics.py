@@ -22,9 +22,9 @@ from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry.recenter import recenter
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import Rendering, RenderOptions, render
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, rasterize
-from dyngs.rendering import Rendering, RenderOptions, render
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -64,12 +64,12 @@ def one_gaussian(mean: tuple[float, float, float], scale: float, opacity: float 
 def drawn_with_gradients(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions, dtype: torch.dtype
 ) -> tuple[Rendering, dict[str, Tensor]]:
-    """A picture, and the gradients of a weighted sum of its colours and alphas."""
+    """An image, and the gradients of a weighted sum of its colours and alphas."""
     leaves = Gaussians(**{k: x.detach().to(dtype).requires_grad_() for k, x in gaussians.tensors().items()})
-    picture = render(leaves, cameras.to(dtype=dtype), options, background=BACKGROUND)
-    total = (picture.rgb * weights(picture.rgb)).sum() + (picture.alpha * weights(picture.alpha)).sum()
+    image = render(leaves, cameras.to(dtype=dtype), options, background=BACKGROUND)
+    total = (image.rgb * weights(image.rgb)).sum() + (image.alpha * weights(image.alpha)).sum()
     found = torch.autograd.grad(total, list(leaves.tensors().values()))
-    return picture, dict(zip(FIELDS, found, strict=True))
+    return image, dict(zip(FIELDS, found, strict=True))
 
 
 def check_against_float64(
@@ -80,32 +80,32 @@ def check_against_float64(
     tolerance: float = 1e-5,
     gradient_tolerance: float = 1e-4,
 ) -> Rendering:
-    """The float32 picture, after comparing it and its gradients with float64 of the same numbers.
+    """The float32 image, after comparing it and its gradients with float64 of the same numbers.
 
     Tolerances are those without thresholds: colours absolutely (rounding of 6e-8 times up to a hundred operations),
     gradients relative to the largest of their kind (terms of both signs cancel) or to 0.01 (the pixels' own gradients
     are of size 1: less is noise). With thresholds a pixel within rounding of one may differ by 1/255.
     """
     unlimited = replace(options, alpha_min=0.0, transmittance_min=0.0)
-    picture, slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float32)
+    image, slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float32)
     truth, true_slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float64)
-    assert (picture.rgb - truth.rgb).abs().max() < tolerance
-    assert (picture.alpha - truth.alpha).abs().max() < tolerance
+    assert (image.rgb - truth.rgb).abs().max() < tolerance
+    assert (image.alpha - truth.alpha).abs().max() < tolerance
     for name in FIELDS:
         assert slopes[name].isfinite().all(), name
         scale = max(0.01, float(true_slopes[name].abs().max()))
         assert (slopes[name] - true_slopes[name]).abs().max() / scale < gradient_tolerance, name
-    picture, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
+    image, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
     truth, _ = drawn_with_gradients(gaussians, cameras, options, torch.float64)
-    assert (picture.rgb - truth.rgb).abs().max() < tolerance + 1.1 / 255
+    assert (image.rgb - truth.rgb).abs().max() < tolerance + 1.1 / 255
     assert all(x.isfinite().all() for x in slopes.values())
-    return picture
+    return image
 
 
 def gradients_vanish(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = USUAL) -> bool:
     """Nothing is drawn, and every gradient is exactly zero."""
-    picture, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
-    return torch.equal(picture.rgb, BACKGROUND.expand_as(picture.rgb)) and not any(x.any() for x in slopes.values())
+    image, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
+    return torch.equal(image.rgb, BACKGROUND.expand_as(image.rgb)) and not any(x.any() for x in slopes.values())
 
 
 # --- scales -----------------------------------------------------------------------------------------------------------
@@ -114,10 +114,10 @@ def gradients_vanish(gaussians: Gaussians, cameras: Cameras, options: RenderOpti
 def test_scale_1e_minus_12_is_a_dot_of_the_low_pass() -> None:
     """Alpha is o exp(-d^2 / (2 eps2d)), whatever the rotation."""
     gaussians = some_gaussians(n=1, means=torch.tensor([[0.0, 0.0, 3.0]]), log_scales=math.log(1e-12))
-    picture = check_against_float64(gaussians, camera(), options=NO_THRESHOLDS)
+    image = check_against_float64(gaussians, camera(), options=NO_THRESHOLDS)
     x, y = torch.meshgrid(torch.arange(37) + 0.5 - 18.5, torch.arange(29) + 0.5 - 14.5, indexing="xy")
     expected = gaussians.opacities * (-(x * x + y * y) / 0.6).exp()
-    torch.testing.assert_close(picture.alpha[0], expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(image.alpha[0], expected, rtol=0, atol=1e-6)
     check_against_float64(some_gaussians(log_scales=math.log(1e-12)), camera())
 
 
@@ -126,9 +126,9 @@ def test_scale_1e_minus_12_vanishes_when_antialiased() -> None:
 
 
 def test_scale_1e12_is_a_uniform_veil() -> None:
-    picture = check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera())
+    image = check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera())
     alpha = 1 - (1 - some_gaussians().opacities.clamp_max(0.99)).prod()
-    torch.testing.assert_close(picture.alpha, alpha.expand(1, 29, 37), rtol=0, atol=2e-6)
+    torch.testing.assert_close(image.alpha, alpha.expand(1, 29, 37), rtol=0, atol=2e-6)
     check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera(), options=ANTIALIASED)
     check_against_float64(some_gaussians(log_scales=math.log(1e3)), camera(), options=ANTIALIASED)
 
@@ -137,8 +137,8 @@ def test_scale_1e12_is_a_uniform_veil() -> None:
 def test_scales_that_underflow_or_overflow_their_squares(log_scale: float, drawn: bool) -> None:
     """exp(-1e4) is 0: a dot. exp(43) units are 5e19 px here; the square of 1.8e19 is the last that float32 holds."""
     gaussians = some_gaussians(log_scales=log_scale)
-    picture, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
-    assert picture.rgb.isfinite().all()
+    image, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
+    assert image.rgb.isfinite().all()
     assert all(x.isfinite().all() for x in slopes.values())
     assert gradients_vanish(gaussians, camera()) != drawn
 
@@ -188,27 +188,27 @@ def test_zero_quaternion_is_the_identity() -> None:
 
 @pytest.mark.parametrize("size", [1e-3, 1e3, 1e30, 1e-30])
 def test_unnormalised_quaternions(size: float) -> None:
-    """Same picture; the gradient is divided by the size, but by no less than 1e-12 for the largest entry."""
+    """Same image; the gradient is divided by the size, but by no less than 1e-12 for the largest entry."""
     unit, long = some_gaussians(), some_gaussians(quats=some_gaussians().quats * size)
-    picture = check_against_float64(long, camera())
-    torch.testing.assert_close(picture.rgb, render(unit, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
+    image = check_against_float64(long, camera())
+    torch.testing.assert_close(image.rgb, render(unit, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
     slopes, unit_slopes = (drawn_with_gradients(g, camera(), NO_THRESHOLDS, torch.float32)[1] for g in (long, unit))
     divisor = (unit.quats.abs().amax(1, keepdim=True) * size).clamp_min(1e-12) / unit.quats.abs().amax(1, keepdim=True)
     assert relative_error(slopes["quats"] * divisor, unit_slopes["quats"]) < 1e-4
 
 
 def test_denormal_quaternions() -> None:
-    """The direction of a denormal has few digits, but it is a direction: same picture as that direction normalised.
+    """The direction of a denormal has few digits, but it is a direction: same image as that direction normalised.
     Below 1e-12 the gradient no longer grows as 1 / |q|."""
     units = torch.tensor(
         [[1.0, 0, 0, 0], [1.0, 1, 0, 0], [0.5, 0.5, -0.5, 0.5], [0, 0, 1, 1], [1, 0, -1, 0], [1, 1, 1, 1]]
     )
     tiny = some_gaussians(quats=units * 2.0**-140)
     assert 0 < tiny.quats.abs().max() < torch.finfo(torch.float32).tiny
-    (picture, slopes), (truth, true_slopes) = (
+    (image, slopes), (truth, true_slopes) = (
         drawn_with_gradients(g, camera(), NO_THRESHOLDS, torch.float32) for g in (tiny, some_gaussians(quats=units))
     )
-    torch.testing.assert_close(picture.rgb, truth.rgb, rtol=0, atol=1e-6)
+    torch.testing.assert_close(image.rgb, truth.rgb, rtol=0, atol=1e-6)
     capped = true_slopes["quats"] * units.abs().amax(1, keepdim=True) * 1e12
     assert relative_error(slopes["quats"], capped) < 1e-4
 
@@ -256,8 +256,8 @@ def test_logits_of_plus_and_minus_100(logit: float) -> None:
     if logit < 0:
         assert gradients_vanish(gaussians, camera())
         return
-    picture = check_against_float64(gaussians, camera(), tolerance=2e-5)
-    assert float(picture.alpha.detach().max()) <= 1
+    image = check_against_float64(gaussians, camera(), tolerance=2e-5)
+    assert float(image.alpha.detach().max()) <= 1
     _, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
     assert not slopes["logit_opacities"].any()  # the sigmoid is flat there
     assert slopes["means"].any()
@@ -293,8 +293,8 @@ def test_straddling_the_near_plane(mean: tuple[float, float, float], scale: floa
 def test_distance_of_1e7_units() -> None:
     near = one_gaussian((0.2, -0.1, 3.0), 0.2)
     far = one_gaussian((0.2e7, -0.1e7, 3e7), 0.2e7)
-    picture = check_against_float64(far, camera(), options=replace(USUAL, depth="expected"))
-    torch.testing.assert_close(picture.rgb, render(near, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
+    image = check_against_float64(far, camera(), options=replace(USUAL, depth="expected"))
+    torch.testing.assert_close(image.rgb, render(near, camera(), background=BACKGROUND).rgb, rtol=0, atol=1e-5)
     check_against_float64(one_gaussian((1.0, 2.0, 1e7), 0.1), camera())
     assert gradients_vanish(one_gaussian((1e7, 0.0, 3.0), 0.1), camera())
 
@@ -317,7 +317,7 @@ def capture_at(offset: np.ndarray) -> Capture:
     return Capture(root=None, format="colmap", splits={"train": tuple(views)}, points=points)  # type: ignore[arg-type]
 
 
-def picture_of(capture: Capture) -> Tensor:
+def image_of(capture: Capture) -> Tensor:
     """Float32 Gaussians on the capture's points, seen by its float32 cameras."""
     scene = random_scene(n=30, views=3, seed=21).to(torch.float32)
     views = capture.splits["train"]
@@ -332,11 +332,11 @@ def test_world_origin_far_away_is_rebased_on_load() -> None:
     """Subtracted in float64 the offset costs 1e-9 units; kept, float32 cannot even resolve 0.25 units there."""
     near, far = capture_at(np.zeros(3)), capture_at(GEOREFERENCED)
     rebased = recenter(far)
-    truth = picture_of(near)
+    truth = image_of(near)
     assert np.linalg.norm(rebased.world_offset - GEOREFERENCED) < 10
-    assert (picture_of(rebased) - truth).abs().quantile(0.99) < 1e-4
-    assert (picture_of(rebased) - truth).abs().max() < 2 / 255
-    assert (picture_of(far) - truth).abs().max() > 0.1
+    assert (image_of(rebased) - truth).abs().quantile(0.99) < 1e-4
+    assert (image_of(rebased) - truth).abs().max() < 2 / 255
+    assert (image_of(far) - truth).abs().max() > 0.1
     assert near is recenter(near)
 
 
@@ -350,11 +350,9 @@ def test_thousands_of_coincident_opaque_gaussians() -> None:
     gaussians = one_gaussian((0.0, 0.0, 3.0), 1e4)
     gaussians = gaussians.select(torch.zeros(n, dtype=torch.long))
     gaussians = gaussians.replace(logit_opacities=torch.full((n,), 100.0), sh=torch.rand(n, 1, 3))
-    picture, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
+    image, slopes = drawn_with_gradients(gaussians, camera(), USUAL, torch.float32)
     first = gaussians.base_rgb[0]
-    torch.testing.assert_close(
-        picture.rgb, (0.99 * first + 0.01 * BACKGROUND).expand_as(picture.rgb), rtol=0, atol=1e-6
-    )
+    torch.testing.assert_close(image.rgb, (0.99 * first + 0.01 * BACKGROUND).expand_as(image.rgb), rtol=0, atol=1e-6)
     assert all(x.isfinite().all() for x in slopes.values())
     assert slopes["sh"][0].any()
     assert not slopes["sh"][2:].any()
@@ -365,8 +363,8 @@ def test_thousands_of_coincident_faint_gaussians() -> None:
     gaussians = one_gaussian((0.0, 0.0, 3.0), 0.3, opacity=0.01).select(torch.zeros(n, dtype=torch.long))
     gaussians = gaussians.replace(sh=torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(2)))
     # float32 multiplies 3000 factors: 3000 * 6e-8 = 2e-4 at worst
-    picture = check_against_float64(gaussians, camera(), tolerance=2e-4, gradient_tolerance=1e-3)
-    assert picture.alpha.max() > 0.999
+    image = check_against_float64(gaussians, camera(), tolerance=2e-4, gradient_tolerance=1e-3)
+    assert image.alpha.max() > 0.999
 
 
 def test_equal_depths_are_ordered_by_index() -> None:
@@ -377,18 +375,18 @@ def test_equal_depths_are_ordered_by_index() -> None:
         gaussians = pair.select(torch.tensor(order))
         rgb = gaussians.base_rgb
         expected = 0.5 * rgb[0] + 0.25 * rgb[1] + 0.25 * BACKGROUND
-        picture = check_against_float64(gaussians, camera())
-        torch.testing.assert_close(picture.rgb, expected.expand_as(picture.rgb), rtol=0, atol=1e-6)
+        image = check_against_float64(gaussians, camera())
+        torch.testing.assert_close(image.rgb, expected.expand_as(image.rgb), rtol=0, atol=1e-6)
 
 
-def test_one_gaussian_covering_a_4k_picture() -> None:
+def test_one_gaussian_covering_a_4k_image() -> None:
     cameras = camera(3840, 2160, focal=3000.0)
     gaussians = one_gaussian((0.1, 0.0, 3.0), 1e3)
     leaves = Gaussians(**{k: x.requires_grad_() for k, x in gaussians.tensors().items()})
-    picture = render(leaves, cameras, background=BACKGROUND)
-    picture.rgb.sum().backward()
-    expected = (0.5 * gaussians.base_rgb + 0.5 * BACKGROUND).expand_as(picture.rgb)
-    torch.testing.assert_close(picture.rgb.detach(), expected.detach(), rtol=0, atol=1e-5)
+    image = render(leaves, cameras, background=BACKGROUND)
+    image.rgb.sum().backward()
+    expected = (0.5 * gaussians.base_rgb + 0.5 * BACKGROUND).expand_as(image.rgb)
+    torch.testing.assert_close(image.rgb.detach(), expected.detach(), rtol=0, atol=1e-5)
     assert leaves.sh.grad is not None
     assert float(leaves.sh.grad[0, 0, 0]) == pytest.approx(0.5 * SH_C0 * 3840 * 2160, rel=1e-4)  # 8e6 numbers summed
     assert all(x.grad is not None and x.grad.isfinite().all() for x in leaves.tensors().values())
@@ -404,14 +402,14 @@ def test_no_gaussians() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 8192), (8192, 1)], ids=str)
-def test_pictures_of_one_pixel_or_one_line(size: tuple[int, int]) -> None:
+def test_images_of_one_pixel_or_one_line(size: tuple[int, int]) -> None:
     # at 4096 px float32 resolves 2e-4 px
     tolerances = (1e-5, 1e-4) if size == (1, 1) else (1e-4, 1e-3)
-    picture = check_against_float64(
+    image = check_against_float64(
         some_gaussians(), camera(*size), tolerance=tolerances[0], gradient_tolerance=tolerances[1]
     )
-    assert picture.rgb.shape == (1, size[1], size[0], 3)
-    assert picture.alpha.any()
+    assert image.rgb.shape == (1, size[1], size[0], 3)
+    assert image.alpha.any()
 
 
 def test_more_than_2_to_the_31_intersections_are_refused_before_anything_is_allocated() -> None:
@@ -473,11 +471,11 @@ def test_skipping_nonfinite_gaussians_equals_leaving_them_out(bad: float) -> Non
         getattr(gaussians, name).view(12, -1)[2 * row, 0] = bad
     keep = torch.tensor([i not in (0, 2, 4, 6, 8) for i in range(12)])
     options = RenderOptions(nonfinite="skip")
-    picture, slopes = drawn_with_gradients(gaussians, camera(), options, torch.float32)
+    image, slopes = drawn_with_gradients(gaussians, camera(), options, torch.float32)
     truth, true_slopes = drawn_with_gradients(gaussians.select(keep), camera(), USUAL, torch.float32)
-    assert torch.equal(picture.rgb, truth.rgb)
-    assert torch.equal(picture.radii[:, keep], truth.radii)
-    assert not picture.radii[:, ~keep].any()
+    assert torch.equal(image.rgb, truth.rgb)
+    assert torch.equal(image.radii[:, keep], truth.radii)
+    assert not image.radii[:, ~keep].any()
     for name in FIELDS:
         assert torch.equal(slopes[name][keep], true_slopes[name]), name
         assert not slopes[name][~keep].any(), name

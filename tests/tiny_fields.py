@@ -79,7 +79,7 @@ def cloud(count: int = 9, seed: int = 0) -> Gaussians:
 
 
 def write_tiny_capture(root: Path) -> Path:
-    """Sixteen pictures of 24x24 px of a scene in which a die turns and a ball rolls."""
+    """Sixteen images of 24x24 px of a scene in which a die turns and a ball rolls."""
     options = DynamicOptions(size=24, num_times=16, num_test=1, samples=1)
     return write_dynamic_capture("spin", root, options)
 

@@ -1,18 +1,18 @@
-"""A tiny capture with every kind of prior; its pictures are noise, so that nothing agrees with them."""
+"""A tiny capture with every kind of prior; its images are noise, so that nothing agrees with them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from tiny_captures import edit_json, random_pixels, write_frames, write_picture
+from tiny_captures import edit_json, random_pixels, write_frames, write_image
 
 
 def with_priors(root: Path, names: tuple[str, ...] = ("a", "b", "c")) -> Path:
-    """A capture of one camera with every prior, and pictures of 12x8."""
+    """A capture of one camera with every prior, and images of 12x8."""
     for i, name in enumerate(names):
-        write_picture(root / f"{name}.png", random_pixels(8, 12, 3, seed=i))
-        write_picture(root / f"{name}_moves.png", np.full((8, 12, 1), 255 * (i > 0), np.uint8))
+        write_image(root / f"{name}.png", random_pixels(8, 12, 3, seed=i))
+        write_image(root / f"{name}_moves.png", np.full((8, 12, 1), 255 * (i > 0), np.uint8))
         np.save(root / f"{name}_depth.npy", np.full((4, 6), 2.0 + i))
         np.save(root / f"{name}_flow.npy", np.full((8, 12, 2), 4.0))
     np.savez(

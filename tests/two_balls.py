@@ -8,9 +8,9 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.output.camera_paths import CameraPath
 from dyngs.output.render_job import DEFAULT_OPTIONS, RenderJob
-from dyngs.rendering import RenderOptions
 from dyngs.static.scene import StaticScene
 
 

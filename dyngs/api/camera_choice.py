@@ -1,7 +1,7 @@
 """Whether the training cameras are refined: found by one or two small, short runs.
 
 Views held out have no refined cameras. So for each of them both models find the pose from which they look most like one
-half of the picture, and are compared on the other half. Where that helps the run without refinement little, the cameras
+half of the image, and are compared on the other half. Where that helps the run without refinement little, the cameras
 are right, and a second run would not be worth its time.
 """
 
@@ -16,7 +16,7 @@ from dyngs.api.small_runs import drawn
 from dyngs.config import Config, DynamicModel, StaticModel
 from dyngs.metrics import psnr
 from dyngs.training.background import background_colour
-from dyngs.training.camera_fit import fitted_to_picture
+from dyngs.training.corrections.camera_fit import fitted_to_image
 from dyngs.training.trainer import Trainer
 
 WRONG = 0.1
@@ -29,7 +29,7 @@ def evidence(plain: Trainer) -> Evidence:
     """Return whether the cameras of a small run without refinement may be wrong."""
     scores = [_scores(plain, index) for index in sorted(plain.held_out)]
     gain = fmean(fitted - given for given, fitted in scores)
-    text = f"poses fitted on half of each of {len(scores)} pictures change the other half by {gain:+.2f} dB"
+    text = f"poses fitted on half of each of {len(scores)} images change the other half by {gain:+.2f} dB"
     return Evidence(gain >= WRONG, text)
 
 
@@ -41,14 +41,14 @@ def compared(one: Trainer, other: Trainer) -> Comparison:
 
 def _scores(trainer: Trainer, index: int) -> tuple[float, float]:
     """Return PSNR, dB, of the right half of a view: from its own pose, and from one fitted on the left half."""
-    picture, background = trainer.pictures[index], background_colour(trainer.background)
-    left = torch.zeros_like(picture.rgb_premultiplied[..., 0])
+    image, background = trainer.images[index], background_colour(trainer.background)
+    left = torch.zeros_like(image.rgb_premultiplied[..., 0])
     left[:, : left.shape[1] // 2] = 1
-    right = 1 - left if picture.mask is None else (1 - left) * picture.mask
+    right = 1 - left if image.mask is None else (1 - left) * image.mask
     options = trainer.options
-    fitted = fitted_to_picture(trainer.scene, picture, background, trainer.extent, options=options, weights=left)
-    truth = picture.composite(background)
-    plain, moved = (psnr(drawn(trainer.scene, x, options, background), truth, right) for x in (picture, fitted))
+    fitted = fitted_to_image(trainer.scene, image, background, trainer.extent, options=options, weights=left)
+    truth = image.composite(background)
+    plain, moved = (psnr(drawn(trainer.scene, x, options, background), truth, right) for x in (image, fitted))
     return plain, moved
 
 

@@ -1,6 +1,6 @@
-"""Whether exposure and white balance are learned for each picture: found by one or two small, short runs.
+"""Whether exposure and white balance are learned for each image: found by one or two small, short runs.
 
-A small run without them says whether pictures disagree: an affine colour that is fitted on half of each picture makes
+A small run without them says whether images disagree: an affine colour that is fitted on half of each image makes
 the other half clearly better. Only then is a second run worth its time. Its exposures of training views say nothing of
 the views held out. So both models get an affine colour for each of those, fitted on one half, and are compared on the
 other half.
@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from dyngs.api.candidate import Candidate, Choice, Comparison, Evidence
-from dyngs.colour.affine import fitted_affine, recoloured
 from dyngs.config import Config, DynamicModel, StaticModel
 from dyngs.data.frame_selection import evenly_spaced
+from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.metrics import psnr
 from dyngs.training.background import background_colour
 from dyngs.training.trainer import Trainer
@@ -28,17 +28,17 @@ MAX_LOSS = 0.05
 LOOKED_AT = 40
 """Training views that are looked at."""
 SQUARES = 8
-"""The halves of a picture are the two colours of a chess board of so many squares a side."""
+"""The halves of an image are the two colours of a chess board of so many squares a side."""
 
 
 def evidence(plain: Trainer) -> Evidence:
-    """Return whether the pictures of a small run without exposures ask for them."""
-    trained_on = [i for i in range(len(plain.pictures)) if i not in plain.held_out]
+    """Return whether the images of a small run without exposures ask for them."""
+    trained_on = [i for i in range(len(plain.images)) if i not in plain.held_out]
     chosen = [trained_on[i] for i in evenly_spaced(len(trained_on), LOOKED_AT)]
     found = [_scored(plain, index) for index in chosen]
     gains = [fitted - given for given, fitted in found]
     text = (
-        f"an affine colour fitted on half of each of {len(found)} training pictures changes the other half by "
+        f"an affine colour fitted on half of each of {len(found)} training images changes the other half by "
         f"{fmean(gains):+.2f} dB"
     )
     return Evidence(fmean(gains) >= CLEAR_GAIN, text)
@@ -48,7 +48,7 @@ def compared(one: Trainer, other: Trainer) -> Comparison:
     """Compare two models on the views held out, each after the same fit.
 
     Where exposure goes with the viewpoint, as in a slow walk, colours that depend on the viewpoint explain it. Then a
-    scene in one exposure is further away from pictures as they are, and is not taken unasked.
+    scene in one exposure is further away from images as they are, and is not taken unasked.
     """
     held_out = sorted(one.held_out)
     before, after = ([_scored(trainer, index) for index in held_out] for trainer in (one, other))
@@ -59,15 +59,15 @@ def compared(one: Trainer, other: Trainer) -> Comparison:
 
 @torch.no_grad()
 def _scored(trainer: Trainer, index: int) -> tuple[float, float]:
-    """Return PSNR, dB, of a picture as the scene shows it, and with each half by a fit on the other half."""
-    picture, background = trainer.pictures[index], background_colour(trainer.background)
-    rendering = trainer.scene.render(picture.cameras, picture.time, options=trainer.options, background=background)
-    truth, rgb = picture.composite(background), rendering.rgb[0]
+    """Return PSNR, dB, of an image as the scene shows it, and with each half by a fit on the other half."""
+    image, background = trainer.images[index], background_colour(trainer.background)
+    rendering = trainer.scene.render(image.cameras, image.time, options=trainer.options, background=background)
+    truth, rgb = image.composite(background), rendering.rgb[0]
     fitted, light = rgb.clone(), _chess_board(*rgb.shape[:2])
     for half in (light, ~light):
-        affine = fitted_affine([(picture, rendering)], background, half.float())
-        fitted[~half] = recoloured(affine, picture, rendering, background)[~half]
-    return psnr(rgb, truth, picture.mask), psnr(fitted, truth, picture.mask)
+        affine = fitted_affine([(image, rendering)], background, half.float())
+        fitted[~half] = recoloured(affine, image, rendering, background)[~half]
+    return psnr(rgb, truth, image.mask), psnr(fitted, truth, image.mask)
 
 
 def _chess_board(height: int, width: int) -> Tensor:
@@ -90,7 +90,7 @@ def _decided(config: Config, choice: Choice) -> Config:
 
 CANDIDATE = Candidate(
     key="train.exposure",
-    does="with an exposure for each picture (after the same fit)",
+    does="with an exposure for each image (after the same fit)",
     asked=_asked,
     decided=_decided,
     compared=compared,

@@ -129,7 +129,7 @@ def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
                 case Order.STEP:
                     trainer.step()
                 case _:
-                    trainer.pictures.rest()
+                    trainer.images.rest()
                     return order, payload
 
 

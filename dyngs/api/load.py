@@ -8,8 +8,8 @@ from dyngs.errors import DyngsError
 from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.export.avatar import read_avatar
 from dyngs.files.wrong_place import command_for
+from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import SCENE_FILE, load_run
-from dyngs.scene import Scene
 from dyngs.splats.formats import all_suffixes, known_format, read_splats
 from dyngs.splats.splat_file import splat_options
 from dyngs.static.scene import StaticScene
@@ -19,7 +19,7 @@ def load(path: Path | str) -> Scene:
     """Load a scene, to be drawn from anywhere, at any time::
 
         scene = dyngs.load("runs/bench")
-        picture = scene.render(camera, time=0.5).rgb[0]
+        image = scene.render(camera, time=0.5).rgb[0]
 
     Args:
         path: a run folder (its newest checkpoint, or its ``scene.dyngs``), a ``scene.dyngs`` with the ``config.yaml``

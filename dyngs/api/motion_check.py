@@ -11,27 +11,27 @@ from dyngs.build import assemble
 from dyngs.config import Config, DefaultStrategy, PointsInit, StaticModel
 from dyngs.data.capture import Capture, View
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import are_scattered
-from dyngs.deform.evidence import MIN_DIFFERING, Evidence, Verdict, agreement_over_time, differing_share
+from dyngs.deform.evidence import MIN_DIFFERING, Evidence, Verdict, agreement_over_time, differing_fraction
 from dyngs.deform.still_error import cameras_in_place, signed_errors
 from dyngs.training.background import evaluation_background
 from dyngs.training.trainer import Trainer
 
 LONGEST_SIDE = 96
-"""Of the pictures that are looked at, px: enough to see what moves, and soon learned by a small model."""
+"""Of the images that are looked at, px: enough to see what moves, and soon learned by a small model."""
 MAX_CAMERAS, MAX_MOMENTS = 8, 24
-"""Cameras that stay in place, and pictures of each, that are compared."""
+"""Cameras that stay in place, and images of each, that are compared."""
 MAX_VIEWS = 100
 MIN_VIEWS = 24
 """With fewer views, agreement by chance cannot be told from other."""
 STEPS, MAX_GAUSSIANS, FIRST_POINTS = 450, 10_000, 5000
-"""Of the small still model."""
+"""Of the small static model."""
 
 
 def motion_evidence(config: Config) -> Evidence:
-    """Return whether anything moves in the capture of ``config``, from its training pictures made small.
+    """Return whether anything moves in the capture of ``config``, from its training images made small.
 
     Raises:
         DyngsError: a capture that cannot be read.
@@ -43,7 +43,7 @@ def motion_evidence(config: Config) -> Evidence:
     views = capture.splits["train"]
     in_place = cameras_in_place(views)
     if sum(map(len, in_place)) > 0.9 * len(views):
-        return _of_standing_cameras(capture, in_place, config.model_copy(update={"data": options}))
+        return _of_fixed_cameras(capture, in_place, config.model_copy(update={"data": options}))
     order = in_order_of_time(views)
     if len(order) < MIN_VIEWS or not are_scattered([views[i] for i in order]):
         return Evidence(Verdict.OPEN, f"{len(views)} views whose time goes with the viewpoint do not tell beforehand")
@@ -56,16 +56,14 @@ def in_order_of_time(views: Sequence[View]) -> list[int]:
     return [order[i] for i in evenly_spaced(len(order), MAX_VIEWS)]
 
 
-def _of_standing_cameras(capture: Capture, cameras: Sequence[Sequence[int]], config: Config) -> Evidence:
-    loader = PictureLoader(capture.splits["train"], config.data)
+def _of_fixed_cameras(capture: Capture, cameras: Sequence[Sequence[int]], config: Config) -> Evidence:
+    loader = ImageLoader(capture.splits["train"], config.data)
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     chosen = [cameras[i] for i in evenly_spaced(len(cameras), MAX_CAMERAS)]
-    pictures = [
-        [loader[seen[i]].composite(background) for i in evenly_spaced(len(seen), MAX_MOMENTS)] for seen in chosen
-    ]
-    share = differing_share(pictures)
-    verdict = Verdict.MOVES if share > MIN_DIFFERING else Verdict.STILL
-    return Evidence(verdict, f"{share:.2%} of the pixels of standing cameras differ from their median")
+    images = [[loader[seen[i]].composite(background) for i in evenly_spaced(len(seen), MAX_MOMENTS)] for seen in chosen]
+    fraction = differing_fraction(images)
+    verdict = Verdict.MOVES if fraction > MIN_DIFFERING else Verdict.STILL
+    return Evidence(verdict, f"{fraction:.2%} of the pixels of fixed cameras differ from their median")
 
 
 def _of_scattered_cameras(capture: Capture, order: Sequence[int], config: Config) -> Evidence:
@@ -76,12 +74,12 @@ def _of_scattered_cameras(capture: Capture, order: Sequence[int], config: Config
     views = capture.splits["train"]
     directions = torch.from_numpy(np.stack([views[i].cam_from_world[2, :3] for i in order]))
     found = agreement_over_time(errors, weights, directions, torch.Generator().manual_seed(config.run.seed))
-    reason = f"errors of a small still model at successive times agree by {found.deviations:.1f} standard deviations"
+    reason = f"errors of a small static model at successive times agree by {found.deviations:.1f} standard deviations"
     return Evidence(found.verdict, reason)
 
 
 def _small(config: Config) -> Config:
-    """Return the configuration of the small still model."""
+    """Return the configuration of the small static model."""
     return config.model_copy(
         update={
             "model": StaticModel(sh_degree=1),
@@ -98,9 +96,9 @@ def _errors(trainer: Trainer, order: Sequence[int], background: torch.Tensor) ->
     """Return errors and weights as ``agreement_over_time`` wants them."""
     found = []
     for i in order:
-        picture = trainer.pictures[i]
+        image = trainer.images[i]
         with torch.no_grad():
-            shown = trainer.scene.render(picture.cameras, picture.time, background=background).rgb[0]
+            shown = trainer.scene.render(image.cameras, image.time, background=background).rgb[0]
         gaussians = trainer.scene.gaussians.detach()
-        found.append(signed_errors(gaussians, picture, trainer.options, background, shown))
+        found.append(signed_errors(gaussians, image, trainer.options, background, shown))
     return torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])

@@ -1,7 +1,7 @@
 """Pilot runs: settings of a moving scene that are tried in small, short runs, and taken where held-out views gain.
 
 Light that changes wants colours that a network makes from direction and time, texture wants its motion looked for,
-bodies want to stay rigid. No capture says which it is. Small runs do, though not always: what pays in small pictures
+bodies want to stay rigid. No capture says which it is. Small runs do, though not always: what pays in small images
 need not pay in large ones (docs/benchmarks.md). Settings that only begin faster (``model.time_window=1``) cannot be
 asked so.
 """
@@ -17,8 +17,8 @@ from dyngs.config import Config, ControlNodesField, DynamicModel, NetworkColour
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.training.background import background_colour
 
-SHARE, FEWEST_STEPS = 0.25, 1000
-"""A pilot run has at most this share of the run's steps; with fewer steps than these it says nothing."""
+FRACTION, FEWEST_STEPS = 0.25, 1000
+"""A pilot run has at most this fraction of the run's steps; with fewer steps than these it says nothing."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Choice:
 
 
 def with_choices(config: Config, every: int, still: Sequence[float] | None) -> Config | None:
-    """Return ``config`` with the settings that win their pilot run; None if motion loses against a still model.
+    """Return ``config`` with the settings that win their pilot run; None if motion loses against a static model.
 
     Each choice is compared with the best of those before it. A line says what was found.
 
     Args:
         config: of a moving scene.
         every: of how many training views one is held out.
-        still: PSNR of a small still model on those views, dB; None: something certainly moves.
+        still: PSNR of a small static model on those views, dB; None: something certainly moves.
 
     Raises:
         DyngsError: a capture that cannot be read.
@@ -50,10 +50,10 @@ def with_choices(config: Config, every: int, still: Sequence[float] | None) -> C
     steps = pilot_steps(config)
     if not steps:
         return config
-    print(f"pilot runs of {steps:,} steps in small pictures, compared on training views that are held out:", flush=True)
+    print(f"pilot runs of {steps:,} steps in small images, compared on training views that are held out:", flush=True)
     scores = _told("the settings as they are", _scores(config, every, steps))
     if still is not None and not is_gain([a - b for a, b in zip(scores, still, strict=True)]):
-        _told("a still model, which is no worse", still)
+        _told("a static model, which is no worse", still)
         return None
     for choice in CHOICES:
         changed = choice.applied(config)
@@ -76,7 +76,7 @@ def pilot_steps(config: Config) -> int:
     """Return the steps of each pilot run; 0: none, as none were asked for, or the run is too short for them."""
     match config.model:
         case DynamicModel() if config.train.minutes is None:
-            steps = min(config.model.pilot_steps, int(SHARE * config.train.steps))
+            steps = min(config.model.pilot_steps, int(FRACTION * config.train.steps))
             return steps if steps >= min(FEWEST_STEPS, config.model.pilot_steps) else 0
         case _:
             return 0

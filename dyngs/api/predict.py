@@ -1,4 +1,4 @@
-"""Prediction of a person's run folder, like that of a trained avatar, from a trained network and a few pictures."""
+"""Prediction of a person's run folder, like that of a trained avatar, from a trained network and a few images."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Prediction:
 
     Attributes:
         run_dir: the run folder.
-        views: names of the pictures that were predicted from.
+        views: names of the images that were predicted from.
         num_gaussians: N.
-        seconds_steps: training the network on these pictures.
-        seconds_maps: reading these pictures and bringing them to the atlas.
+        seconds_steps: training the network on these images.
+        seconds_maps: reading these images and bringing them to the atlas.
         seconds_network: the network and its Gaussians.
     """
 
@@ -70,7 +70,7 @@ def predict_person(
             to these first, once, as by ``dyngs data fit``.
         out: a new run folder.
         views: how many of the training views to predict from, well spread; or their names.
-        steps: of training the network on these pictures before, see ``dyngs.training.adaptation``.
+        steps: of training the network on these images before, see ``dyngs.training.adaptation``.
         say: is told in a line that a body is fitted.
         report: is told how far that fit and these steps have come.
 
@@ -95,7 +95,7 @@ def predict_person(
     maps = person.look(chosen)
     middle = time.perf_counter()
     with torch.no_grad():
-        avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_share))
+        avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_fraction))
     end = time.perf_counter()
     write_run(out, avatar, data, model, end - began)
     names = tuple(person.sitter.views[i].name for i in chosen)
@@ -128,7 +128,7 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
         "uv",
         "resolution",
         "scaffold_heights",
-        "min_silhouette_share",
+        "min_silhouette_fraction",
         "near",
         "eps2d",
         "rasterize_mode",

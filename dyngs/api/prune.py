@@ -16,7 +16,7 @@ from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.config.kinds import network_of, person_of
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
@@ -122,7 +122,7 @@ def prune_within(
     start, begun = latest_checkpoint(run_dir), time.perf_counter()
     config = _config_from(run_dir, start, out, [f"prune.steps={SEARCH_STEPS}", *overrides])
     if config.prune.is_wanted:
-        raise DyngsError("prune.share and prune.mask_times are chosen with --prune R, which removes just that share")
+        raise DyngsError("prune.fraction and prune.mask_times are chosen with --prune R, which removes just that share")
     if config.model != load_resolved(run_dir).model:
         raise DyngsError("model.*: losses are counted from RUN as it is; choose that with --prune R")
     keep_freed_memory()
@@ -159,15 +159,15 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     return config
 
 
-def _unseen(config: Config, device: torch.device) -> list[Picture]:
-    """Return at most ``MOST_HELD_OUT`` pictures of the split `val`, which no training sees; of people none.
+def _unseen(config: Config, device: torch.device) -> list[Image]:
+    """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people none.
 
     They play other motions there, in which poses are not refined.
     """
     views = read_capture(config.data).splits.get("val", ())
     if not views or person_of(config) is not None:
         return []
-    loader = PictureLoader(views, config.data)
+    loader = ImageLoader(views, config.data)
     loader.device = device
     return [loader[i] for i in evenly_spaced(len(loader), MOST_HELD_OUT)]
 

@@ -1,4 +1,4 @@
-"""Whether a still scene is trained without what disagrees between its pictures: found by two small, short runs.
+"""Whether a static scene is trained without what disagrees between its images: found by two small, short runs.
 
 Both runs are compared on training views that are held out. Those show people who walk through, too, whom no model can
 foresee. So only the pixels count that at least one of the two models explains best, the same ones for both.
@@ -17,7 +17,7 @@ from dyngs.training.background import background_colour
 from dyngs.training.trainer import Trainer
 
 EXPLAINED = 0.8
-"""Share of the pixels of a view that count: those where the smaller of the two errors is smallest."""
+"""Fraction of the pixels of a view that count: those where the smaller of the two errors is smallest."""
 CLEAR_GAIN = 0.1
 """Mean gain, dB, that masks must bring at least."""
 
@@ -34,20 +34,18 @@ def compared(one: Trainer, other: Trainer) -> Comparison:
     """Compare two models on the views held out, over the pixels that one of them explains."""
     background, found = background_colour(one.background), []
     for index in sorted(one.held_out):
-        picture = one.pictures[index]
-        truth = picture.composite(background)
-        pictures = [
-            drawn(x.scene, picture, x.options, background, fitted=x.exposures is not None) for x in (one, other)
-        ]
-        counts = explained(pictures[0], pictures[1], truth, picture.mask)
-        found.append((psnr(pictures[0], truth, counts), psnr(pictures[1], truth, counts)))
+        image = one.images[index]
+        truth = image.composite(background)
+        images = [drawn(x.scene, image, x.options, background, fitted=x.exposures is not None) for x in (one, other)]
+        counts = explained(images[0], images[1], truth, image.mask)
+        found.append((psnr(images[0], truth, counts), psnr(images[1], truth, counts)))
     return Comparison(found)
 
 
 def explained(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
-    """Return (H, W) the pixels, of those that ``mask`` keeps, where the smaller error of two pictures is smallest.
+    """Return (H, W) the pixels, of those that ``mask`` keeps, where the smaller error of two images is smallest.
 
-    Neither picture is favoured: exchanged, they give the same.
+    Neither image is favoured: exchanged, they give the same.
 
     Args:
         one, other, truth: (H, W, 3).

@@ -11,19 +11,19 @@ from torch import Tensor
 from typing_extensions import assert_never
 
 from dyngs.build import assemble
-from dyngs.colour.affine import fitted_affine, recoloured
 from dyngs.config import BudgetConfig, Config, DefaultStrategy, FixedStrategy, McmcStrategy, PruneConfig, Strategy
 from dyngs.data.capture import View
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
+from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Scene
 from dyngs.metrics import psnr
-from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene
 from dyngs.training.trainer import Trainer
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
-"""Longest side of the pictures, px, and most Gaussians.
+"""Longest side of the images, px, and most Gaussians.
 
-A still model of what moves grows without end, to explain motion by viewpoint; one per pixel is enough to fail by.
+A static model of what moves grows without end, to explain motion by viewpoint; one per pixel is enough to fail by.
 """
 FEWEST_VIEWS = 8
 """With fewer training views none can be spared for a comparison."""
@@ -32,7 +32,7 @@ FEW_VIEWS, OFTEN, HELD_OUT = 24, 4, 10
 
 
 def small_run(config: Config, every: int, steps: int) -> Config:
-    """Return ``config`` for ``steps`` in small pictures, without limits, one view of ``every`` never trained on."""
+    """Return ``config`` for ``steps`` in small images, without limits, one view of ``every`` never trained on."""
     side = min(config.data.longest_side or SMALL_SIDE, SMALL_SIDE)
     held_out = {"hold_out_every": every, "hold_out_until": 1.0, "steps": steps, "minutes": None}
     return config.model_copy(
@@ -62,24 +62,22 @@ def hold_out_every(views: Sequence[View]) -> int:
 
 
 @torch.no_grad()
-def drawn(
-    scene: Scene, picture: Picture, options: RenderOptions, background: Tensor, *, fitted: bool = False
-) -> Tensor:
-    """Return ``picture`` as ``scene`` shows it (H, W, 3); ``fitted``: after an affine colour that is fitted to it."""
-    rendering = scene.render(picture.cameras, picture.time, options=options, background=background)
+def drawn(scene: Scene, image: Image, options: RenderOptions, background: Tensor, *, fitted: bool = False) -> Tensor:
+    """Return ``image`` as ``scene`` shows it (H, W, 3); ``fitted``: after an affine colour that is fitted to it."""
+    rendering = scene.render(image.cameras, image.time, options=options, background=background)
     if not fitted:
         return rendering.rgb[0]
-    affine = fitted_affine([(picture, rendering)], background)
-    return recoloured(affine, picture, rendering, background)
+    affine = fitted_affine([(image, rendering)], background)
+    return recoloured(affine, image, rendering, background)
 
 
 def held_out_scores(scene: Scene, trainer: Trainer, background: Tensor) -> list[float]:
-    """Return the PSNR of the pictures that ``trainer`` holds out, dB, in order of their indices.
+    """Return the PSNR of the images that ``trainer`` holds out, dB, in order of their indices.
 
-    Where exposures are learned, those of pictures held out are not: they are fitted.
+    Where exposures are learned, those of images held out are not: they are fitted.
     """
     options, fitted = trainer.options, trainer.exposures is not None
-    shown = [trainer.pictures[i] for i in sorted(trainer.held_out)]
+    shown = [trainer.images[i] for i in sorted(trainer.held_out)]
     return [psnr(drawn(scene, x, options, background, fitted=fitted), x.composite(background), x.mask) for x in shown]
 
 

@@ -1,4 +1,4 @@
-"""Settings that are found out by small, short runs of a still scene, compared on training views that are held out.
+"""Settings that are found out by small, short runs of a static scene, compared on training views that are held out.
 
 All settings share one small run without any of them. Each is compared with the best of those before it, and a setting
 of which that first run says that it cannot pay gets no run of its own.
@@ -17,13 +17,13 @@ from dyngs.config.still import as_still
 from dyngs.data.read import read_capture
 from dyngs.training.trainer import Trainer
 
-STEPS, SHARE, FEWEST_STEPS = 1500, 0.2, 400
-"""Steps of each small run; at most this share of the run's own. With fewer steps than these it says nothing."""
+STEPS, FRACTION, FEWEST_STEPS = 1500, 0.2, 400
+"""Steps of each small run; at most this fraction of the run's own. With fewer steps than these it says nothing."""
 CANDIDATES: tuple[Candidate, ...] = (camera_choice.CANDIDATE, exposure_choice.CANDIDATE, robust_choice.CANDIDATE)
 
 
 def decided(config: Config) -> Config:
-    """Return ``config`` with all ``auto`` settings decided that small still runs decide; lines say what was found.
+    """Return ``config`` with all ``auto`` settings decided that small static runs decide; lines say what was found.
 
     A moving scene is stood in for by a still one.
 
@@ -36,7 +36,7 @@ def decided(config: Config) -> Config:
     best = config
     for candidate in asked:
         best = candidate.decided(best, "never")
-    views, steps = read_capture(config.data).splits["train"], min(STEPS, int(SHARE * config.train.steps))
+    views, steps = read_capture(config.data).splits["train"], min(STEPS, int(FRACTION * config.train.steps))
     if config.train.minutes is not None or steps < FEWEST_STEPS or len(views) < FEWEST_VIEWS:
         keys = ", ".join(f"{candidate.key}=auto" for candidate in asked)
         print(f"{keys}: too short a run, or too few views, to find out whether it pays; not used", flush=True)

@@ -1,7 +1,7 @@
-"""A still model beside a moving one: trained first, compared on held-out training views, kept where it is better.
+"""A static model beside a moving one: trained first, compared on held-out training views, kept where it is better.
 
 Most of what a moving scene shows stands, and some scenes that have times do not move at all. So nothing moves before
-the pictures say so, and what moves must be worth it.
+the images say so, and what moves must be worth it.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from dyngs.config import Config, DynamicModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.config.still import as_still
 from dyngs.data.capture import View
-from dyngs.data.loader import Picture, PictureLoader
-from dyngs.data.pictures.images import area_downscale
+from dyngs.data.images.images import area_downscale
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.deform.evidence import Verdict
 from dyngs.deform.still_error import signed_errors
 from dyngs.errors import DyngsError
+from dyngs.gaussians.scene import Scene
 from dyngs.metrics import psnr
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import STILL_FOLDER, begin
-from dyngs.scene import Scene
 from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, StepDone
 from dyngs.training.loop import Loop
@@ -39,9 +39,9 @@ from dyngs.training.schedule import hold_out_until
 from dyngs.training.trainer import Trainer
 
 STILL_STEPS = 2000
-"""Most steps of the still model that is compared with."""
+"""Most steps of the static model that is compared with."""
 ERRS, MIN_ERRING = 0.1, 0.01
-"""Colour error from which a still model fails, and the share of held-out views where it does so if things move."""
+"""Colour error from which a static model fails, and the fraction of held-out views where it does so if things move."""
 CLEAR = 0.05
 """Opacity of what moves up to which a pixel shows what stands."""
 
@@ -52,7 +52,7 @@ def start(config: Config, folder: Path, train_still: Callable[[Config, Path], No
     Args:
         config: of a run that has not begun, or was stopped before its first checkpoint.
         folder: of the run.
-        train_still: trains the still model in a folder, or goes on with it, to its end.
+        train_still: trains the static model in a folder, or goes on with it, to its end.
 
     Raises:
         DyngsError: a capture that cannot be read, or one without times.
@@ -67,26 +67,26 @@ def start(config: Config, folder: Path, train_still: Callable[[Config, Path], No
         return config
     evidence = motion_evidence(config)
     if evidence.verdict is Verdict.STILL:
-        print(f"nothing moves: {evidence.reason}; trained as a still scene", flush=True)
+        print(f"nothing moves: {evidence.reason}; trained as a static scene", flush=True)
         return as_still(config)
     if len(views) < FEWEST_VIEWS:
-        print(f"{len(views)} views are too few to compare with a still model on some of them", flush=True)
+        print(f"{len(views)} views are too few to compare with a static model on some of them", flush=True)
         return config
     every, moves = hold_out_every(views), evidence.verdict is Verdict.MOVES
     begin(folder, config)
     said = "moves" if moves else "may move"
-    print(f"something {said}: {evidence.reason}; first a small still model, to compare with", flush=True)
+    print(f"something {said}: {evidence.reason}; first a small static model, to compare with", flush=True)
     train_still(_still_config(config, every, folder / STILL_FOLDER), folder / STILL_FOLDER)
     failing, scores = _small_still_model(folder / STILL_FOLDER)
     if not moves:
-        fails = f"a small still model fails in {failing:.1%} of held-out training views"
+        fails = f"a small static model fails in {failing:.1%} of held-out training views"
         if failing < MIN_ERRING:
-            print(f"nothing moves: {fails}; trained as a still scene", flush=True)
+            print(f"nothing moves: {fails}; trained as a static scene", flush=True)
             return still_instead(folder, config)
         print(f"{fails}: motion is tried", flush=True)
     chosen = with_choices(config, every, None if moves else scores)
     if chosen is None:
-        print("motion does not pay; trained as a still scene", flush=True)
+        print("motion does not pay; trained as a static scene", flush=True)
         return still_instead(folder, config)
     return chosen.model_copy(update={"train": config.train.model_copy(update={"hold_out_every": every})})
 
@@ -95,15 +95,15 @@ def _require_times(config: Config, views: Sequence[View]) -> None:
     """Raise an error unless the views were taken at two times or more."""
     if len({view.time for view in views}) < 2:
         raise DyngsError(
-            f"{config.data.root}: the pictures have no times, so nothing can move; train configs/static.yaml, or add a "
-            "time to each picture (docs/formats.md), or give data.times=order if their names are in the order of time"
+            f"{config.data.root}: the images have no times, so nothing can move; train configs/static.yaml, or add a "
+            "time to each image (docs/formats.md), or give data.times=order if their names are in the order of time"
         )
 
 
 def still_instead(folder: Path, config: Config) -> Config:
-    """Remove what was trained in ``folder``, and return the configuration of the still scene to train instead.
+    """Remove what was trained in ``folder``, and return the configuration of the static scene to train instead.
 
-    Its colours are those that were asked for, as the small still model has them: pilot runs choose for what moves.
+    Its colours are those that were asked for, as the small static model has them: pilot runs choose for what moves.
     """
     shutil.rmtree(folder / "checkpoints", ignore_errors=True)
     train = config.train.model_copy(update={"hold_out_every": 0})
@@ -115,15 +115,15 @@ def still_instead(folder: Path, config: Config) -> Config:
 
 
 class StillComparison:
-    """Listener that compares a moving model with its own still model once views are held out no more.
+    """Listener that compares a moving model with its own static model once views are held out no more.
 
     Args:
-        folder: of the run; the still model lies in it, and is removed when it has lost.
+        folder: of the run; the static model lies in it, and is removed when it has lost.
         trainer: returns the trainer of the moving model.
         loop: tells the result.
 
     Attributes:
-        is_lost: the still model is better.
+        is_lost: the static model is better.
     """
 
     def __init__(self, folder: Path, trainer: Callable[[], Trainer], loop: Loop) -> None:
@@ -142,12 +142,12 @@ class StillComparison:
         if not trainer.held_out or not checkpoint_paths(source):
             return
         run = load_run(source)
-        still, small = run.scene.to(trainer.device), PictureLoader(trainer.pictures.views, run.config.data)
+        still, small = run.scene.to(trainer.device), ImageLoader(trainer.images.views, run.config.data)
         small.device = trainer.device
-        found = [_compared(trainer, still, trainer.pictures[i], small[i]) for i in sorted(trainer.held_out)]
+        found = [_compared(trainer, still, trainer.images[i], small[i]) for i in sorted(trainer.held_out)]
         moving, standing = _means([x[0] for x in found]), [x[1] for x in found if x[1] is not None]
         self.is_lost = not is_gain([x[0][0] - x[0][1] for x in found])
-        kept = "a still model is trained instead" if self.is_lost else "motion is kept"
+        kept = "a static model is trained instead" if self.is_lost else "motion is kept"
         text = f"{len(found)} held-out training views: {moving[0]:.2f} dB with motion, {moving[1]:.2f} dB without"
         if standing:
             text += "; where nothing moves {:.2f} and {:.2f} dB".format(*_means(standing))
@@ -158,22 +158,22 @@ class StillComparison:
 
 @torch.no_grad()
 def _compared(
-    trainer: Trainer, still: Scene, picture: Picture, small: Picture
+    trainer: Trainer, still: Scene, image: Image, small: Image
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Return PSNR of a small picture with motion and without, whole and where nothing that moves is in front."""
+    """Return PSNR of a small image with motion and without, whole and where nothing that moves is in front."""
     background, options, fitted = background_colour(trainer.background), trainer.options, trainer.exposures is not None
     size, truth = (small.cameras.width, small.cameras.height), small.composite(background)
-    pictures = [
-        area_downscale(drawn(trainer.scene, picture, options, background, fitted=fitted), *size),
+    images = [
+        area_downscale(drawn(trainer.scene, image, options, background, fitted=fitted), *size),
         drawn(still, small, options, background, fitted=fitted),
     ]
-    alpha = trainer.scene.part("moving").render(picture.cameras, picture.time, options=options).alpha[0]
+    alpha = trainer.scene.part("moving").render(image.cameras, image.time, options=options).alpha[0]
     stands = (area_downscale(alpha[..., None], *size)[..., 0] < CLEAR).float()
     stands = stands * (1.0 if small.mask is None else small.mask)
-    whole = psnr(pictures[0], truth, small.mask), psnr(pictures[1], truth, small.mask)
+    whole = psnr(images[0], truth, small.mask), psnr(images[1], truth, small.mask)
     if not bool((stands > 0).any()):
         return whole, None
-    return whole, (psnr(pictures[0], truth, stands), psnr(pictures[1], truth, stands))
+    return whole, (psnr(images[0], truth, stands), psnr(images[1], truth, stands))
 
 
 def _means(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -181,18 +181,18 @@ def _means(values: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _still_config(config: Config, every: int, folder: Path) -> Config:
-    """Return the configuration of the small still model, which never sees the views held out."""
+    """Return the configuration of the small static model, which never sees the views held out."""
     small = small_run(as_still(config), every, min(config.train.steps, STILL_STEPS))
     return small.model_copy(update={"run": config.run.model_copy(update={"dir": folder})})
 
 
 def _small_still_model(folder: Path) -> tuple[float, list[float]]:
-    """Return how the still model in ``folder`` does on the held-out training views.
+    """Return how the static model in ``folder`` does on the held-out training views.
 
     The error of a Gaussian is that of the pixels that show it, with its sign: detail that is not yet resolved cancels.
 
     Returns:
-        the share of the views, by blending weights, where it fails; PSNR of each view, dB.
+        the fraction of the views, by blending weights, where it fails; PSNR of each view, dB.
     """
     run = load_run(folder)
     trainer = assemble(run.config, restored=True)
@@ -200,9 +200,9 @@ def _small_still_model(folder: Path) -> tuple[float, list[float]]:
     background = background_colour(trainer.background)
     fails = total = 0.0
     for index in sorted(trainer.held_out):
-        picture = trainer.pictures[index]
-        shown = drawn(scene, picture, trainer.options, background, fitted=trainer.exposures is not None)
-        errors, weights = signed_errors(scene.gaussians, picture, trainer.options, background, shown)
+        image = trainer.images[index]
+        shown = drawn(scene, image, trainer.options, background, fitted=trainer.exposures is not None)
+        errors, weights = signed_errors(scene.gaussians, image, trainer.options, background, shown)
         mean: Tensor = errors.abs().mean(1) / weights.clamp_min(1e-6)
         fails += float(weights[mean > ERRS].sum())
         total += float(weights.sum())

@@ -59,9 +59,9 @@ from dyngs.runs.lock import writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
+from dyngs.training.extend import told, with_length
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible, shared
-from dyngs.training.longer import told, with_length
 from dyngs.training.loop import Loop, Stopwatch
 from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
@@ -96,7 +96,7 @@ def train(
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
-            changed: the run then goes on to so many, on their schedules (``dyngs.training.longer``).
+            changed: the run then goes on to so many, on their schedules (``dyngs.training.extend``).
         resume_from: a run folder to go on with, from its newest checkpoint, or from the beginning where it was stopped
             before its first: the result has the same bytes as if the run had never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
@@ -104,7 +104,7 @@ def train(
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
-            cannot be kept, no card where one is asked for, a loss that is not finite, a full disk.
+            cannot be kept, no GPU where one is asked for, a loss that is not finite, a full disk.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how to go on.
     """
     folder = resume_from or config.run.dir or default_folder(config.run.name)
@@ -158,7 +158,7 @@ def _told_again(config: Config, folder: Path) -> str:
 
 
 def _train_still(new_run: Callable[[Config, Path, Checkpoint | None], _Run], config: Config, folder: Path) -> None:
-    """Train the still model that a moving one is compared with, or go on with it, to its end."""
+    """Train the static model that a moving one is compared with, or go on with it, to its end."""
     resumed = latest_checkpoint(folder) if checkpoint_paths(folder) else None
     if resumed is not None and resumed.info.step >= config.total_steps:
         return
@@ -225,7 +225,7 @@ class _Run:
         """Step until the end, or until interrupted, and keep the limits.
 
         Returns:
-            false where the still model has turned out to be better, so that the run ends before its time.
+            false where the static model has turned out to be better, so that the run ends before its time.
         """
         options, loop, done = self.config.train, self.loop, self.loop.trainer.done
         with (
@@ -247,7 +247,7 @@ class _Run:
                 loop.run(lambda: interrupts.requested or _is_lost(comparison))
             finally:
                 if limited is not None:
-                    limited.trainer.pictures.rest()
+                    limited.trainer.images.rest()
             if _is_lost(comparison):
                 return False
             if loop.trainer.done < loop.total:
@@ -350,7 +350,7 @@ def _tell_memory(trainer: Trainer, processes: int) -> None:
     """Print how much memory a run will take, and a warning where that is likely to be more than is there.
 
     Raises:
-        DyngsError: it is certain to be more than this machine, or its card, can give.
+        DyngsError: it is certain to be more than this machine, or its GPU, can give.
     """
     for forecast in memory_forecasts(trainer, processes):
         print(forecast, flush=True)

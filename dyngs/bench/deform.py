@@ -33,17 +33,17 @@ FIELD_STAGES = ("field forward", "field backward", "field penalties", "field Ada
 
 @dataclass(frozen=True)
 class DeformLoad:
-    """A configuration to measure, and the share of its Gaussians that move.
+    """A configuration to measure, and the fraction of its Gaussians that move.
 
     Attributes:
         config: configuration of a dynamic model.
         run_dir: run whose checkpoint to start from; None: untrained Gaussians.
-        moving_share: share of moving Gaussians without a run.
+        moving_fraction: fraction of moving Gaussians without a run.
     """
 
     config: Config
     run_dir: Path | None = None
-    moving_share: float = 0.1
+    moving_fraction: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class DeformReport:
         kind: kind of the field.
         steps: time of a training step by variant, interleaved.
         stages: time by stage of the field, for the moving Gaussians.
-        field_share: share of the field in a step with the moving Gaussians.
+        field_fraction: fraction of the field in a step with the moving Gaussians.
     """
 
     isa: str
@@ -67,7 +67,7 @@ class DeformReport:
     stages: dict[str, float]
 
     @property
-    def field_share(self) -> float:
+    def field_fraction(self) -> float:
         moving, still = self.steps[VARIANTS[1]], self.steps[VARIANTS[0]]
         return max(0.0, 1 - still / moving)
 
@@ -75,12 +75,12 @@ class DeformReport:
 def load_of_run(run_dir: Path) -> DeformLoad:
     """Return the load of a trained dynamic run. Raises DyngsError if it has no field."""
     run = load_run(run_dir)
-    if field_of(run.config) is None or run.scene.is_still:
+    if field_of(run.config) is None or run.scene.is_static:
         raise DyngsError(f"{run_dir}: nothing moves in this run; give one of a dynamic model, or none")
     return DeformLoad(run.config, run_dir)
 
 
-def synthetic_load(folder: Path, num_gaussians: int, moving_share: float, kind: str) -> DeformLoad:
+def synthetic_load(folder: Path, num_gaussians: int, moving_fraction: float, kind: str) -> DeformLoad:
     """Return a load without a run: random Gaussians and a small room, which is written into ``folder``."""
     keys = {
         "data.root": folder,
@@ -91,7 +91,7 @@ def synthetic_load(folder: Path, num_gaussians: int, moving_share: float, kind: 
     }
     config = load_config(None, [f"{key}={value}" for key, value in keys.items()])
     write_dynamic_capture("room", folder, DynamicOptions(size=200, num_times=4, num_cameras=3, samples=1))
-    return DeformLoad(config, None, moving_share)
+    return DeformLoad(config, None, moving_fraction)
 
 
 def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
@@ -124,9 +124,9 @@ def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
 
 def format_report(report: DeformReport) -> str:
     """Return the report as text."""
-    share = report.num_moving / max(report.num_gaussians, 1)
+    fraction = report.num_moving / max(report.num_gaussians, 1)
     lines = [
-        f"{report.kind}: {report.num_gaussians:,} Gaussians, {report.num_moving:,} ({share:.1%}) move; "
+        f"{report.kind}: {report.num_gaussians:,} Gaussians, {report.num_moving:,} ({fraction:.1%}) move; "
         f"{report.threads} thread(s), instruction set {report.isa}",
         f"{'training step':<24}{'median ms':>10}{'steps/s':>10}",
     ]
@@ -134,14 +134,14 @@ def format_report(report: DeformReport) -> str:
     lines += [f"{name:<24}{ms:10.2f}" for name, ms in report.stages.items()]
     faster = report.steps[VARIANTS[2]] / report.steps[VARIANTS[1]]
     lines.append(
-        f"the field takes {report.field_share:.0%} of a step; the static split makes steps {faster:.2f}x faster"
+        f"the field takes {report.field_fraction:.0%} of a step; the static split makes steps {faster:.2f}x faster"
     )
     return "\n".join(lines)
 
 
 def write_report(report: DeformReport, path: Path) -> None:
     """Write the report as JSON."""
-    write_text(path, json.dumps(asdict(report) | {"field_share": report.field_share}, indent=2) + "\n")
+    write_text(path, json.dumps(asdict(report) | {"field_fraction": report.field_fraction}, indent=2) + "\n")
 
 
 def _field(config: Config) -> DeformField:
@@ -162,8 +162,8 @@ def _trainer(load: DeformLoad, variant: str) -> Trainer:
     if variant == VARIANTS[0]:
         trainer.scene = replace(scene, field=None, moving=scene.moving[:0])
     elif variant == VARIANTS[2] or load.run_dir is None:
-        share = 1.0 if variant == VARIANTS[2] else load.moving_share
-        rows = torch.arange(round(share * len(scene)), device=device)
+        fraction = 1.0 if variant == VARIANTS[2] else load.moving_fraction
+        rows = torch.arange(round(fraction * len(scene)), device=device)
         low, high = torch.zeros(3, device=device), torch.ones(3, device=device)
         setup = FieldSetup(low, high, len(scene.times), len(rows), trainer.extent)
         field = new_field(_field(load.config), setup, torch.Generator("cpu").manual_seed(0))

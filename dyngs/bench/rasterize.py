@@ -84,9 +84,9 @@ class RasterizeReport:
     Attributes:
         entries: number of (tile, Gaussian) pairs.
         pairs: number of blended (pixel, Gaussian) pairs.
-        lanes_used: share of the computed pairs that were blended.
-        runs: times per number of threads; on a card one.
-        device: "cpu", or the name of the card.
+        lanes_used: fraction of the computed pairs that were blended.
+        runs: times per number of threads; on a GPU one.
+        device: "cpu", or the name of the GPU.
     """
 
     isa: str
@@ -145,7 +145,7 @@ def _with_random_shapes(means: Tensor, colors: Tensor, cameras: Cameras) -> Work
 def bench_rasterize(load: Workload, threads: list[int], repeats: int) -> RasterizeReport:
     """Measure every stage, interleaved over thread counts so that other load affects them alike.
 
-    A workload on a card is timed by CUDA events.
+    A workload on a GPU is timed by CUDA events.
     """
     with torch.no_grad():
         projection = project(load.means, load.quats, load.scales, load.opacities, load.cameras, _LIMITS)
@@ -253,7 +253,7 @@ def format_report(report: RasterizeReport) -> str:
     rows = [
         ("all stages", [f"{run.total:.2f}" for run in report.runs]),
         ("speed-up", [f"{report.runs[0].total / run.total:.2f}x" for run in report.runs]),
-        ("project + bin, share", [f"{_preparation_share(run):.0%}" for run in report.runs]),
+        ("project + bin, share", [f"{_preparation_fraction(run):.0%}" for run in report.runs]),
         ("sgemm, GFLOP/s", [f"{run.sgemm_gflops:.0f}" for run in report.runs]),
     ]
     for name in ("blend", "blend backward"):
@@ -269,5 +269,5 @@ def _label(report: RasterizeReport, run: StageTimes) -> str:
     return f"{run.threads} thread(s)" if report.device == "cpu" else "cuda"
 
 
-def _preparation_share(run: StageTimes) -> float:
+def _preparation_fraction(run: StageTimes) -> float:
     return (run.milliseconds["project"] + run.milliseconds["bin + sort"]) / run.total

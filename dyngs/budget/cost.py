@@ -19,7 +19,7 @@ from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.remaining import FIXED, MOTION, PER_GAUSSIAN, PER_MEGAPIXEL
 from dyngs.training.events import Event, StepDone
 from dyngs.training.memory import gaussian_bytes, num_changes, peak_memory
-from dyngs.training.schedule import growth_per_change, motion_begins_after, picture_divisor, scaled
+from dyngs.training.schedule import growth_per_change, image_divisor, motion_begins_after, scaled
 
 SLOWER = 0.1
 """Power of the number of changes with which each adds fewer Gaussians."""
@@ -87,7 +87,7 @@ class CostMeter:
             case StepDone():
                 now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
                 config = self.run.trainer.config
-                self._pixels = height * width * picture_divisor(config.train, event.step) ** 2
+                self._pixels = height * width * image_divisor(config.train, event.step) ** 2
                 if self._last is not None:
                     cost = step_cost(config, event.step, self._pixels, event.num_gaussians)
                     self._paces.append((now - self._last) / cost)
@@ -106,7 +106,7 @@ class CostMeter:
         spread = PACE if has_grown else PACE_UNSEEN
         other = max(self.run.used - self._stepping, 0.0)
         slow, middle, fast = (other + pace * self._whole(config, n) for n in (counts.high, counts.middle, counts.low))
-        peak, each = peak_memory() + self.run.trainer.pictures.bytes_to_come, gaussian_bytes(config)
+        peak, each = peak_memory() + self.run.trainer.images.bytes_to_come, gaussian_bytes(config)
         least, expected, most = (peak + each * max(n - now, 0) for n in (counts.low, counts.middle, counts.high))
         paths = checkpoint_paths(self.run.folder)
         stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if config.train.save_every else 1)
@@ -151,10 +151,10 @@ class CostMeter:
 
 
 def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) -> float:
-    """Return the cost of ``step``, whose picture has so many pixels at full size; only ratios mean something."""
+    """Return the cost of ``step``, whose image has so many pixels at full size; only ratios mean something."""
     begins = motion_begins_after(config, config.train.steps)
     moving = MOTION if begins is not None and step > begins else 1.0
-    shown = 1e-6 * pixels / picture_divisor(config.train, step) ** 2
+    shown = 1e-6 * pixels / image_divisor(config.train, step) ** 2
     return moving * (FIXED + PER_MEGAPIXEL * shown + PER_GAUSSIAN * num_gaussians)
 
 

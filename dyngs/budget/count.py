@@ -27,7 +27,7 @@ class CountLimit:
 
     Attributes:
         before: their number before the first removal; 0: there was none.
-        lost: dB of training pictures by all removals, before anything was trained again.
+        lost: dB of training images by all removals, before anything was trained again.
     """
 
     def __init__(self, run: LimitedRun, most: int) -> None:
@@ -79,6 +79,6 @@ class CountLimit:
 
 def count_limit(run: LimitedRun) -> CountLimit | None:
     """Return the limit of a run, None without one."""
-    times = {view.time for view in run.trainer.pictures.views if view.time is not None}
+    times = {view.time for view in run.trainer.images.views if view.time is not None}
     most = most_gaussians(run.trainer.config, len(times))
     return None if most is None else CountLimit(run, most)

@@ -15,7 +15,8 @@ from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
 
 STAGES = (0.7, 0.9)
-"""Shares of a run after which Gaussians are removed where that is needed, with steps left for the others to adapt."""
+"""Fractions of a run after which Gaussians are removed where that is needed, with steps left for the others to
+adapt."""
 
 
 @dataclass
@@ -53,7 +54,7 @@ class LimitedRun:
         self.trainer = self.loop.trainer = trainer
 
     def remove(self, kept: Tensor) -> tuple[float, float]:
-        """Leave only the Gaussians ``kept`` (N,); return the quality of training pictures before and after, dB."""
+        """Leave only the Gaussians ``kept`` (N,); return the quality of training images before and after, dB."""
         trainer = self.trainer
         before, count = training_quality(trainer, trainer.scene), trainer.num_gaussians
         trainer.keep(kept)
@@ -65,10 +66,10 @@ class LimitedRun:
         self.loop.tell(Message(text))
 
 
-def stage(config: Config, step: int, share: float = 0.0) -> int:
+def stage(config: Config, step: int, fraction: float = 0.0) -> int:
     """Return how many stages of removal a run has come to after ``step``; the last is its end.
 
-    Where pruning follows training, its beginning is the first stage, and the others are shares of it.
+    Where pruning follows training, its beginning is the first stage, and the others are fractions of it.
 
     Args:
         config: of the run.
@@ -81,4 +82,4 @@ def stage(config: Config, step: int, share: float = 0.0) -> int:
         return len(STAGES) + 2 + sum(later >= x for x in (*STAGES, 1.0))
     if total > steps:
         return 0
-    return sum(max(step / steps, share) >= x for x in STAGES) + (step == steps)
+    return sum(max(step / steps, fraction) >= x for x in STAGES) + (step == steps)

@@ -12,13 +12,13 @@ from torch import Tensor
 from dyngs.build import restored_scene
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
+from dyngs.gaussians.scene import Scene
 from dyngs.ops.device import CPU
 from dyngs.prune.selection import highest
-from dyngs.prune.stage import default_scores, probe_pictures, quality_of
+from dyngs.prune.stage import default_scores, probe_images, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, FORMER_EXPORT_FOLDER
-from dyngs.scene import Scene
 from dyngs.storage.drawable import drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
@@ -27,7 +27,7 @@ from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
-"""Share of the Gaussians that each trial keeps of those of the trial before."""
+"""Fraction of the Gaussians that each trial keeps of those of the trial before."""
 FINEST_CHANGE, LARGEST_CHANGE, COARSEST = 2**0.25, 2.0, 64.0
 """Smallest and largest factor on the steps per trial, and the largest in all."""
 _TRIALS = 40
@@ -39,7 +39,7 @@ class SizeReport:
 
     Attributes:
         asked, megabytes: 1e6 bytes.
-        before, after: mean PSNR of at most 16 training pictures, dB: as trained, and as read from the file.
+        before, after: mean PSNR of at most 16 training images, dB: as trained, and as read from the file.
         num_gaussians, num_kept: as trained, and in the file.
         coarser: than usual by this factor are the steps to which values are rounded.
     """
@@ -84,7 +84,7 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
     """Write ``scene.dyngs``, at most ``megabytes`` large, into a folder of ``run_dir``, and return a report.
 
     Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
-    makes training pictures better than the former alone.
+    makes training images better than the former alone.
 
     Args:
         trainer: at the end of its run; it is left as it is.
@@ -95,8 +95,8 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
         DyngsError: no way that was tried fits; the run itself is complete.
     """
     whole, scene, config = trainer.checkpoint(), trainer.scene.to(CPU), trainer.config  # files are made on the CPU
-    pictures = probe_pictures(trainer)
-    before = quality_of(trainer, scene, pictures)
+    images = probe_images(trainer)
+    before = quality_of(trainer, scene, images)
     plan = storage_plan(config, whole, scene, None)
     info = SceneInfo(**asdict(whole.info))
 
@@ -106,17 +106,17 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
             return None
         data, coarser = found
         read = restored_scene(Checkpoint(whole.info, decoded(data).tensors), config.model)
-        return _File(data, quality_of(trainer, read, pictures), len(kept), coarser)
+        return _File(data, quality_of(trainer, read, images), len(kept), coarser)
 
     chosen = stored(scene, plan.coarseness)
     if chosen is None or chosen.coarser > 1:
-        scores, share = default_scores(trainer).cpu(), KEPT
-        while share * len(scene) >= 1:
-            kept = highest(scores, 1 - share)
+        scores, fraction = default_scores(trainer).cpu(), KEPT
+        while fraction * len(scene) >= 1:
+            kept = highest(scores, 1 - fraction)
             found = stored(scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept])
             if chosen is not None and (found is None or found.psnr <= chosen.psnr):
                 break
-            chosen, share = found, share * KEPT
+            chosen, fraction = found, fraction * KEPT
     if chosen is None:
         raise DyngsError(f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}")
     write_scene(run_dir / EXPORT_FOLDER / SCENE_FILE, chosen.data)

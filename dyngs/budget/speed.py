@@ -21,11 +21,11 @@ from dyngs.config import Config
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
+from dyngs.gaussians.scene import Scene, render_options
 from dyngs.metrics import flip, ssim
 from dyngs.ops.device import finish
 from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores, training_quality
-from dyngs.scene import Scene, render_options
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE
 from dyngs.training.schedule import scaled
@@ -35,9 +35,9 @@ from dyngs.training.views import training_cameras
 FEW = 300
 """Number of Gaussians with which the fixed cost of drawing is measured."""
 POSSIBLE = 0.8
-"""Share of the allowed drawing time; a run whose fixed cost is higher is refused."""
+"""Fraction of the allowed drawing time; a run whose fixed cost is higher is refused."""
 GOAL, ACCEPTED = 0.9, 0.95
-"""Shares of the allowed time: the aim of a removal, and the least that needs one. Measurements vary."""
+"""Fractions of the allowed time: the aim of a removal, and the least that needs one. Measurements vary."""
 CHECKS = 10
 """Number of measurements during growth, over a run."""
 VIEWS, GROWTH_VIEWS, ROUNDS = 10, 5, 3
@@ -47,15 +47,15 @@ ATTEMPTS = 2
 TRIALS = 5
 """Number of trials in one removal."""
 CLOSE_ENOUGH = 0.9
-"""Share of the time aimed at from which the search ends."""
+"""Fraction of the time aimed at from which the search ends."""
 JUDGED = 100
-"""Side of the part of a picture that is compared, px; larger parts only take longer."""
+"""Side of the part of an image that is compared, px; larger parts only take longer."""
 SCORING_DRAWINGS = 1000
 """Number of drawings that take about as long as scoring the Gaussians."""
 SAFETY = 1.3
 """Factor on the time that is kept free for that: the load of the machine changes."""
 MAYBE = 0.6
-"""Share of the allowed time; a faster scene will not be too slow at the end."""
+"""Fraction of the allowed time; a faster scene will not be too slow at the end."""
 
 
 @dataclass
@@ -68,7 +68,7 @@ class Measured:
         cap: Gaussians that there may be by what was measured; 0: as many as are wanted.
         passed: stages at which Gaussians were removed where that was needed.
         before: number of Gaussians before the first removal; 0: there was none.
-        quality: of training pictures then, dB.
+        quality: of training images then, dB.
         lost: dB of them by all removals, before anything was trained again.
         measuring: seconds that it took to measure ``base``.
         removing: seconds that the last removal took; 0: there was none.
@@ -113,7 +113,7 @@ class SpeedLimit:
                 possible = _rounded_down(ACCEPTED * POSSIBLE / found.base)
                 raise DyngsError(
                     f"budget.min_fps={self.fps:g}: {FEW} Gaussians alone are drawn at {1 / found.base:.3g} per second "
-                    f"here; {possible:g} would be possible, more with smaller pictures (data.longest_side)"
+                    f"here; {possible:g} would be possible, more with smaller images (data.longest_side)"
                 )
         self.hold()
 
@@ -230,8 +230,8 @@ class SpeedLimit:
         found = None
         for _ in range(TRIALS):
             wanted = (1 + CLOSE_ENOUGH) / 2 * goal
-            share = max((wanted - fine_seconds) / (slow_seconds - fine_seconds), 0.0)
-            count = min(fine + max(1, int(share * (slow - fine))), slow - 1)
+            fraction = max((wanted - fine_seconds) / (slow_seconds - fine_seconds), 0.0)
+            count = min(fine + max(1, int(fraction * (slow - fine))), slow - 1)
             if count <= fine:
                 break
             kept = highest(scores, 1 - count / len(scores))
@@ -255,28 +255,28 @@ def allowed(found: Measured, fps: float, count: int, config: Config) -> int:
     each = (found.seconds - found.base) / max(count, 1)
     if each <= 0:
         return most
-    return max(1, min(most, int(left / each / (1 - config.prune.share))))
+    return max(1, min(most, int(left / each / (1 - config.prune.fraction))))
 
 
 @torch.no_grad()
 def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float:
     """Return the median over training views of the least time to draw one at full size, deformation included.
 
-    In between each picture is judged, as evaluation does: drawing is faster where caches still hold all it needs.
+    In between each image is judged, as evaluation does: drawing is faster where caches still hold all it needs.
     """
     config = trainer.config
-    chosen = [trainer.pictures.views[i] for i in evenly_spaced(len(trainer.pictures), views)]
+    chosen = [trainer.images.views[i] for i in evenly_spaced(len(trainer.images), views)]
     cameras = training_cameras(chosen, config.data)
     drawing = Drawing(scene, render_options(config.model), torch.zeros(3, device=scene.gaussians.means.device))
-    drawing.picture(cameras[0], chosen[0].time)
+    drawing.image(cameras[0], chosen[0].time)
     least = [math.inf] * len(chosen)
     for _ in range(ROUNDS):
         for i, view in enumerate(chosen):
             start = time.perf_counter()
-            picture = drawing.picture(cameras[i], view.time)
-            finish(picture.device)
+            image = drawing.image(cameras[i], view.time)
+            finish(image.device)
             least[i] = min(least[i], time.perf_counter() - start)
-            part = picture[:JUDGED, :JUDGED]
+            part = image[:JUDGED, :JUDGED]
             ssim(part, part)
             flip(part, part)
     return median(least)

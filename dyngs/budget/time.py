@@ -20,20 +20,20 @@ from dyngs.config.kinds import harmonics_measured_after
 from dyngs.errors import DyngsError
 from dyngs.runs.config_file import write_config
 from dyngs.training.events import Event, StepDone
-from dyngs.training.schedule import motion_begins_after, picture_divisor, scaled
+from dyngs.training.schedule import image_divisor, motion_begins_after, scaled
 from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200
 """Fewest steps that must fit; otherwise the run is refused."""
 AIM = 0.97
-"""Share of the time that a run is planned to use."""
-PILOT_STEPS, PILOT_WARM_UP, PILOT_SHARE = 20, 2, 0.02
-"""Steps that are measured before training, fewer where they would take a larger share of the time."""
+"""Fraction of the time that a run is planned to use."""
+PILOT_STEPS, PILOT_WARM_UP, PILOT_FRACTION = 20, 2, 0.02
+"""Steps that are measured before training, fewer where they would take a larger fraction of the time."""
 FITS = 20
 """Number of times over a run that the number of steps is adapted."""
 SMALLEST_CHANGE = 0.04
 """Smallest relative change of the number of steps for which the run is prepared again."""
-PIXEL_SHARE = 0.7
+PIXEL_FRACTION = 0.7
 GROWTH, MOTION = 1.25, 2.0
 _SAMPLES = 64
 
@@ -164,7 +164,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
     start, done = time.perf_counter(), pilot.done
     while pilot.done < min(done + PILOT_STEPS, wanted):
         pilot.step()
-        if time.perf_counter() - prepared > PILOT_SHARE * 60 * minutes:
+        if time.perf_counter() - prepared > PILOT_FRACTION * 60 * minutes:
             break
     now = time.perf_counter()
     pace, used = (now - start) / (pilot.done - done), used + (prepared - begin) + (now - begin)
@@ -174,7 +174,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
         needed = (used + seconds_left(config, 0, fewest, pace)) / AIM / 60
         raise DyngsError(
             f"train.minutes={minutes:g}: about {found} steps would fit, and fewer than {fewest} are of no use; "
-            f"{_rounded_up(needed):g} would do, or smaller pictures (data.longest_side)"
+            f"{_rounded_up(needed):g} would do, or smaller images (data.longest_side)"
         )
     return with_steps(config, found)
 
@@ -182,7 +182,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
 def refitted(trainer: Trainer, config: Config) -> Trainer:
     """Return a trainer that is where ``trainer`` is, but on the schedules of ``config``."""
     fitted = assemble(config, restored=True)
-    fitted.pictures, fitted.bad_gradients = trainer.pictures, trainer.bad_gradients
+    fitted.images, fitted.bad_gradients = trainer.images, trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
     step = trainer.done + 1
     fitted.training.extend(fitted.scene, trainer.training.window(step), step)
@@ -205,9 +205,9 @@ def fitting_steps(config: Config, done: int, pace: float, seconds: float, most: 
 def seconds_left(config: Config, done: int, steps: int, pace: float) -> float:
     """Return the seconds that the rest of ``steps`` takes after ``done``, at ``pace`` seconds per step so far."""
     options, left = with_steps(config, steps).train, steps - done
-    now = _weight(picture_divisor(config.train, max(done, 1)))
+    now = _weight(image_divisor(config.train, max(done, 1)))
     sampled = (done + math.ceil(left * (i + 0.5) / _SAMPLES) for i in range(_SAMPLES))
-    weight = fmean(_weight(picture_divisor(options, step)) for step in sampled) / now
+    weight = fmean(_weight(image_divisor(options, step)) for step in sampled) / now
     if done < scaled(config.strategy.stop, steps):
         weight *= GROWTH
     motion = motion_begins_after(config, steps)
@@ -228,8 +228,8 @@ def _happened(config: Config, done: int) -> tuple[bool, ...]:
 
 
 def _weight(divisor: int) -> float:
-    """Return the time of a step with pictures shrunk by ``divisor``, relative to one at full size."""
-    return 1 - PIXEL_SHARE + PIXEL_SHARE / divisor**2
+    """Return the time of a step with images shrunk by ``divisor``, relative to one at full size."""
+    return 1 - PIXEL_FRACTION + PIXEL_FRACTION / divisor**2
 
 
 def _rounded_up(x: float) -> float:

@@ -43,10 +43,10 @@ from dyngs.errors import DyngsError, printable, require_name
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
-_OUT_OF_MEMORY = "out of memory; use smaller pictures (data.longest_side) or a smaller cache (data.cache_mb)"
+_OUT_OF_MEMORY = "out of memory; use smaller images (data.longest_side) or a smaller cache (data.cache_mb)"
 _TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
-_CARD_OUT_OF_MEMORY = "CUDA out of memory"
-_CARD_IS_FULL = "the card is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
+_GPU_OUT_OF_MEMORY = "CUDA out of memory"
+_GPU_IS_FULL = "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
 _RENAMED = {"compact": "prune"}
 """Commands of earlier versions and what they are called now."""
 _OF_DATA = ("inspect", "sfm", "motion", "synth")
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except (DyngsError, MemoryError, RuntimeError) as error:
-        full = _CARD_IS_FULL if _CARD_OUT_OF_MEMORY in str(error) else _OUT_OF_MEMORY
+        full = _GPU_IS_FULL if _GPU_OUT_OF_MEMORY in str(error) else _OUT_OF_MEMORY
         if isinstance(error, RuntimeError) and full == _OUT_OF_MEMORY and _TORCH_OUT_OF_MEMORY not in str(error):
             raise
         if debug:

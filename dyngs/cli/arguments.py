@@ -34,7 +34,7 @@ def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
         "--device",
         choices=("auto", "cpu", "cuda"),
         default=default,
-        help=f"what computes; auto: a CUDA card that can be used, else the CPU (default {default})",
+        help=f"what computes; auto: a CUDA GPU that can be used, else the CPU (default {default})",
     )
 
 
@@ -54,7 +54,7 @@ def computing_device(choice: str) -> torch.device:
     """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line on stderr says why.
 
     Raises:
-        DyngsError: ``cuda`` where no card can be used.
+        DyngsError: ``cuda`` where no GPU can be used.
     """
     from dyngs.ops.device import device_for, why_on_cpu
 

@@ -24,7 +24,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add_device(raster, "cpu")
     raster.set_defaults(run=run_rasterize)
     deform = stages.add_parser(
-        "deform", help="share of the field in a training step, with and without the static split"
+        "deform", help="fraction of the field in a training step, with and without the static split"
     )
     deform.add_argument(
         "run_dir", type=Path, nargs="?", metavar="RUN", help="run folder of a dynamic model (default: random Gaussians)"
@@ -47,7 +47,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         type=float,
         default=0.1,
         metavar="SHARE",
-        help="share of moving Gaussians if no RUN is given (default 0.1)",
+        help="fraction of moving Gaussians if no RUN is given (default 0.1)",
     )
     deform.add_argument("--threads", type=int, metavar="N", help="number of threads (default: all cores)")
     deform.add_argument("--repeats", type=int, default=10, metavar="N", help="repetitions of five steps (default 10)")

@@ -48,8 +48,8 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         help="keys of data, such as data.follow_links=true",
     )
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw cameras and points to this picture file")
-    parser.add_argument("--deep", action="store_true", help="decode every picture in full (slow)")
+    parser.add_argument("--image", type=Path, metavar="FILE", help="draw cameras and points to this image file")
+    parser.add_argument("--deep", action="store_true", help="decode every image in full (slow)")
     parser.set_defaults(run=run_inspect)
 
 
@@ -134,8 +134,8 @@ def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, and draw it if asked to."""
-    from dyngs.data.inspection.report import format_report, inspect_capture
-    from dyngs.data.prepare.unposed import is_videos
+    from dyngs.capture.inspection.report import format_report, inspect_capture
+    from dyngs.capture.unposed import is_videos
 
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
@@ -146,30 +146,30 @@ def run_inspect(arguments: argparse.Namespace) -> int:
             print(f"also: {problem}")
         raise DyngsError(report.problems[0])
     print(format_report(report))
-    if arguments.picture is not None:
-        from dyngs.data.inspection.camera_plot import draw_cameras
+    if arguments.image is not None:
+        from dyngs.capture.inspection.camera_plot import draw_cameras
 
-        draw_cameras(report.capture, arguments.picture)
-        print(f"written: {arguments.picture}")
+        draw_cameras(report.capture, arguments.image)
+        print(f"written: {arguments.image}")
     return 0
 
 
 def _inspect_videos(arguments: argparse.Namespace) -> int:
     """Print a report on a video, or a folder of videos, without poses."""
-    from dyngs.data.inspection.video_report import video_report
-    from dyngs.files.containment import pictures_up_to
+    from dyngs.capture.inspection.video_report import video_report
+    from dyngs.files.containment import images_up_to
 
-    if arguments.picture is not None:
+    if arguments.image is not None:
         raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
-    with pictures_up_to(data_section(arguments.overrides).max_megapixels):
+    with images_up_to(data_section(arguments.overrides).max_megapixels):
         print(video_report(arguments.path))
     return 0
 
 
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and print the next commands."""
-    from dyngs.data.prepare.sfm import SfmOptions, estimate_poses
-    from dyngs.data.prepare.unposed import is_several_videos
+    from dyngs.capture.sfm import SfmOptions, estimate_poses
+    from dyngs.capture.unposed import is_several_videos
 
     limits = data_section(arguments.overrides)
     if is_several_videos(arguments.images):
@@ -188,14 +188,14 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     with ProgressBar() as report:
         result = estimate_poses(arguments.images, arguments.out, options, report)
     print(result.summary())
-    print(f"next: dyngs data inspect {result.root} --picture cameras.png")
+    print(f"next: dyngs data inspect {result.root} --image cameras.png")
     print(f"      dyngs train static data.root={result.root}")
     return 0
 
 
 def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int:
     """Estimate the poses of several cameras and print the next commands."""
-    from dyngs.data.prepare.several.estimate import VideosOptions, poses_of_videos
+    from dyngs.capture.multi_video.estimate import VideosOptions, poses_of_videos
 
     for option, given in (
         ("--matching", arguments.matching != "auto"),
@@ -218,7 +218,7 @@ def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int
     with ProgressBar() as report:
         result = poses_of_videos(arguments.images, arguments.out, options, report)
     print(result.summary())
-    print(f"next: dyngs data inspect {result.root} --picture cameras.png")
+    print(f"next: dyngs data inspect {result.root} --image cameras.png")
     print(f"      dyngs train dynamic data.root={result.root}")
     return 0
 

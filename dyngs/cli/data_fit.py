@@ -1,4 +1,4 @@
-"""``dyngs data fit``: the body template fitted to pictures of a person."""
+"""``dyngs data fit``: the body template fitted to images of a person."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     """Add ``fit`` to the commands of ``dyngs data``."""
     parser = verbs.add_parser(
         "fit",
-        help="fit the free body template to pictures of a person",
+        help="fit the free body template to images of a person",
         description="Fit the free body template to the silhouettes of a person: one shape and skeleton, and the pose "
         "of every frame. OUT is a capture for `dyngs train human`.",
     )
@@ -27,18 +27,18 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "capture",
         type=Path,
         metavar="CAPTURE",
-        help="folder of a capture; or a video, or a folder of pictures, of one camera that stands",
+        help="folder of a capture; or a video, or a folder of images, of one camera that stands",
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
     parser.add_argument(
         "--keypoints", type=Path, metavar="PATH", help="key points: a folder of OpenPose files, or a COCO file"
     )
-    parser.add_argument("--masks", type=Path, metavar="DIR", help="masks of the person (white), named as the pictures")
+    parser.add_argument("--masks", type=Path, metavar="DIR", help="masks of the person (white), named as the images")
     parser.add_argument(
         "--background",
         type=Path,
         metavar="PATH",
-        help="a picture of the place without the person, or a folder of one for each camera: masks are made by it",
+        help="an image of the place without the person, or a folder of one for each camera: masks are made by it",
     )
     parser.add_argument(
         "--joints",

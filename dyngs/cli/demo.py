@@ -14,7 +14,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = commands.add_parser(
         "demo",
         help="train, evaluate and render a built-in moving scene",
-        description="Ray trace a small moving scene, train on it, evaluate, render pictures and a video, write a .ply.",
+        description="Ray trace a small moving scene, train on it, evaluate, render images and a video, write a .ply.",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="output folder (default dyngs-demo)"
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = run_demo(arguments.out, DemoOptions(steps=arguments.steps, threads=arguments.threads))
     Console().print(result_table(result))
     print(f"truth, render, error  {result.sheet}")
-    print(f"test views            {result.pictures}")
+    print(f"test views            {result.images}")
     print(f"orbit video           {result.video}")
     print(f"for other viewers     {result.ply}")
     print(f"run folder            {result.run_dir}")

@@ -76,7 +76,7 @@ def examine() -> Iterator[Finding]:
     for name, module in _REQUIRED.items():
         yield Finding(name, _version(name) or "") if util.find_spec(module) else Finding(name, "missing", "broken")
     yield from _examine_core()
-    yield from _examine_card()
+    yield from _examine_gpu()
     for name, (module, purpose) in _OPTIONAL.items():
         found = util.find_spec(module) is not None
         yield Finding(name, _version(name) or "") if found else Finding(name, f"needed for {purpose}", "absent")
@@ -99,16 +99,16 @@ def _examine_core() -> Iterator[Finding]:
         yield Finding("OpenMP runtimes", f"{len(runtimes)}: {names}" if runtimes else "0")
 
 
-def _examine_card() -> Iterator[Finding]:
-    """Yield what there is of a CUDA card; without one dyngs works, too."""
+def _examine_gpu() -> Iterator[Finding]:
+    """Yield what there is of a CUDA GPU; without one dyngs works, too."""
     try:
-        from dyngs.ops.device import findings, why_no_card
+        from dyngs.ops.device import findings, why_no_gpu
     except (ImportError, DyngsError):
         return
-    reason = why_no_card()
+    reason = why_no_gpu()
     for name, value in findings().items():
         yield Finding(name, value)
-    yield Finding("device", "cuda") if reason is None else Finding("device", f"cpu; for a card: {reason}", "absent")
+    yield Finding("device", "cuda") if reason is None else Finding("device", f"cpu; for a GPU: {reason}", "absent")
 
 
 def openmp_runtimes() -> list[Path] | None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dyngs.evaluate.report import EvalReport
 
 _OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
-"""Of the tested pictures, and on them."""
+"""Of the tested images, and on them."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -33,7 +33,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--refine",
         action="store_true",
-        help="also score from poses refined on the pictures themselves: of a person's body, otherwise of the cameras; "
+        help="also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; "
         "always done after camera.refine",
     )
     parser.add_argument("--refine-poses", dest="refine", action="store_true", help=argparse.SUPPRESS)
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.refine and arguments.split != "train":
         load_resolved(arguments.run_dir)  # what is no run is refused before anything is announced
-        print("refining poses on the tested pictures, beside the scores as given: this takes a while", file=sys.stderr)
+        print("refining poses on the tested images, beside the scores as given: this takes a while", file=sys.stderr)
     report = evaluate_run(
         arguments.run_dir,
         arguments.split,
@@ -91,11 +91,11 @@ def report_table(report: EvalReport) -> Table:
     for label, value in _rows_over_time(report):
         table.add_row(label, escape(value))
     field = f", {report.field_mb:.1f} of them the field" if report.num_moving else ""
-    deforming = f", {report.deform_share:.0%} of the time deforming" if report.num_moving else ""
-    table.add_row("picture size", f"{report.width}x{report.height} on {report.background}")
+    deforming = f", {report.deform_fraction:.0%} of the time deforming" if report.num_moving else ""
+    table.add_row("image size", f"{report.width}x{report.height} on {report.background}")
     table.add_row("Gaussians", f"{report.num_gaussians:,}")
     if report.num_moving:
-        table.add_row("moving", f"{report.num_moving:,} ({report.moving_share:.1%})")
+        table.add_row("moving", f"{report.num_moving:,} ({report.moving_fraction:.1%})")
     stored = "" if report.stored_mb is None else f"{report.stored_mb:.2f} MB on disk, as float32 "
     table.add_row("model", f"{stored}{report.model_mb:.1f} MB{field}")
     table.add_row("colour", f"{report.colour_floats:.1f} numbers per Gaussian")
@@ -105,7 +105,7 @@ def report_table(report: EvalReport) -> Table:
 
 
 def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the scores of a person: as given, from silhouettes, refined on the pictures."""
+    """Return labels and values of the scores of a person: as given, from silhouettes, refined on the images."""
     rows: list[tuple[str, str]] = []
     for scores, suffix in ((report, ""), (report.silhouette_poses, _OUTLINED), (report.own_poses, _REFINED)):
         if scores is None:
@@ -121,13 +121,13 @@ def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the PSNR of parts of pictures; of a still capture only what is known."""
+    """Return labels and values of the PSNR of parts of images; of a still capture only what is known."""
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
     for label, name, value in (
         ("on what moves", "psnr_moving", report.psnr_moving),
-        ("on what does not", "psnr_still", report.psnr_still),
+        ("on what does not", "psnr_static", report.psnr_static),
     ):
         if value is not None:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))

@@ -12,9 +12,9 @@ from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
     from dyngs.export.run_to_splats import Part
-    from dyngs.output.redrawn import Redrawn
+    from dyngs.gaussians.scene import Scene
+    from dyngs.output.roundtrip import Redrawn
     from dyngs.runs.checkpoint import LoadedRun
-    from dyngs.scene import Scene
     from dyngs.splats.formats import Written
 
 _OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
@@ -72,7 +72,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--max-change",
         type=float,
         metavar="X",
-        help="--format dyngs: largest root-mean-square change of the pictures, in grey levels of 255 "
+        help="--format dyngs: largest root-mean-square change of the images, in grey levels of 255 "
         "(default: what lowers the PSNR of training views by 0.025 dB)",
     )
     parser.add_argument(
@@ -130,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         loaded = with_motion(loaded, arguments.motion).run
         times = loaded.scene.times if times is None else times
-    if loaded.scene.is_still and times is not None:
+    if loaded.scene.is_static and times is not None:
         print_notes(("nothing moves in this run: it is the same at all times",))
     if kind == "tracks":
         files = _export_tracks(arguments, loaded, times)
@@ -173,7 +173,7 @@ def _kind(arguments: argparse.Namespace) -> str:
 
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
-    """Write the run as a .dyngs file and print how much its pictures change."""
+    """Write the run as a .dyngs file and print how much its images change."""
     from dyngs.export.scene_file import write_scene_file
     from dyngs.storage.measure import SMALLEST_CHANGE
 
@@ -192,10 +192,10 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
     written = write_scene_file(arguments.run_dir, out, max_change)
     change = written.precision.change
     if change is None:
-        warning = "the capture cannot be read: quantisation steps are fixed, and the change of pictures is not measured"
+        warning = "the capture cannot be read: quantisation steps are fixed, and the change of images is not measured"
         print_notes((), (warning,))
     else:
-        note = f"pictures change by {change:.2f} grey levels of 255 (root mean square over some training views)"
+        note = f"images change by {change:.2f} grey levels of 255 (root mean square over some training views)"
         print_notes((note,))
     ratio = written.num_bytes_exact / written.num_bytes
     print(f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)")
@@ -256,7 +256,7 @@ def _export_splats(
     else:
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
-        if times is None and not arguments.static and not loaded.scene.is_still:
+        if times is None and not arguments.static and not loaded.scene.is_static:
             print_notes(("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",))
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
@@ -272,7 +272,7 @@ def _part(arguments: argparse.Namespace) -> Part:
 
 def _redrawn(loaded: LoadedRun, scene: Scene, time: float, written: Written) -> Redrawn:
     """Return how a file differs from the scene."""
-    from dyngs.output.redrawn import compare_run
+    from dyngs.output.roundtrip import compare_run
     from dyngs.splats.formats import read_splats
 
     return compare_run(loaded, scene, time, written.splat, read_splats(written.path))
@@ -282,7 +282,7 @@ def _export_moving(arguments: argparse.Namespace, loaded: LoadedRun, times: tupl
     """Write all times as one file of moving Gaussians."""
     from dyngs.export.moving_file import SUFFIX, UP, read_moment, write_moving
     from dyngs.export.run_to_splats import scene_part
-    from dyngs.output.redrawn import compare_run
+    from dyngs.output.roundtrip import compare_run
     from dyngs.output.upright import writing_of
 
     if arguments.sh_degree is not None:

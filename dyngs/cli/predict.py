@@ -1,4 +1,4 @@
-"""``dyngs predict``: predict a person from a few pictures with a network trained on other people."""
+"""``dyngs predict``: predict a person from a few images with a network trained on other people."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``predict`` to the commands."""
     parser = commands.add_parser(
         "predict",
-        help="predict a person from a few pictures, without training",
+        help="predict a person from a few images, without training",
         description="Predict an avatar from one or a few training views of a capture with silhouettes. Without body "
         "parameters a body is fitted first, as by `dyngs data fit`. Writes a run folder (model.kind=human) for all "
         "other commands.",
@@ -43,7 +43,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         type=int,
         default=10,
         metavar="N",
-        help="first train the network on these pictures for so many steps (default 10)",
+        help="first train the network on these images for so many steps (default 10)",
     )
     parser.set_defaults(run=run)
 
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     seconds = made.seconds_steps + made.seconds_maps + made.seconds_network
     print(f"predicted: {made.num_gaussians:,} Gaussians from {', '.join(made.views)}")
     trained = f"{made.seconds_steps:.2f} s steps, " if arguments.steps else ""
-    parts = f"{trained}{made.seconds_maps:.2f} s pictures, {made.seconds_network:.2f} s network"
+    parts = f"{trained}{made.seconds_maps:.2f} s images, {made.seconds_network:.2f} s network"
     print(f"time:      {seconds:.2f} s ({parts})")
     print(f"written:   {out}\nnext:      dyngs eval {out}\n           dyngs train --resume {out}   refines it")
     return 0

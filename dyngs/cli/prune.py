@@ -20,11 +20,11 @@ _EPILOG = """\
 examples:
   dyngs prune runs/dance --out runs/dance_pruned                 the most that costs 0.2 dB
   dyngs prune runs/dance --out runs/tiny --max-loss 1 --steps 2000
-  dyngs prune runs/dance --out runs/fifth --prune 0.8            just this share of the Gaussians, whatever it costs
+  dyngs prune runs/dance --out runs/fifth --prune 0.8            just this fraction of the Gaussians, whatever it costs
   dyngs prune runs/dance model.alpha_min=0.02 --out runs/fast --prune 0.8
   dyngs train --resume runs/fifth                                continue an interrupted fine-tuning
 
-As a stage of training: dyngs train CONFIG ... prune.share=0.8. All options are explained in docs/prune.md.
+As a stage of training: dyngs train CONFIG ... prune.fraction=0.8. All options are explained in docs/prune.md.
 """
 
 
@@ -48,7 +48,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help=f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})",
     )
     parser.add_argument(
-        "--prune", metavar="R", help="no search: remove just this share of the Gaussians, in [0, 1), and nothing else"
+        "--prune",
+        metavar="R",
+        help="no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else",
     )
     parser.add_argument(
         "--score",
@@ -76,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.evaluate.comparison import compared
     from dyngs.runs.checkpoint import load_run
 
-    keys = {"prune": "share", "score": "score", "masks": "mask_times", "steps": "steps"}
+    keys = {"prune": "fraction", "score": "score", "masks": "mask_times", "steps": "steps"}
     asked = {key: getattr(arguments, option) for option, key in keys.items()}
     overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
     overrides += [f"run.threads={arguments.threads}", *run_device(arguments), *arguments.overrides]
@@ -89,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
     print(
         f"written: {folder}, and the file in {file_of(folder)}\n"
-        f"next:    dyngs eval {folder}\n         dyngs render {file_of(folder)} --out {folder}/pictures"
+        f"next:    dyngs eval {folder}\n         dyngs render {file_of(folder)} --out {folder}/images"
     )
     return 0
 
@@ -98,7 +100,7 @@ def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, 
     """Prune as asked for; return the new folder, and what is promised of it where the share was searched for."""
     from dyngs.api.prune import prune_run, prune_within
 
-    chosen = any(text.startswith(("prune.share=", "prune.mask_times=")) for text in overrides)
+    chosen = any(text.startswith(("prune.fraction=", "prune.mask_times=")) for text in overrides)
     if chosen and arguments.max_loss is not None:
         raise DyngsError("--max-loss finds what can go; leave out --prune and --masks, which say it")
     if chosen:

@@ -1,4 +1,4 @@
-"""``dyngs render``: pictures and videos of a run, an avatar file, or any file of Gaussians."""
+"""``dyngs render``: images and videos of a run, an avatar file, or any file of Gaussians."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 examples:
-  dyngs render runs/bench --out pictures                          the test views and a contact sheet
+  dyngs render runs/bench --out images                          the test views and a contact sheet
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
   dyngs render runs/street --path along --video along.mp4                  as it was filmed, smoothed
   dyngs render runs/dance --path orbit --time 0.5 --video frozen.mp4       moving camera, frozen scene
@@ -44,7 +44,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add ``render`` to the commands."""
     parser = commands.add_parser(
         "render",
-        help="render pictures and videos of a run, an avatar or a file of Gaussians",
+        help="render images and videos of a run, an avatar or a file of Gaussians",
         description="Render the views of a split beside their ground truth, a camera path, or a fixed camera over "
         "time.",
         epilog=_EPILOG,
@@ -53,7 +53,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "source", type=Path, metavar="RUN_OR_FILE", help="run folder, avatar file (.safetensors), or any 3DGS .ply"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the pictures")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the images")
     cameras = parser.add_mutually_exclusive_group()
     cameras.add_argument(
         "--split", choices=("test", "val", "train", "pose"), help="render the views of this split (default: test)"
@@ -82,7 +82,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--alpha", action="store_true", help="write opacity as well")
     parser.add_argument(
-        "--size", type=image_size, metavar="WxH", help="picture size for a path or fixed camera, in pixels"
+        "--size", type=image_size, metavar="WxH", help="image size for a path or fixed camera, in pixels"
     )
     parser.add_argument(
         "--background",

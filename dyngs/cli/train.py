@@ -114,8 +114,8 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
 
 def _with_poses(config: Config) -> Config:
     """Return the configuration with poses for photos or a video; people need a capture with body parameters."""
+    from dyngs.capture.unposed import is_unposed, with_poses
     from dyngs.config.kinds import field_of, network_of, person_of
-    from dyngs.data.prepare.unposed import is_unposed, with_poses
 
     if network_of(config) is not None:
         return config  # its folder holds a capture per person
@@ -148,7 +148,7 @@ def _next(folder: Path, config: Config) -> str:
     """Return the next commands for a run."""
     if config.model.kind == "human_predictor":
         return f"next:    dyngs predict {folder} CAPTURE --out RUN"
-    return f"next:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/pictures"
+    return f"next:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/images"
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
@@ -162,12 +162,12 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     run = load_run(folder)
     scene = run.scene
     if freezes_below_px(run.config) is None:
-        return ["motion:  none, so this is a still model, like those of configs/static.yaml"]
+        return ["motion:  none, so this is a static model, like those of configs/static.yaml"]
     if not scene.times:
         return ["motion:  the capture has no times (or only one), so this is a static model"]
-    if scene.is_still:
+    if scene.is_static:
         return [f"motion:  nothing moves by {limit:g} px or more, so this became a static model"]
-    return [f"motion:  {len(scene.rows):,} of {len(scene):,} Gaussians move ({scene.moving_share:.1%})"]
+    return [f"motion:  {len(scene.rows):,} of {len(scene):,} Gaussians move ({scene.moving_fraction:.1%})"]
 
 
 def parse_config(words: Sequence[str], resume: Path | None) -> Config:

@@ -21,7 +21,7 @@ KEYS = {
     "model.all_views_at": "model.time_window_full_at",
     "model.still_below": "model.freeze_below_px",
     "model.heights": "model.scaffold_heights",
-    "model.carve": "model.min_silhouette_share",
+    "model.carve": "model.min_silhouette_fraction",
     "model.views": "model.source_views",
     "model.inputs": "model.source_sets",
     "model.targets": "model.target_views",
@@ -30,7 +30,7 @@ KEYS = {
     "train.sharpen_from": "train.resolution_grows_from",
     "train.sharpen_to": "train.resolution_full_at",
     "compact": "prune",
-    "compact.prune": "prune.share",
+    "compact.prune": "prune.fraction",
     "compact.masks": "prune.mask_times",
 }
 """Former dotted key to the present one; that of a section also stands for the keys in it that have no line here."""
@@ -70,7 +70,7 @@ CONSTANTS: dict[str, dict[str, float]] = {
 """Keys that there are no more, with the value that is always taken by the kind of their section ("": it has none)."""
 
 REMOVED = {
-    "prune.max_loss": "the stage removes just prune.share; `dyngs prune RUN --out RUN2 --max-loss DB` finds the share",
+    "prune.max_loss": "the stage removes just prune.fraction; `dyngs prune RUN --out RUN2 --max-loss DB` finds it",
 }
 """Keys that there are no more, whatever their value was, and what to do instead. Runs that have them are read."""
 

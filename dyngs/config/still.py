@@ -1,4 +1,4 @@
-"""The configuration of a still scene that stands in for that of a moving one."""
+"""The configuration of a static scene that stands in for that of a moving one."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _LENGTH_AND_LOG = ("steps", "log_every", "save_every", "eval_every", "tensorboar
 
 
 def as_still(config: Config) -> Config:
-    """Return ``config`` as the preset ``static`` would have it: what a person would have asked for of a still scene.
+    """Return ``config`` as the preset ``static`` would have it: what a person would have asked for of a static scene.
 
-    Values that differ from those of the preset ``dynamic`` were asked for, and stay where a still scene has such a key.
+    Values that differ from those of the preset ``dynamic`` were asked for, and stay where a static one has such a key.
     """
     root = [f"data.root={config.data.root}"]
     still = load_config(packaged_preset("static"), root)

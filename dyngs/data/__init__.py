@@ -1,1 +1,1 @@
-"""Captures: posed pictures of a scene on disk, their readers, preparation, inspection and loading for training."""
+"""Captures: posed images of a scene on disk, their readers, preparation, inspection and loading for training."""

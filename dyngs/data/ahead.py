@@ -44,8 +44,8 @@ class Ahead(Generic[Item]):
         for index in wanted:
             if index not in self._pending:
                 if self._pool is None:
-                    self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="dyngs-pictures")
-                # the context holds which files may be opened, and how large pictures may be
+                    self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="dyngs-images")
+                # the context holds which files may be opened, and how large images may be
                 self._pending[index] = self._pool.submit(copy_context().run, self._work, index)
 
     def rest(self) -> None:

@@ -107,13 +107,13 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     found = []
     for view in views:
         if view.frame is None:
-            raise DyngsError(f"{where}: {view.image_path} has no frame number; give each picture its 'frame'")
+            raise DyngsError(f"{where}: {view.image_path} has no frame number; give each image its 'frame'")
         found.append(rows.get(view.frame, -1))
     lacking = sorted({view.frame for view, row in zip(views, found, strict=True) if row < 0 and view.frame is not None})
     if lacking:
         raise DyngsError(
-            f"{where}: no body parameters for {len(lacking)} frames that have pictures ({first_few(lacking)}); the "
-            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the pictures"
+            f"{where}: no body parameters for {len(lacking)} frames that have images ({first_few(lacking)}); the "
+            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the images"
         )
     return np.array(found, dtype=np.int64)
 

@@ -1,4 +1,4 @@
-"""Captures in memory: views with cameras, sparse points and body parameters; pictures stay on disk."""
+"""Captures in memory: views with cameras, sparse points and body parameters; images stay on disk."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ class VideoFrame:
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Mask of a person in a picture, in a file.
+    """Mask of a person in an image, in a file.
 
     Attributes:
-        path: a picture of the same size, or an HDF5 file whose data set ``masks`` (F, H, W) has a row per frame.
+        path: an image of the same size, or an HDF5 file whose data set ``masks`` (F, H, W) has a row per frame.
         person: how the person's pixels are marked: "white" (grey levels are partial coverage), "black" (the inverse of
             "white"), or "nonzero" (labels: everything but 0).
-        row: row of the data set, None for a picture.
+        row: row of the data set, None for an image.
     """
 
     path: Path
@@ -60,26 +60,26 @@ class Silhouette:
 
 @dataclass(frozen=True)
 class View:
-    """One picture and its camera.
+    """One image and its camera.
 
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
-        image_path: picture file; for a frame of a ``video`` the file it is decoded to, see ``pictures.frame_cache``.
+        image_path: image file; for a frame of a ``video`` the file it is decoded to, see ``images.frame_cache``.
         cam_from_world: (4, 4) float64, OpenCV axes, in the capture's recentred world (see ``Capture.world_offset``).
-        intrinsics: (3, 3) float64 in pixels of the *stored* picture size.
-        width, height: stored picture size in pixels.
+        intrinsics: (3, 3) float64 in pixels of the *stored* image size.
+        width, height: stored image size in pixels.
         camera_id: index of the physical camera.
         mask_path: white = keep, black = ignore; None without a mask.
-        time: in [0, 1], or None for a still scene.
+        time: in [0, 1], or None for a static scene.
         frame: frame number of a sequence, or None.
         video: the video frame that ``image_path`` is decoded from, None where it is a file of the capture.
-        silhouette: mask of the person, which becomes the picture's alpha; None where nobody is cut out.
-        depth_path: depth map, in any unit, see ``pictures.depth``; None without one.
+        silhouette: mask of the person, which becomes the image's alpha; None where nobody is cut out.
+        depth_path: depth map, in any unit, see ``images.depth``; None without one.
         motion_mask_path: white = moves; None without one.
         motion_mask_labels: the mask holds labels instead: all but 0 moves.
-        flow_path: optical flow to the view ``flow_to``, see ``pictures.flow``; None without one.
+        flow_path: optical flow to the view ``flow_to``, see ``images.flow``; None without one.
         flow_to: name of the next view of this camera in its file, None for the last one.
-        exposure: light let in by the EXIF tags, see ``pictures.exif``: comparable among views of one capture; None
+        exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one capture; None
             where the file does not say.
     """
 
@@ -167,7 +167,7 @@ class Capture:
         points_file: the .ply that the points are from, which is not known to fit the cameras; None for other points.
         world_offset: (3,) float64, added to recentred coordinates gives those of the files; zero unless the scene lies
             far from its origin.
-        has_alpha: pictures carry straight alpha that means "transparent here".
+        has_alpha: images carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people, else None.
         fps: frames per second of the recording, None where the capture does not say.
         span: first and last time as written in the files, which are 0 and 1 in the views; None without times.

@@ -1,4 +1,4 @@
-"""A decoded picture as it is kept in memory, of the CPU or of a card."""
+"""A decoded image as it is kept in memory, of the CPU or of a GPU."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dyngs.ops.transfer import Upload
 
 @dataclass(frozen=True)
 class Decoded:
-    """Pixels and maps of a picture.
+    """Pixels and maps of an image.
 
     Attributes:
         pixels: (H, W, 3 or 4) uint8, straight alpha.
         mask: (H, W) bool, or None.
-        moves, depth, flow: maps as those of ``Picture``, or None.
+        moves, depth, flow: maps as those of ``Image``, or None.
     """
 
     pixels: Tensor
@@ -32,7 +32,7 @@ class Decoded:
         return sum(x.nbytes for x in self._there().values())
 
     def upload(self, device: torch.device) -> Callable[[], Decoded]:
-        """Begin to copy everything to ``device``; the result returns the picture there."""
+        """Begin to copy everything to ``device``; the result returns the image there."""
         arrays = self._there()
         upload = Upload(list(arrays.values()), device)
         nothing = {field.name: None for field in fields(self)}

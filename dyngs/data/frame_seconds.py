@@ -1,4 +1,4 @@
-"""Seconds at which the pictures of a capture were taken, in a file beside them: ``times.json``.
+"""Seconds at which the images of a capture were taken, in a file beside them: ``times.json``.
 
 COLMAP's models have no times. ``dyngs data sfm`` writes this file for the frames of a video.
 """
@@ -18,12 +18,12 @@ NAME = "times.json"
 
 
 def write_seconds(root: Path, seconds: Mapping[str, float]) -> None:
-    """Write the second of each picture, by its path below ``root/images``."""
+    """Write the second of each image, by its path below ``root/images``."""
     write_text(root / NAME, json.dumps({"seconds": dict(seconds)}, indent=1) + "\n")
 
 
 def read_seconds(root: Path) -> dict[str, float]:
-    """Read the second of each picture, by its path below ``root/images``; empty without the file.
+    """Read the second of each image, by its path below ``root/images``; empty without the file.
 
     Raises:
         DyngsError: the file is damaged, or something in it is no number.
@@ -33,7 +33,7 @@ def read_seconds(root: Path) -> dict[str, float]:
         return {}
     seconds = read_json_object(path).get("seconds")
     if not isinstance(seconds, dict):
-        raise DyngsError(f"{path}: needs an object 'seconds' of picture names and seconds; see docs/formats.md")
+        raise DyngsError(f"{path}: needs an object 'seconds' of image names and seconds; see docs/formats.md")
     for name, second in seconds.items():
         if not is_number(second):
             raise DyngsError(f"{path}: the second of {name:.60} must be a number, got {second!r:.40}")

@@ -82,7 +82,7 @@ def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Split
     """Return the views of the splits anew: those of ``cameras`` for training, those of all others for testing.
 
     Raises:
-        DyngsError: a camera that has no pictures, or no other camera.
+        DyngsError: a camera that has no images, or no other camera.
     """
     views = all_views(splits)
     known = sorted({view.camera_id for view in views})

@@ -1,4 +1,4 @@
-"""Pictures for training: decoded on demand, undistorted, downscaled, and cached within a memory limit."""
+"""Images for training: decoded on demand, undistorted, downscaled, and cached within a memory limit."""
 
 from __future__ import annotations
 
@@ -17,51 +17,51 @@ from dyngs.data.ahead import Ahead
 from dyngs.data.capture import View
 from dyngs.data.decoded import Decoded
 from dyngs.data.geometry.intrinsics import scaled_intrinsics
-from dyngs.data.pictures.depth import read_depth, read_labels
-from dyngs.data.pictures.flow import read_flow
-from dyngs.data.pictures.images import (
+from dyngs.data.images.depth import read_depth, read_labels
+from dyngs.data.images.flow import read_flow
+from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,
-    check_picture,
+    check_image,
     premultiplied,
+    read_image,
     read_mask,
-    read_picture,
     straight_uint8,
     target_size,
 )
-from dyngs.data.pictures.lens import LensMap, is_pinhole, undistort, undistort_map
-from dyngs.data.pictures.resampling import flow_at, nearest_positions, resized, taken_at
-from dyngs.data.pictures.silhouettes import cut_out
+from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
+from dyngs.data.images.resampling import flow_at, nearest_positions, resized, taken_at
+from dyngs.data.images.silhouettes import cut_out
 from dyngs.errors import DyngsError
-from dyngs.files.containment import pictures_up_to
-from dyngs.ops.device import CPU, card_memory
+from dyngs.files.containment import images_up_to
+from dyngs.ops.device import CPU, gpu_memory
 from dyngs.ops.transfer import sent
 
 FULLY_KEPT = 1 - 1e-4
 """Mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding."""
 
-CARD_SHARE = 0.25
-"""Share of the free memory of a card that pictures may take: the rest is for the scene and what is drawn."""
+GPU_FRACTION = 0.25
+"""Fraction of the free memory of a GPU that images may take: the rest is for the scene and what is drawn."""
 
 _SMALL_BYTES = 4
-"""Bytes of a shrunk picture, whose values are float32, per byte of the whole one and share of its pixels."""
+"""Bytes of a shrunk image, whose values are float32, per byte of the whole one and fraction of its pixels."""
 
 
 @dataclass(frozen=True)
-class Picture:
-    """The picture of one view with its camera, as a training target.
+class Image:
+    """The image of one view with its camera, as a training target.
 
     Attributes:
         name: name of the view.
-        cameras: one pinhole camera (V = 1) of this picture's size, float32.
+        cameras: one pinhole camera (V = 1) of this image's size, float32.
         rgb_premultiplied: (H, W, 3) float32, colours times alpha.
         alpha: (H, W) float32 in [0, 1], None where the file has no alpha.
         mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
         time: in [0, 1] or None.
         frame: the view's frame number or None.
-        moves: (H, W) float32, the share of each pixel that moves, by the motion mask; None without one.
+        moves: (H, W) float32, the fraction of each pixel that moves, by the motion mask; None without one.
         depth: (H, W) float32 depth in the unit of its map, 0 where unknown; None without one.
-        flow: (H, W, 2) float32 displacement in pixels of this picture up to the view ``flow_to``, NaN where unknown;
+        flow: (H, W, 2) float32 displacement in pixels of this image up to the view ``flow_to``, NaN where unknown;
             None without one.
     """
 
@@ -77,13 +77,13 @@ class Picture:
     flow: Tensor | None = None
 
     def composite(self, background: Tensor) -> Tensor:
-        """Return the (H, W, 3) picture over the colour ``background`` (3,)."""
+        """Return the (H, W, 3) image over the colour ``background`` (3,)."""
         if self.alpha is None:
             return self.rgb_premultiplied
         return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background.to(self.alpha.device)
 
-    def to(self, device: torch.device | str) -> Picture:
-        """Return the same picture, with its camera, on another device."""
+    def to(self, device: torch.device | str) -> Image:
+        """Return the same image, with its camera, on another device."""
         maps = {name: None if x is None else sent(x, device) for name, x in self._maps().items()}
         return replace(
             self,
@@ -100,8 +100,8 @@ class Picture:
         """Return everything per pixel beside the colours, by name."""
         return {name: getattr(self, name) for name in ("alpha", "mask", "moves", "depth", "flow")}
 
-    def shrunk(self, factor: int) -> Picture:
-        """Return the picture with both sides divided by ``factor``, averaged over pixel areas, and its camera."""
+    def shrunk(self, factor: int) -> Image:
+        """Return the image with both sides divided by ``factor``, averaged over pixel areas, and its camera."""
         if factor == 1:
             return self
         old = self.cameras
@@ -124,16 +124,16 @@ class Picture:
         )
 
 
-class PictureLoader:
-    """A sequence of pictures, decoded on demand or ahead of it; the first ones are cached up to ``options.cache_mb``.
+class ImageLoader:
+    """A sequence of images, decoded on demand or ahead of it; the first ones are cached up to ``options.cache_mb``.
 
-    Once the cache is full, what is in it stays: where every picture is asked for once per epoch, in a new order each
+    Once the cache is full, what is in it stays: where every image is asked for once per epoch, in a new order each
     time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
-    ahead or not. Safe to use from several threads. Pictures are decoded on the CPU. Those given out on a card are kept
+    ahead or not. Safe to use from several threads. Images are decoded on the CPU. Those given out on a GPU are kept
     there as far as a quarter of its free memory goes; the others are copied beside its work.
 
     Attributes:
-        corrected: returns the camera of a picture, given the index of its view and its camera by the capture; None: the
+        corrected: returns the camera of an image, given the index of its view and its camera by the capture; None: the
             latter.
     """
 
@@ -154,23 +154,23 @@ class PictureLoader:
             decoding_threads: decode what is to be expected in so many threads; 0, or ``cache_mb`` 0: in none.
 
         Raises:
-            DyngsError: missing pictures (count and first), damaged ones, or a size that is not the view's.
+            DyngsError: missing images (count and first), damaged ones, or a size that is not the view's.
         """
         self._views = tuple(views)
         self._options = options = options or DataConfig(root=Path())
         self._with_maps = with_maps
-        self._device, self._card_room = CPU, 0.0
+        self._device, self._gpu_room = CPU, 0.0
         self._cache: dict[int, Decoded] = {}
-        self._on_card: dict[int, Decoded] = {}
-        self._cached_bytes = self._card_bytes = 0
+        self._on_gpu: dict[int, Decoded] = {}
+        self._cached_bytes = self._gpu_bytes = 0
         self._threads = decoding_threads if options.cache_mb > 0 else 0
         self._ahead = Ahead(self._made_ready, self._threads)
-        self._small: dict[int, Picture] = {}
+        self._small: dict[int, Image] = {}
         self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
         self.corrected: Callable[[int, Cameras], Cameras] | None = None
         self._lock = Lock()
-        with pictures_up_to(options.max_megapixels):
+        with images_up_to(options.max_megapixels):
             check_files(self._views)
 
     def __len__(self) -> int:
@@ -178,7 +178,7 @@ class PictureLoader:
 
     @property
     def device(self) -> torch.device:
-        """Where pictures and cameras are given out."""
+        """Where images and cameras are given out."""
         return self._device
 
     @device.setter
@@ -186,10 +186,10 @@ class PictureLoader:
         if device == self._device:
             return
         self.rest()
-        memory = card_memory(device)
+        memory = gpu_memory(device)
         with self._lock:
-            self._on_card, self._card_bytes, self._small, self._small_bytes = {}, 0, {}, 0
-            self._device, self._card_room = device, math.inf if memory is None else CARD_SHARE * memory[0]
+            self._on_gpu, self._gpu_bytes, self._small, self._small_bytes = {}, 0, {}, 0
+            self._device, self._gpu_room = device, math.inf if memory is None else GPU_FRACTION * memory[0]
 
     @property
     def times(self) -> tuple[float | None, ...]:
@@ -198,30 +198,30 @@ class PictureLoader:
 
     @property
     def views(self) -> tuple[View, ...]:
-        """The views, in the order of the pictures."""
+        """The views, in the order of the images."""
         return self._views
 
-    def __getitem__(self, index: int) -> Picture:
-        """Return the picture of view ``index``.
+    def __getitem__(self, index: int) -> Image:
+        """Return the image of view ``index``.
 
         Raises:
             DyngsError: the file turns out to be truncated, or its mask has another size.
         """
         return self._with_camera(index, self._as_stored(index))
 
-    def _with_camera(self, index: int, picture: Picture) -> Picture:
-        """Return ``picture`` with its camera corrected, on ``device``."""
+    def _with_camera(self, index: int, image: Image) -> Image:
+        """Return ``image`` with its camera corrected, on ``device``."""
         if self.corrected is not None:
-            picture = replace(picture, cameras=self.corrected(index % len(self._views), picture.cameras))
-        return picture if self.device.type == "cpu" else picture.to(self.device)
+            image = replace(image, cameras=self.corrected(index % len(self._views), image.cameras))
+        return image if self.device.type == "cpu" else image.to(self.device)
 
-    def _as_stored(self, index: int) -> Picture:
-        """Return the picture of view ``index`` with the camera of the capture."""
+    def _as_stored(self, index: int) -> Image:
+        """Return the image of view ``index`` with the camera of the capture."""
         view = self._views[index]
         decoded = self._decoded(index % len(self._views))
         height, width = decoded.pixels.shape[:2]
         pixels = premultiplied(decoded.pixels)
-        return Picture(
+        return Image(
             name=view.name,
             cameras=_camera_of(view, width, height),
             rgb_premultiplied=pixels[..., :3].contiguous(),
@@ -235,12 +235,12 @@ class PictureLoader:
         )
 
     def cameras(self) -> list[Cameras]:
-        """Return the cameras of all pictures as they are by now, one each; no picture is read."""
+        """Return the cameras of all images as they are by now, one each; no image is read."""
         stored = [_camera_of(view, *size) for view, size in zip(self._views, self.sizes, strict=True)]
         found = stored if self.corrected is None else [self.corrected(i, x) for i, x in enumerate(stored)]
         return [x.to(device=self.device) for x in found]
 
-    def shrunk(self, index: int, factor: int) -> Picture:
+    def shrunk(self, index: int, factor: int) -> Image:
         """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is left."""
         with self._lock:
             if factor != self._small_by:
@@ -251,16 +251,16 @@ class PictureLoader:
         with self._lock:
             if index in self._small:
                 return self._with_camera(index, self._small[index])
-        picture = self._as_stored(index).shrunk(factor)
+        image = self._as_stored(index).shrunk(factor)
         with self._lock:
             is_new = index not in self._small and factor == self._small_by
-            if is_new and self._taken + picture.num_bytes <= self._room:
-                self._small[index] = picture
-                self._small_bytes += picture.num_bytes
-        return self._with_camera(index, picture)
+            if is_new and self._taken + image.num_bytes <= self._room:
+                self._small[index] = image
+                self._small_bytes += image.num_bytes
+        return self._with_camera(index, image)
 
     def expect(self, indices: Sequence[int]) -> None:
-        """Begin to decode the pictures that are asked for next, in this order, as far as they are not cached."""
+        """Begin to decode the images that are asked for next, in this order, as far as they are not cached."""
         with self._lock:
             wanted = [i for i in indices if i not in self._kept and not (self._small_by > 1 and i in self._small)]
         self._ahead.expect(wanted)
@@ -269,72 +269,72 @@ class PictureLoader:
         """End the threads that decode ahead; they begin anew with the next ``expect``."""
         self._ahead.rest()
 
-    def without_motion_masks(self) -> PictureLoader:
-        """Return a loader of the same pictures that reads no motion masks."""
+    def without_motion_masks(self) -> ImageLoader:
+        """Return a loader of the same images that reads no motion masks."""
         if all(view.motion_mask_path is None for view in self._views):
             return self
         views = [replace(view, motion_mask_path=None) for view in self._views]
-        return PictureLoader(views, self._options, with_maps=self._with_maps, decoding_threads=self._threads)
+        return ImageLoader(views, self._options, with_maps=self._with_maps, decoding_threads=self._threads)
 
     @property
     def decoded_ahead(self) -> int:
-        """Number of pictures that ``expect`` decodes ahead; 0 where all are cached."""
+        """Number of images that ``expect`` decodes ahead; 0 where all are cached."""
         return 0 if len(self._kept) == len(self._views) else self._ahead.most
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
-        """Width and height of the pictures, in px, without decoding any."""
+        """Width and height of the images, in px, without decoding any."""
         options = self._options
         return [target_size(v.width, v.height, options.downscale, options.longest_side) for v in self._views]
 
     @property
     def keeps_all(self) -> bool:
-        """Whether the cache has room for all pictures, as far as their sizes tell."""
+        """Whether the cache has room for all images, as far as their sizes tell."""
         return self._bytes_of_all() <= self._options.cache_mb * 1e6
 
     @property
-    def keeps_all_on_card(self) -> bool:
-        """Whether a card has room for all pictures, as far as their sizes tell."""
-        return self._bytes_of_all() <= self._card_room
+    def keeps_all_on_gpu(self) -> bool:
+        """Whether a GPU has room for all images, as far as their sizes tell."""
+        return self._bytes_of_all() <= self._gpu_room
 
     @property
     def bytes_to_come(self) -> int:
-        """Bytes that pictures will take, in the cache or decoded ahead, beside those that they take now."""
-        whole = min(self._bytes_of_all() - self.bytes_on_card, round(self._options.cache_mb * 1e6))
+        """Bytes that images will take, in the cache or decoded ahead, beside those that they take now."""
+        whole = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._options.cache_mb * 1e6))
         return max(whole - self.cached_bytes, 0)
 
     @property
-    def bytes_on_card(self) -> int:
-        """Bytes that pictures will take of the memory of a card."""
-        return 0 if self._device == CPU else int(min(self._bytes_of_all(), self._card_room))
+    def bytes_on_gpu(self) -> int:
+        """Bytes that images will take of the memory of a GPU."""
+        return 0 if self._device == CPU else int(min(self._bytes_of_all(), self._gpu_room))
 
     def _bytes_of_all(self) -> int:
-        """Return the bytes of all pictures once decoded; whether a file has alpha is not known, and taken as no."""
+        """Return the bytes of all images once decoded; whether a file has alpha is not known, and taken as no."""
         masks = [view.mask_path is not None for view in self._views]
         return sum(w * h * (3 + mask) for (w, h), mask in zip(self.sizes, masks, strict=True))
 
     @property
     def cached_bytes(self) -> int:
-        """Bytes of the CPU's memory that cached pictures take."""
+        """Bytes of the CPU's memory that cached images take."""
         return self._cached_bytes + (self._small_bytes if self._device == CPU else 0)
 
     @property
     def _kept(self) -> dict[int, Decoded]:
-        """Pictures that are kept where they are given out."""
-        return self._cache if self._device == CPU else self._on_card
+        """Images that are kept where they are given out."""
+        return self._cache if self._device == CPU else self._on_gpu
 
     @property
     def _taken(self) -> int:
-        """Bytes that are taken where pictures are given out."""
-        return self.cached_bytes if self._device == CPU else self._card_bytes + self._small_bytes
+        """Bytes that are taken where images are given out."""
+        return self.cached_bytes if self._device == CPU else self._gpu_bytes + self._small_bytes
 
     @property
     def _room(self) -> float:
         """Bytes that may be taken there."""
-        return self._options.cache_mb * 1e6 if self._device == CPU else self._card_room
+        return self._options.cache_mb * 1e6 if self._device == CPU else self._gpu_room
 
     def _decoded(self, index: int) -> Decoded:
-        """Return the decoded picture ``index`` on ``device``."""
+        """Return the decoded image ``index`` on ``device``."""
         with self._lock:
             if index in self._kept:
                 return self._kept[index]
@@ -345,32 +345,32 @@ class PictureLoader:
         return there
 
     def _made_ready(self, index: int) -> tuple[Decoded, Callable[[], Decoded] | None]:
-        """Return the decoded picture ``index``, and its copy that is on its way to a card, if there is one."""
+        """Return the decoded image ``index``, and its copy that is on its way to a GPU, if there is one."""
         with self._lock:
             decoded = self._cache.get(index)
         decoded = self._read(index) if decoded is None else decoded
         return decoded, None if self._device == CPU else decoded.upload(self._device)
 
     def _keep(self, index: int, decoded: Decoded, there: Decoded) -> None:
-        """Keep a picture where it is given out, if there is room; else, if that is a card, on the CPU."""
+        """Keep an image where it is given out, if there is room; else, if that is a GPU, on the CPU."""
         if index not in self._kept and self._has_room(there.num_bytes):
             self._kept[index] = there
             if self._device == CPU:
                 self._cached_bytes += there.num_bytes
                 return
-            self._card_bytes += there.num_bytes
+            self._gpu_bytes += there.num_bytes
             if self._cache.pop(index, None) is not None:
                 self._cached_bytes -= decoded.num_bytes
-        elif self._device != CPU and index not in self._on_card and index not in self._cache:
+        elif self._device != CPU and index not in self._on_gpu and index not in self._cache:
             waiting = (self._ahead.most + 1) * decoded.num_bytes
             if self._cached_bytes + waiting <= self._options.cache_mb * 1e6:
                 self._cache[index] = decoded
                 self._cached_bytes += decoded.num_bytes
 
     def _has_room(self, size: int) -> bool:
-        """Return whether a picture of ``size`` bytes is to be kept where it is given out.
+        """Return whether an image of ``size`` bytes is to be kept where it is given out.
 
-        While pictures are shrunk, only where small and large ones fit together: the small ones are what is asked for.
+        While images are shrunk, only where small and large ones fit together: the small ones are what is asked for.
         """
         left = len(self._views) - len(self._kept) - 1
         if self._small_by > 1 and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > self._room:
@@ -379,11 +379,11 @@ class PictureLoader:
         return self._taken + size + waiting <= self._room
 
     def _read(self, index: int) -> Decoded:
-        with pictures_up_to(self._options.max_megapixels):
+        with images_up_to(self._options.max_megapixels):
             return self._decode(self._views[index])
 
     def _decode(self, view: View) -> Decoded:
-        pixels = read_picture(view.image_path, (view.width, view.height))
+        pixels = read_image(view.image_path, (view.width, view.height))
         if view.silhouette is not None:
             pixels = cut_out(pixels, view.silhouette)
         mask = None if view.mask_path is None else read_mask(view.mask_path)
@@ -405,7 +405,7 @@ class PictureLoader:
         return Decoded(small, mask, **maps)
 
     def _maps(self, view: View, size: tuple[int, int]) -> dict[str, Tensor]:
-        """Return motion mask, depth and flow of a view, as far as it has them, for the picture of ``size``."""
+        """Return motion mask, depth and flow of a view, as far as it has them, for the image of ``size``."""
         maps: dict[str, Tensor] = {}
         lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
         if view.motion_mask_path is not None:
@@ -437,7 +437,7 @@ class PictureLoader:
 
 
 def _camera_of(view: View, width: int, height: int) -> Cameras:
-    """Return the camera of a view as a picture of this size, by the capture."""
+    """Return the camera of a view as an image of this size, by the capture."""
     intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
     pose, intrinsics = (
         torch.as_tensor(x, dtype=torch.float32, device="cpu")[None] for x in (view.cam_from_world, intrinsics)
@@ -446,7 +446,7 @@ def _camera_of(view: View, width: int, height: int) -> Cameras:
 
 
 def check_files(views: Sequence[View]) -> None:
-    """Check that all pictures and masks of ``views`` exist, look complete and have the size of their view.
+    """Check that all images and masks of ``views`` exist, look complete and have the size of their view.
 
     Raises:
         DyngsError: a file is missing (says how many, and the first), damaged or of another size.
@@ -456,18 +456,18 @@ def check_files(views: Sequence[View]) -> None:
     missing = [path for path in paths if not path.is_file()]
     if missing:
         raise DyngsError(
-            f"{len(missing)} of {len(paths)} pictures are missing, the first is {missing[0]}; restore them or remove "
+            f"{len(missing)} of {len(paths)} images are missing, the first is {missing[0]}; restore them or remove "
             f"them from the capture"
         )
     for view in views:
-        header = check_picture(view.image_path)
+        header = check_image(view.image_path)
         if header.size_for((view.width, view.height)) != (view.width, view.height):
             raise DyngsError(
-                f"{view.image_path}: the picture is {header.width}x{header.height}, but {view.width}x{view.height} was "
+                f"{view.image_path}: the image is {header.width}x{header.height}, but {view.width}x{view.height} was "
                 f"expected; restore the original or correct its intrinsics"
             )
         if view.mask_path is not None:
-            mask = check_picture(view.mask_path)
+            mask = check_image(view.mask_path)
             _require_size(view, view.mask_path, (mask.width, mask.height), "mask")
 
 
@@ -478,13 +478,13 @@ def _require_shape(view: View, path: Path | None, found: Tensor, what: str) -> N
 def _require_size(view: View, path: Path | None, size: tuple[int, int], what: str) -> None:
     if size != (view.width, view.height):
         raise DyngsError(
-            f"{path}: the {what} is {size[0]}x{size[1]} but its picture is {view.width}x{view.height}; "
+            f"{path}: the {what} is {size[0]}x{size[1]} but its image is {view.width}x{view.height}; "
             "make them the same size"
         )
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:
-    """(H, W) bool mask of pixels inside the stored picture with a kept neighbourhood; None if all are."""
+    """(H, W) bool mask of pixels inside the stored image with a kept neighbourhood; None if all are."""
     keep = lens_map.valid
     if mask is not None:
         keep = keep & (undistort(mask.float()[..., None], lens_map)[..., 0] > 0.999)

@@ -1,4 +1,4 @@
-"""Times of pictures by the order of their names: ``data.times=order``."""
+"""Times of images by the order of their names: ``data.times=order``."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _NUMBERS = re.compile(r"(\d+)")
 def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
     """Return the views with times by their names, and a line that says how.
 
-    Where the name of every picture ends in a number, and no two of a camera in the same, that number is the time:
+    Where the name of every image ends in a number, and no two of a camera in the same, that number is the time:
     frames that are missing leave gaps. Otherwise times are places in the order of the names, numbers in them read as
-    numbers. Pictures of one folder are from one camera; in another folder the same numbers, or places, are the same
+    numbers. Images of one folder are from one camera; in another folder the same numbers, or places, are the same
     times.
 
     Args:
@@ -28,25 +28,25 @@ def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -
         per_second: numbers, or places in the order, in a second: times become seconds; None leaves them as they are.
 
     Raises:
-        DyngsError: fewer than two pictures, or folders with different numbers of pictures and names without numbers.
+        DyngsError: fewer than two images, or folders with different numbers of images and names without numbers.
     """
     views = all_views(splits)
     if len(views) < 2:
-        raise DyngsError(f"{root}: data.times=order needs two pictures or more, there is {len(views)}")
+        raise DyngsError(f"{root}: data.times=order needs two images or more, there is {len(views)}")
     folders: dict[Path, list[View]] = defaultdict(list)
     for view in views:
         folders[view.image_path.parent].append(view)
     numbers = {view.name: _last_number(view.image_path.stem) for view in views}
     if all(_all_differ([numbers[view.name] for view in seen]) for seen in folders.values()):
         times = {name: float(number or 0) for name, number in numbers.items()}
-        line = f"times are the numbers in the names of the pictures, from {min(times.values()):g} to "
+        line = f"times are the numbers in the names of the images, from {min(times.values()):g} to "
         line += f"{max(times.values()):g} (data.times=order{_in_seconds(times, per_second)})"
     else:
         lengths = {len(seen) for seen in folders.values()}
         if len(lengths) > 1:
             counts = f"{min(lengths)} to {max(lengths)}"
             raise DyngsError(
-                f"{root}: data.times=order: folders hold {counts} pictures; end the names in the numbers of the frames"
+                f"{root}: data.times=order: folders hold {counts} images; end the names in the numbers of the frames"
             )
         orders = [sorted(seen, key=lambda view: natural_order(view.image_path.name)) for seen in folders.values()]
         times = {view.name: float(place) for order in orders for place, view in enumerate(order)}

@@ -13,10 +13,10 @@ from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View, all_view
 from dyngs.data.fitted_body import with_fitted_body
 from dyngs.data.frame_selection import hold_out_frames, select_frames, split_by_camera
 from dyngs.data.geometry.recenter import recenter
+from dyngs.data.images.frame_cache import decode_frames
+from dyngs.data.images.images import read_header
+from dyngs.data.images.lens import wide_pinhole
 from dyngs.data.name_order import times_by_name
-from dyngs.data.pictures.frame_cache import decode_frames
-from dyngs.data.pictures.images import read_header
-from dyngs.data.pictures.lens import wide_pinhole
 from dyngs.data.prior_files import present_priors
 from dyngs.data.readers import (
     blender,
@@ -40,7 +40,7 @@ from dyngs.data.times import (
     unit_times,
 )
 from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside, pictures_up_to, staying_within
+from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
 
 FARTHEST = 1e18
@@ -62,25 +62,25 @@ FORMATS: tuple[CaptureFormat, ...] = (
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
-    """Read the capture in a folder; pictures are not decoded, only their headers are read.
+    """Read the capture in a folder; images are not decoded, only their headers are read.
 
     Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and ``pose_frames`` those
-    of a person that become the split pose. Where the format names no test views, every ``test_every``-th picture is
+    of a person that become the split pose. Where the format names no test views, every ``test_every``-th image is
     one. Times are scaled to [0, 1] over all splits; a scene far from the origin is moved there. The splits train, val
     and test are always present, val and test possibly empty.
 
     Example::
 
         import dyngs
-        from dyngs.data.loader import PictureLoader
+        from dyngs.data.loader import ImageLoader
 
         capture = dyngs.read_capture("lego")
-        picture = PictureLoader(capture.splits["train"])[0].to("cpu")
-        picture.cameras, picture.rgb_premultiplied  # what to render from, and what should come out
+        image = ImageLoader(capture.splits["train"])[0].to("cpu")
+        image.cameras, image.rgb_premultiplied  # what to render from, and what should come out
 
     Args:
         source: the folder, or a ``dyngs.config.DataConfig``: the folder as ``root``, and options such as ``frames``.
-        decode_videos: write the chosen frames of videos as picture files, see ``pictures.frame_cache``; otherwise views
+        decode_videos: write the chosen frames of videos as image files, see ``images.frame_cache``; otherwise views
             may name files that do not exist yet.
 
     Raises:
@@ -96,7 +96,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     chosen = _chosen_format(options, found)
     with (
         staying_within(root, options.follow_links),
-        pictures_up_to(options.max_megapixels),
+        images_up_to(options.max_megapixels),
         reading(root, "one of its files is not as it should be (`dyngs --debug` shows where); export it again"),
     ):
         capture = _finished(chosen.read(root), options, decode_videos)
@@ -141,7 +141,7 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
 def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
     splits: Splits = {name: tuple(sorted(views, key=lambda view: view.name)) for name, views in capture.splits.items()}
     if not splits.get("train"):
-        raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed pictures")
+        raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed images")
     if capture.body is not None:  # people are drawn in the poses of their frames, which are found by their times
         splits = times_of_frames(splits)
     new_poses = splits.pop("pose", None)
@@ -179,7 +179,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     if decode_videos:
         frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
-    warnings = [*capture.warnings, *_check_names(capture.root, splits), *_missing_pictures(splits)]
+    warnings = [*capture.warnings, *_check_names(capture.root, splits), *_missing_images(splits)]
     points, more = _finite_points(capture.points)
     capture = replace(
         capture,
@@ -222,10 +222,10 @@ def _with_poses_held_out(
 
 
 def _check_places(view: View) -> None:
-    """Refuse pictures, masks and maps that lie outside the capture."""
-    picture = view.image_path if view.video is None else view.video.video
+    """Refuse images, masks and maps that lie outside the capture."""
+    image = view.image_path if view.video is None else view.video.video
     priors = (view.depth_path, view.motion_mask_path, view.flow_path)
-    for path in (picture, view.mask_path, view.silhouette and view.silhouette.path, *priors):
+    for path in (image, view.mask_path, view.silhouette and view.silhouette.path, *priors):
         if path is not None:
             inside(path)
 
@@ -235,17 +235,17 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
     for view in all_views(splits):
         if named.setdefault(view.name, view.image_path) != view.image_path:
             raise DyngsError(
-                f"{root}: the pictures {named[view.name]} and {view.image_path} share the name {view.name}; rename one"
+                f"{root}: the images {named[view.name]} and {view.image_path} share the name {view.name}; rename one"
             )
     train = {view.image_path for view in splits["train"]}
     leaked = [view.name for view in splits["test"] if view.image_path in train]
-    return [f"{len(leaked)} test pictures are also training pictures, first {leaked[0]}"] if leaked else []
+    return [f"{len(leaked)} test images are also training images, first {leaked[0]}"] if leaked else []
 
 
-def _missing_pictures(splits: Splits) -> list[str]:
+def _missing_images(splits: Splits) -> list[str]:
     seen = all_views(splits)
     missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
-    return [f"{len(missing)} of {len(seen)} pictures are missing, first {missing[0]}"] if missing else []
+    return [f"{len(missing)} of {len(seen)} images are missing, first {missing[0]}"] if missing else []
 
 
 def _first_has_alpha(views: tuple[View, ...]) -> bool:

@@ -50,7 +50,7 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
         return splits, []
     if len(timed) < len(views):
         untimed = next(view.name for view in views if view.time is None)
-        raise DyngsError(f"{root}: {untimed} has no time although other pictures have; give time for all or none")
+        raise DyngsError(f"{root}: {untimed} has no time although other images have; give time for all or none")
     first, last = min(timed), max(timed)
     within = first >= 0 and last <= 1
     if first == last or (within and (not stretch or (first, last) == (0, 1) or last - first <= SAME_TIME)):
@@ -116,18 +116,18 @@ def clip_seconds(splits: Splits, fps: float | None) -> float | None:
 
 
 def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the splits without times, and a warning, if all of several pictures have the same time."""
+    """Return the splits without times, and a warning, if all of several images have the same time."""
     times = {view.time for view in all_views(splits)}
     if len(times) != 1 or times == {None}:
         return splits, []
     time = times.pop() or 0.0
     if len(all_views(splits)) == 1:
         return _with_time(splits, time if 0 <= time <= 1 else 0.0), []
-    return _with_time(splits, None), [f"all pictures have time {time:g}: treated as a still scene"]
+    return _with_time(splits, None), [f"all images have time {time:g}: treated as a static scene"]
 
 
 def sequence_warnings(splits: Splits) -> list[str]:
-    """Warn of pictures with the same camera, pose and time, and of cameras with different numbers of frames."""
+    """Warn of images with the same camera, pose and time, and of cameras with different numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
     return [*_repeated(views), *_frame_counts(views)]
 
@@ -145,7 +145,7 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
-    """Return indices of views, in order of time, for each static camera with pictures at several times.
+    """Return indices of views, in order of time, for each static camera with images at several times.
 
     A camera is a pose, intrinsics, a lens and a size. Of several views with one camera and time the first is taken.
     """
@@ -180,16 +180,16 @@ def videos(views: Sequence[View]) -> list[list[int]]:
 
 
 def _repeated(views: list[View]) -> list[str]:
-    """Warn of several pictures with one camera, pose and time."""
-    pictures: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
+    """Warn of several images with one camera, pose and time."""
+    images: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
     for view in views:
-        pictures[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(view.image_path, view)
-    doubled = [list(same.values()) for same in pictures.values() if len(same) > 1]
+        images[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(view.image_path, view)
+    doubled = [list(same.values()) for same in images.values() if len(same) > 1]
     if not doubled:
         return []
     first, second = doubled[0][:2]
     return [
-        f"{sum(map(len, doubled))} pictures share camera, pose and time with another one, first {first.name} and "
+        f"{sum(map(len, doubled))} images share camera, pose and time with another one, first {first.name} and "
         f"{second.name} at time {first.time:g}; are their times right?"
     ]
 

@@ -1,4 +1,4 @@
-"""2D tracks that a user gives with a capture: where points of surfaces appear in its pictures."""
+"""2D tracks that a user gives with a capture: where points of surfaces appear in its images."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _LARGEST = 1e6
 
 @dataclass(frozen=True)
 class Tracks:
-    """Tracks of P points in F pictures.
+    """Tracks of P points in F images.
 
     Attributes:
-        names: of the F pictures: names of views, or their ``file_path`` as the capture's files have it.
-        xy: (F, P, 2) float32 in pixels of the stored pictures; the centre of the first pixel is (0.5, 0.5).
+        names: of the F images: names of views, or their ``file_path`` as the capture's files have it.
+        xy: (F, P, 2) float32 in pixels of the stored images; the centre of the first pixel is (0.5, 0.5).
         visible: (F, P) bool, the point is seen there; where it is not, ``xy`` means nothing.
     """
 
@@ -57,7 +57,7 @@ def read_tracks(path: Path) -> Tracks:
         )
     listed = tuple(x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in names.tolist())
     if len(set(listed)) < len(listed):
-        raise DyngsError(f"{path}: names holds one name more than once; give one row per picture")
+        raise DyngsError(f"{path}: names holds one name more than once; give one row per image")
     xy = xy.astype(np.float64)
     good = np.all(np.abs(xy) < _LARGEST, axis=-1)  # phrased so that NaN fails it
     return Tracks(listed, np.where(good[..., None], xy, 0.0).astype(np.float32), (visible > 0) & good)

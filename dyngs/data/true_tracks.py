@@ -24,7 +24,7 @@ class TrueTracks:
         times: (T,) ascending, as the capture's files have them.
         views: (V,) names of the views of all splits, as ``View.name``.
         moments: (V,) row of ``times`` at which each view was taken.
-        visible: (V, P) whether the view shows the point: in the picture, and nothing before it.
+        visible: (V, P) whether the view shows the point: in the image, and nothing before it.
     """
 
     points: np.ndarray

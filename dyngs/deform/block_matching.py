@@ -1,6 +1,6 @@
-"""Block matching: where the drawn picture belongs in the true one.
+"""Block matching: where the drawn image belongs in the true one.
 
-Gradients of a picture see a few pixels far. A texture that lies a whole check beside its place has no gradient that
+Gradients of an image see a few pixels far. A texture that lies a whole check beside its place has no gradient that
 leads back; the place where a block of pixels fits best can be searched for.
 """
 
@@ -17,16 +17,16 @@ RADIUS = 3
 BLOCK = 7
 """Side of the blocks that are compared, px."""
 BETTER = 0.6
-"""Most that the squared error of a block may be, as a share of its error in place, to be moved."""
+"""Most that the squared error of a block may be, as a fraction of its error in place, to be moved."""
 FITS = 1.02
-"""Largest error in place, as a share of the best, where a block belongs where it is."""
+"""Largest error in place, as a fraction of the best, where a block belongs where it is."""
 MIN_ERROR = 2e-4
 """Mean squared error of a block, summed over channels, up to which it counts as right."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Where the pixels of a drawn picture belong.
+    """Where the pixels of a drawn image belong.
 
     Attributes:
         shifts: (H, W, 2) along x and y, px; 0 where none is trusted.

@@ -3,7 +3,7 @@
 After SC-GS (Huang et al. 2024) and Dynamic 3D Gaussians (Luiten et al. 2024): nodes carry rigid motions, neighbours
 move alike, and a motion that leaves the times seen so far goes on at constant velocity.
 
-Every picture moves four neighbouring control points of each spline: poses that few pictures show are shared by many.
+Every image moves four neighbouring control points of each spline: poses that few images show are shared by many.
 
 Local letters: S nodes, P control points.
 """
@@ -43,11 +43,11 @@ from dyngs.deform.rigid_groups import (
     with_free,
     with_zero,
 )
-from dyngs.deform.spline_fit import SPAN, cubic_shares, refitted, spline_basis
+from dyngs.deform.spline_fit import SPAN, cubic_fractions, refitted, spline_basis
 from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.quaternions import identity_quat, unit_quats
 from dyngs.ops.transfer import sent
-from dyngs.parameters import Parameters
 from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed, tensors_of
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
@@ -59,13 +59,13 @@ LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3
 LR_DECAY = 0.2
 """Ratio of the last to the first learning rate."""
 PIECES_PER_TIME = 0.3
-"""Pieces of the splines per training time. With more, poses follow single pictures; with fewer, they lag behind."""
+"""Pieces of the splines per training time. With more, poses follow single images; with fewer, they lag behind."""
 GROUP_PIECES_PER_TIME = 0.5
 """The same of the groups' splines: all that a body shows speaks for its pose."""
 GROUP_RATES = {"group_quats": 3e-3, "binding": 2e-2}
 """Learning rates of rigid groups other than of their shifts."""
 LEAST = 0.02
-"""Least share of a second group from which a Gaussian is bound to it."""
+"""Least fraction of a second group from which a Gaussian is bound to it."""
 RESIDUALS = 0.01
 """Weight of what the nodes of a rigid group move in its frame: squared, in node spacings."""
 PER_GAUSSIAN = ("followed", "others", "bodies")
@@ -273,24 +273,24 @@ class ControlNodes(NetworkField):
         local = self._local(time)
         if not self.has_groups:
             return local
-        labels, shares = self.buffers["labels"], self._group_shares(time)
-        quats = unit_quats((shares * self.parameters["group_quats"]).sum(1))
-        motion = with_free(GroupMotion(quats, (shares * self.parameters["group_shifts"]).sum(1)))
+        labels, fractions = self.buffers["labels"], self._group_fractions(time)
+        quats = unit_quats((fractions * self.parameters["group_quats"]).sum(1))
+        motion = with_free(GroupMotion(quats, (fractions * self.parameters["group_shifts"]).sum(1)))
         own = GroupMotion(motion.quats[labels], motion.shifts[labels])
         return carried(local, self.buffers["positions"], with_zero(self.buffers["centers"])[labels], own)
 
-    def _group_shares(self, time: float) -> Tensor:
+    def _group_fractions(self, time: float) -> Tensor:
         """Return the weights (Q, 1) of the control points of the groups' splines at ``time``."""
         pieces = self.parameters["group_quats"].shape[1] - SPAN + 1
-        shares = spline_basis(torch.tensor([time], device="cpu"), pieces)[0, :, None]
-        return sent(shares.float(), self.setup.center.device)
+        fractions = spline_basis(torch.tensor([time], device="cpu"), pieces)[0, :, None]
+        return sent(fractions.float(), self.setup.center.device)
 
     def _local(self, time: float) -> Offsets:
         """Return the nodes' offsets at ``time`` in the frames of their groups, if they have any."""
         place = min(max(time, 0.0), 1.0) * self.num_pieces
         piece = min(int(place), self.num_pieces - 1)
-        shares = sent(cubic_shares(place - piece)[:, None], self.setup.center.device)
-        parts = {n: (shares * x[:, piece : piece + SPAN]).sum(1) for n, x in self._splines().items()}
+        fractions = sent(cubic_fractions(place - piece)[:, None], self.setup.center.device)
+        parts = {n: (fractions * x[:, piece : piece + SPAN]).sum(1) for n, x in self._splines().items()}
         if "logit_opacities" in parts:
             parts["logit_opacities"] = parts["logit_opacities"][:, 0]
         return Offsets(**parts)

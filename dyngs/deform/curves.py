@@ -43,7 +43,7 @@ class Curves:
     heads: dict[str, Tensor]
     pivots: Tensor | None = None
     followed: Tensor | None = None
-    shares: Tensor | None = None
+    fractions: Tensor | None = None
     lives: Tensor | None = None
     error: float = 0.0
 
@@ -89,12 +89,12 @@ def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tenso
     times = torch.linspace(0, 1, count, dtype=torch.float64, device="cpu")
     solver = torch.linalg.pinv(spline_basis(times, pieces)).float()  # (P, count)
     sums: dict[str, Tensor] = {}
-    for time, shares in zip(times.tolist(), solver.T, strict=True):
+    for time, fractions in zip(times.tolist(), solver.T, strict=True):
         for name, x in vars(offsets_at(time)).items():
             if x is not None:
                 rows = x.reshape(len(x), 1, -1)
                 sums.setdefault(name, rows.new_zeros(len(x), pieces + SPAN - 1, rows.shape[2]))
-                sums[name] += shares[:, None] * rows
+                sums[name] += fractions[:, None] * rows
     return sums
 
 
@@ -102,8 +102,8 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
     """Return the quantile ``CHECKED`` of the splines' distances from the places, root mean squares over the pieces."""
     times = (torch.arange(pieces, dtype=torch.float64, device="cpu") + 0.5) / pieces
     apart = [
-        (torch.einsum("p,spd->sd", shares.float(), points) - offsets_at(time).means).norm(dim=1)
-        for time, shares in zip(times.tolist(), spline_basis(times, pieces), strict=True)
+        (torch.einsum("p,spd->sd", fractions.float(), points) - offsets_at(time).means).norm(dim=1)
+        for time, fractions in zip(times.tolist(), spline_basis(times, pieces), strict=True)
     ]
     found = torch.stack(apart).square().mean(0).sqrt()
     return float(found.sort().values[int(CHECKED * (len(found) - 1))]) if len(found) else 0.0
@@ -116,22 +116,22 @@ def _curves_of_nodes(field: ControlNodes, means: Tensor, tolerance: float) -> Cu
         heads, error = fitted_curves(field.at, 2 * MOST_PIECES, tolerance)
     else:
         heads, error = _fit(field.at, field.num_pieces), 0.0
-    followed, shares = _padded(nodes.followed, nodes.weights(means))
+    followed, fractions = _padded(nodes.followed, nodes.weights(means))
     others, binding = field.buffers.get("others"), field.parameters.get("binding")
     if others is not None and binding is not None:
         torn = ~is_alone(binding)
         second = torch.where(torn, torch.sigmoid(binding[:, 0]), 0.0)[:, None]
         other, weights = _padded(others, replace(nodes, followed=others).weights(means))
         followed = torch.cat([followed, other], dim=1)
-        shares = torch.cat([(1 - second) * shares, second * weights], dim=1)
+        fractions = torch.cat([(1 - second) * fractions, second * weights], dim=1)
     lives = None
     if field.has_lives:
         center, log_span, velocity = (field.parameters[name] for name in SIZES)
         lives = torch.cat([velocity, center, log_span.exp()], dim=1)
-    return Curves(heads, nodes.positions, followed, shares, lives, error)
+    return Curves(heads, nodes.positions, followed, fractions, lives, error)
 
 
-def _padded(followed: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both with ``FOLLOWED`` columns; shares of added ones are 0."""
+def _padded(followed: Tensor, fractions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both with ``FOLLOWED`` columns; fractions of added ones are 0."""
     more = FOLLOWED - followed.shape[1]
-    return torch.nn.functional.pad(followed, (0, more)), torch.nn.functional.pad(shares, (0, more))
+    return torch.nn.functional.pad(followed, (0, more)), torch.nn.functional.pad(fractions, (0, more))

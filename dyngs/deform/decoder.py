@@ -9,9 +9,9 @@ from torch import Tensor
 
 from dyngs.config import FieldSection
 from dyngs.deform.field import Offsets
+from dyngs.gaussians.parameters import Parameters
 from dyngs.initialisation import glorot
 from dyngs.ops.perceptron import Layer, perceptron
-from dyngs.parameters import Parameters
 
 
 class Decoder:

@@ -1,7 +1,7 @@
-"""Evidence that something moves, from pictures and from the errors of a small still model, before a scene is trained.
+"""Evidence that something moves, from images and from the errors of a small static model, before a scene is trained.
 
-How far a still model errs says little: an unfinished one errs everywhere. *When* it errs says more: errors of what
-stands depend on where a picture was taken from, errors of what moves on when.
+How far a static model errs says little: an unfinished one errs everywhere. *When* it errs says more: errors of what
+stands depend on where an image was taken from, errors of what moves on when.
 
 Local letters: V views in order of time, N Gaussians.
 """
@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 DIFFERS = 0.06
-"""Difference from the median picture, mean over channels, from which a pixel shows something else."""
+"""Difference from the median image, mean over channels, from which a pixel shows something else."""
 MIN_DIFFERING = 1e-3
-"""Share of differing pixels, over all pictures of cameras that stay in place, from which something moves."""
+"""Fraction of differing pixels, over all images of cameras that stay in place, from which something moves."""
 SHUFFLES = 40
 """Random orders of the views that show how errors agree by chance."""
 MOVES_FROM, STILL_UP_TO = 4.0, 3.0
@@ -29,11 +29,11 @@ COVERS = 1.0
 MIN_SEEN = 20
 """Views that see a Gaussian, below which its errors say nothing."""
 DAMPING = 0.02
-"""Ridge of the fit of errors over directions, as a share of the weights."""
+"""Ridge of the fit of errors over directions, as a fraction of the weights."""
 
 
 class Verdict(Enum):
-    """Answer of the pictures."""
+    """Answer of the images."""
 
     STILL = "still"
     MOVES = "moves"
@@ -45,7 +45,7 @@ class Evidence:
     """Whether something moves.
 
     Attributes:
-        verdict: of the pictures; open where time and viewpoint cannot be told apart.
+        verdict: of the images; open where time and viewpoint cannot be told apart.
         reason: for people: what was measured, and the figure.
     """
 
@@ -73,21 +73,21 @@ class Agreement:
 
 
 @torch.no_grad()
-def differing_share(cameras: Sequence[Sequence[Tensor]]) -> float:
-    """Return the share of pixels that differ from the median picture of their camera.
+def differing_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
+    """Return the fraction of pixels that differ from the median image of their camera.
 
-    Each picture is first brought to the brightness of the median (changing exposure is no motion) and averaged over
+    Each image is first brought to the brightness of the median (changing exposure is no motion) and averaged over
     2x2 pixels, against noise.
 
     Args:
-        cameras: pictures (H, W, 3) in [0, 1] of each camera that stays in place.
+        cameras: images (H, W, 3) in [0, 1] of each camera that stays in place.
     """
     differing = total = 0
-    for pictures in cameras:
-        smooth = [avg_pool2d(picture.movedim(2, 0), 2, ceil_mode=True) for picture in pictures]
+    for images in cameras:
+        smooth = [avg_pool2d(image.movedim(2, 0), 2, ceil_mode=True) for image in images]
         usual = torch.stack(smooth).median(0).values
-        for picture in smooth:
-            gap = picture - usual
+        for image in smooth:
+            gap = image - usual
             gap = gap - gap.flatten(1).median(1).values[:, None, None]
             differing += int((gap.abs().mean(0) > DIFFERS).sum())
             total += gap[0].numel()
@@ -99,7 +99,7 @@ def agreement_over_time(errors: Tensor, weights: Tensor, directions: Tensor, gen
     """Return how far errors at times that follow each other agree, where views look from all sides in no order.
 
     The error of a Gaussian in a view is the weighted mean over the pixels that show it. Its part that depends on the
-    direction of view, as far as harmonics of degree 2 can tell, is left out. In a still scene views that follow each
+    direction of view, as far as harmonics of degree 2 can tell, is left out. In a static scene views that follow each
     other in time have nothing in common, however little the model has learned.
 
     Args:

@@ -11,9 +11,9 @@ from typing_extensions import assert_never
 from dyngs.config import ControlNodesField, DeformField, HexplaneField, MlpField, TrajectoryField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup
+from dyngs.deform.fixed_cameras.start import FirstMotion
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
-from dyngs.deform.standing.start import FirstMotion
 from dyngs.deform.trajectory import Trajectory
 from dyngs.state import Role, State, with_role
 from dyngs.tensor_checks import require_positive, require_tensor

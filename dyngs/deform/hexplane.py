@@ -10,8 +10,8 @@ from torch import Tensor
 from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
 from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen, key_times
+from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
-from dyngs.parameters import Parameters
 
 LR_DECAY = 0.01
 """Ratio of the last to the first learning rate."""

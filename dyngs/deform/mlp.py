@@ -8,7 +8,7 @@ from torch import Tensor
 from dyngs.config import MlpField
 from dyngs.deform.decoder import Decoder, split_heads
 from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
-from dyngs.parameters import Parameters
+from dyngs.gaussians.parameters import Parameters
 
 LR_DECAY = 0.002
 """Ratio of the last to the first learning rate."""

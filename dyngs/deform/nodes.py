@@ -41,7 +41,7 @@ class Nodes:
         return replace(self, followed=self.followed.index_select(0, rows))
 
     def weights(self, means: Tensor) -> Tensor:
-        """Return (M, B) shares of the followed nodes: Gaussians of the distance, normalised; constant in ``means``."""
+        """Return (M, B) weights of the followed nodes: Gaussians of the distance, normalised; constant in ``means``."""
         apart = (means.detach()[:, None] - self.positions[self.followed]).square().sum(-1)
         return torch.softmax(-0.5 * apart / self.radii[self.followed].square(), dim=1)
 

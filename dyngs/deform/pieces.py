@@ -1,4 +1,4 @@
-"""Pieces of what moves: each keeps its motion only where that pays in pictures that were not trained on."""
+"""Pieces of what moves: each keeps its motion only where that pays in images that were not trained on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CHUNK = 65536
 """Gaussians whose distances are taken at once."""
 
 Scores = Callable[[Callable[[float], Gaussians]], Sequence[float]]
-"""PSNR of pictures, dB, of Gaussians at a time."""
+"""PSNR of images, dB, of Gaussians at a time."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Faint Gaussians at random points of a scene, for moving things that a still model has lost."""
+"""Faint Gaussians at random points of a scene, for moving things that a static model has lost."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 
 BOX_MARGIN = 1.1
 SCALE = 0.3
-"""Standard deviation of each, as a share of the distance between them."""
+"""Standard deviation of each, as a fraction of the distance between them."""
 LOGIT = -2.2
 """Opacity 0.1, as all Gaussians begin."""
 SOLID = 0.05

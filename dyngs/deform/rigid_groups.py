@@ -32,7 +32,7 @@ FEWEST, MOST = 6, 32
 GROUP_TIMES = 16
 """Times at which the motion of nodes is compared."""
 AGREES = 0.35
-"""Share of the nodes' spacing, and of as much motion as up to two of these, that a rigid motion may leave over."""
+"""Fraction of the nodes' spacing, and of as much motion as up to two of these, that a rigid motion may leave over."""
 ALONE = -20.0
 """Binding of a Gaussian that is of one group only; up to half of it counts as that, for files round it."""
 
@@ -107,7 +107,7 @@ def continuous(quats: Tensor) -> Tensor:
     return torch.where(middle < 0, -signed, signed)
 
 
-def rigid_motion(points: Tensor, moved: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+def rigid_motion(points: Tensor, moved: Tensor, fractions: Tensor) -> tuple[Tensor, Tensor]:
     """Return the rotations (C, T, 3, 3) and shifts (C, T, 3) with x' = R x + s nearest to ``moved``, by least squares.
 
     After Kabsch (1976).
@@ -117,10 +117,10 @@ def rigid_motion(points: Tensor, moved: Tensor, shares: Tensor) -> tuple[Tensor,
         moved: (T, S, 3).
         shares: (C, S) weights of the points in each of C fits, not negative, not all 0.
     """
-    shares = shares / shares.sum(1, keepdim=True)
-    before, after = shares @ points, torch.einsum("cs,tsd->ctd", shares, moved)
+    fractions = fractions / fractions.sum(1, keepdim=True)
+    before, after = fractions @ points, torch.einsum("cs,tsd->ctd", fractions, moved)
     products = (moved[..., :, None] * points[:, None, :]).flatten(2)
-    covariance = torch.einsum("cs,tsx->ctx", shares, products).unflatten(2, (3, 3))
+    covariance = torch.einsum("cs,tsx->ctx", fractions, products).unflatten(2, (3, 3))
     covariance = covariance - after[..., :, None] * before[:, None, None, :]
     left, _, right = torch.linalg.svd(covariance)
     flip = torch.ones_like(covariance[..., 0])
@@ -190,21 +190,21 @@ def _heaviest(positions: Tensor, paths: Tensor, tolerances: Tensor, weights: Ten
     seeds = torch.nonzero(weights > 0)[:, 0]
     seeds = seeds[:: max(len(seeds) // MOST_SEEDS, 1)]
     chosen = near[seeds].topk(min(SEED_NODES, int((weights > 0).sum())), dim=1, largest=False).indices
-    shares = torch.zeros(len(seeds), len(positions), dtype=positions.dtype, device=positions.device)
-    shares.scatter_(1, chosen, weights[chosen])
+    fractions = torch.zeros(len(seeds), len(positions), dtype=positions.dtype, device=positions.device)
+    fractions.scatter_(1, chosen, weights[chosen])
     best, heaviest = torch.zeros(len(positions), dtype=torch.bool, device=positions.device), 0.0
     for _ in range(ROUNDS):
-        turns, shifts = rigid_motion(positions, paths, shares)
+        turns, shifts = rigid_motion(positions, paths, fractions)
         agrees = (_strays(positions, paths, turns, shifts) <= tolerances) & (weights > 0)
         totals = agrees.to(weights) @ weights
         top = int(totals.argmax())
         if float(totals[top]) > heaviest:
             best, heaviest = agrees[top], float(totals[top])
-        kept = totals.topk(-(-len(shares) // 3)).indices
+        kept = totals.topk(-(-len(fractions) // 3)).indices
         kept = kept[agrees[kept].sum(1) >= 3]
         if not len(kept):
             break
-        shares = agrees[kept] * weights
+        fractions = agrees[kept] * weights
     return best
 
 
@@ -243,7 +243,7 @@ def bound(first: Offsets, nodes: Nodes, means: Tensor, at_nodes: Offsets, bindin
     if not len(torn):
         return first
     second = follow(nodes.followed_by(torn), means.index_select(0, torn), at_nodes)
-    share = torch.sigmoid(binding.index_select(0, torn))
+    fraction = torch.sigmoid(binding.index_select(0, torn))
     mixed = {}
     for name, x in vars(first).items():
         other = getattr(second, name)
@@ -253,7 +253,7 @@ def bound(first: Offsets, nodes: Nodes, means: Tensor, at_nodes: Offsets, bindin
         if name == "quats":  # q and -q are one rotation
             one = identity_quat(own)
             other = torch.where(((own + one) * (other + one)).sum(1, keepdim=True) < 0, -(other + one) - one, other)
-        step = (other - own) * (share if x.ndim > 1 else share[:, 0])
+        step = (other - own) * (fraction if x.ndim > 1 else fraction[:, 0])
         mixed[name] = x.index_add(0, torn, step)
     return Offsets(**mixed)
 

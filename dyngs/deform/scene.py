@@ -12,11 +12,11 @@ from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.scene import Moment, Scene, clamped_time
+from dyngs.gaussians.scene import Moment, Scene, clamped_time
+from dyngs.gaussians.visibility import VisibilityMasks, matched
 from dyngs.state import Role, State, StateTensor, part_of, prefixed
 from dyngs.static.scene import filter_state, filtered, stored_filter, stored_times, times_state
 from dyngs.tensor_checks import require_ascending, require_indices
-from dyngs.visibility import VisibilityMasks, matched
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
@@ -61,7 +61,7 @@ class DynamicScene(Scene):
         return self.seen_at
 
     @property
-    def is_still(self) -> bool:
+    def is_static(self) -> bool:
         return self.field is None or len(self.moving) == 0
 
     @property
@@ -74,7 +74,7 @@ class DynamicScene(Scene):
 
     @property
     def num_motion_values(self) -> int:
-        return 0 if self.field is None or self.is_still else self.field.num_values
+        return 0 if self.field is None or self.is_static else self.field.num_values
 
     def moment(self, time: float | None) -> Moment:
         """Return all N Gaussians at ``time``, or with masks only those that are seen around then, in their order.
@@ -82,7 +82,7 @@ class DynamicScene(Scene):
         What does not move is not computed anew.
         """
         now = clamped_time(time)
-        if self.field is None or self.is_still:
+        if self.field is None or self.is_static:
             return Moment(filtered(self.gaussians, self.filter_std), now)
         return Moment(self.deformed_at(now)[0], now)
 
@@ -146,7 +146,7 @@ class DynamicScene(Scene):
 
 def field_scene_of(scene: Scene) -> DynamicScene | None:
     """Return ``scene`` if a deformation field moves it, None for any other scene."""
-    return scene if isinstance(scene, DynamicScene) and not scene.is_still else None
+    return scene if isinstance(scene, DynamicScene) and not scene.is_static else None
 
 
 @dataclass(frozen=True)

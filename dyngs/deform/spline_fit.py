@@ -47,7 +47,7 @@ def refitted(points: Tensor, pieces: int) -> Tensor:
     return torch.einsum("qp,spd->sqd", fit, points.double()).to(points)
 
 
-def cubic_shares(place: float) -> Tensor:
+def cubic_fractions(place: float) -> Tensor:
     """Return the (4,) weights of the control points of a piece of a uniform cubic B-spline, at ``place`` in [0, 1]."""
     rest = 1 - place
     middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]

@@ -1,4 +1,4 @@
-"""Errors of a still model in the pictures: the first measure of what may move."""
+"""Errors of a static model in the images: the first measure of what may move."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from torch import Tensor
 
 from dyngs.data.capture import View
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.data.times import static_cameras
-from dyngs.deform.standing.changes import median_picture
+from dyngs.deform.fixed_cameras.changes import median_image
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions, Shader, render
+from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
 MIN_SAME = 3
-"""Fewest pictures of one camera whose median shows what is still."""
+"""Fewest images of one camera whose median shows what is still."""
 USUAL = 0.7
-"""What moves differs from the median in three of ten pictures or more; what is hidden at times, in fewer."""
+"""What moves differs from the median in three of ten images or more; what is hidden at times, in fewer."""
 MOMENTS = 8
-"""Pictures of one camera that are compared."""
+"""Images of one camera that are compared."""
 SHOWS = 1e-3
-"""Sum of weights, in pixels, from which a Gaussian counts as visible in a picture."""
+"""Sum of weights, in pixels, from which a Gaussian counts as visible in an image."""
 
 
 @dataclass(frozen=True)
 class StillErrors:
-    """Errors of a still scene in the pictures, per Gaussian.
+    """Errors of a static scene in the images, per Gaussian.
 
     Attributes:
         most: (N,) large where anything moves, be it this Gaussian or what hides it at times.
@@ -41,39 +41,39 @@ class StillErrors:
 
 def still_errors(
     gaussians_at: Callable[[float], Gaussians],
-    pictures: Sequence[Picture],
+    images: Sequence[Image],
     options: RenderOptions,
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
 ) -> StillErrors:
-    """Return the errors of a still scene in the pictures, where each Gaussian is seen.
+    """Return the errors of a static scene in the images, where each Gaussian is seen.
 
-    e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each picture v, a mean over channels.
+    e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each image v, a mean over channels.
     Errors of one view are summed with their sign over what a Gaussian covers: detail that is not yet resolved cancels,
     a thing that has come or gone does not. Both sums come from passes back through the blending of a constant colour.
     Masked pixels do not count; a Gaussian that shows nowhere has 0.
 
-    Where cameras stay in place, what is expected of one with ``MIN_SAME`` pictures or more is their median, which holds
-    whatever is still exactly as it is; ``most`` is the largest, ``usual`` the ``USUAL`` quantile of e_vi over pictures
+    Where cameras stay in place, what is expected of one with ``MIN_SAME`` images or more is their median, which holds
+    whatever is still exactly as it is; ``most`` is the largest, ``usual`` the ``USUAL`` quantile of e_vi over images
     in which a Gaussian shows. Else the rendering is expected, and both are the mean, weighted by sum_p w_vip: a still
     model that is not yet right errs too.
 
     Args:
         gaussians_at: N Gaussians at a time.
-        pictures: one or more, as many as are to be looked at.
+        images: one or more, as many as are to be looked at.
         background: (3,) colour.
         shader_at: what colours the Gaussians at a time; None: their harmonics.
     """
-    expected = _median_pictures(pictures, background)
-    looked_at = [p for p in pictures if _camera_key(p) in expected] if expected else pictures
+    expected = _median_images(images, background)
+    looked_at = [p for p in images if _camera_key(p) in expected] if expected else images
     found: list[tuple[Tensor, Tensor]] = []
-    for picture in looked_at:
-        gaussians, shown = gaussians_at(picture.time or 0.0).detach(), expected.get(_camera_key(picture))
+    for image in looked_at:
+        gaussians, shown = gaussians_at(image.time or 0.0).detach(), expected.get(_camera_key(image))
         if shown is None:
             with torch.no_grad():
-                shader = shader_at(picture.time or 0.0)
-                shown = render(gaussians, picture.cameras, options, background=background, shader=shader).rgb[0]
-        signed, weight = signed_errors(gaussians, picture, options, background, shown)
+                shader = shader_at(image.time or 0.0)
+                shown = render(gaussians, image.cameras, options, background=background, shader=shader).rgb[0]
+        signed, weight = signed_errors(gaussians, image, options, background, shown)
         found.append((signed.abs().mean(1), weight))
     errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
     if not expected:
@@ -86,24 +86,24 @@ def still_errors(
 
 
 def signed_errors(
-    gaussians: Gaussians, picture: Picture, options: RenderOptions, background: Tensor, expected: Tensor
+    gaussians: Gaussians, image: Image, options: RenderOptions, background: Tensor, expected: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return, per Gaussian, sums over pixels of its blending weight times the signed error, and of the weight alone.
 
     Args:
         gaussians: N, as they are drawn.
-        picture: the truth; masked pixels do not count.
+        image: the truth; masked pixels do not count.
         options: how to draw.
         background: (3,) colour.
-        expected: (H, W, 3) picture that is compared with it.
+        expected: (H, W, 3) image that is compared with it.
 
     Returns:
         (N, 3) and (N,); both come from passes back through the blending of a constant colour.
     """
-    counts = torch.ones(expected.shape[:2], device=expected.device) if picture.mask is None else picture.mask
-    error = (expected - picture.composite(background)) * counts[..., None]
+    counts = torch.ones(expected.shape[:2], device=expected.device) if image.mask is None else image.mask
+    error = (expected - image.composite(background)) * counts[..., None]
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
-    blended = render(gaussians.replace(sh=flat), picture.cameras, options).rgb[0]
+    blended = render(gaussians.replace(sh=flat), image.cameras, options).rgb[0]
     (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
     (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())
     return signed[:, 0], weight[:, 0, 0]
@@ -123,17 +123,17 @@ def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
     return [seen[i] for seen in chosen for i in evenly_spaced(len(seen), limit // len(chosen))]
 
 
-def _median_pictures(pictures: Sequence[Picture], background: Tensor) -> dict[bytes, Tensor]:
-    """Return the median picture (H, W, 3) of each camera with enough pictures."""
+def _median_images(images: Sequence[Image], background: Tensor) -> dict[bytes, Tensor]:
+    """Return the median image (H, W, 3) of each camera with enough images."""
     same: dict[bytes, list[Tensor]] = {}
-    for picture in pictures:
-        same.setdefault(_camera_key(picture), []).append(picture.composite(background))
-    return {key: median_picture(seen) for key, seen in same.items() if len(seen) >= MIN_SAME}
+    for image in images:
+        same.setdefault(_camera_key(image), []).append(image.composite(background))
+    return {key: median_image(seen) for key, seen in same.items() if len(seen) >= MIN_SAME}
 
 
-def _camera_key(picture: Picture) -> bytes:
-    """Return a key that is equal for pictures from the same camera pose, but for rounding."""
-    cameras = picture.cameras
+def _camera_key(image: Image) -> bytes:
+    """Return a key that is equal for images from the same camera pose, but for rounding."""
+    cameras = image.cameras
     return b"".join(x.round(decimals=6).cpu().numpy().tobytes() for x in (cameras.cam_from_world, cameras.intrinsics))
 
 

@@ -1,6 +1,6 @@
 """The part of a clip that training sees: it starts around the middle and grows until it is all.
 
-Motion over a whole clip may be far larger than the thing that moves. From the few pictures around one moment a sharp
+Motion over a whole clip may be far larger than the thing that moves. From the few images around one moment a sharp
 canonical form can be had, and a field that has followed it so far needs little to follow it a little farther.
 """
 
@@ -22,7 +22,7 @@ class TimeWindow:
 
     Attributes:
         strays: |time - 0.5| of all training views, ascending.
-        first: views in the window at the start, as a share of all.
+        first: views in the window at the start, as a fraction of all.
         begins: step up to which all views are trained on, because nothing moves yet.
         opens, full: steps between which the window grows evenly, in views, to all of them.
     """

@@ -15,22 +15,22 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import DynamicModel
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
+from dyngs.deform.fixed_cameras.changes import Footage
+from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.pieces import MovingPart, Scores, paid_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.standing.changes import Footage
-from dyngs.deform.standing.start import FirstMotion, first_motion
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.scene import Moment, Scene, Variant
 from dyngs.ops.adam import Count
-from dyngs.parameters import Parameters
-from dyngs.scene import Moment, Scene, Variant
 from dyngs.state import Role, State, fields_moved_to, with_role
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
 from dyngs.static.rates import Rates
@@ -41,9 +41,9 @@ SURELY_MOVING = 1.5
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
 TRIAL, MIN_TRIAL = 0.015, 40
-"""Steps of a trial, as a share of the run, and fewest of them."""
-MIN_MOVING_SHARE = 0.02
-"""Share of surely moving Gaussians up to which the scene counts as still."""
+"""Steps of a trial, as a fraction of the run, and fewest of them."""
+MIN_MOVING_FRACTION = 0.02
+"""Fraction of surely moving Gaussians up to which the scene counts as still."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,11 @@ class TrainingViews:
         times: of the training views, in [0, 1], ascending; at least two differ.
         cameras: the training cameras.
         extent: of the scene, world units.
-        still_errors: how far its pictures disagree with what is still, where N Gaussians are seen.
-        cameras_stay: in place, so that pictures show what is still exactly alike.
+        still_errors: how far its images disagree with what is still, where N Gaussians are seen.
+        cameras_stay: in place, so that images show what is still exactly alike.
         standing: returns what those cameras show.
-        held_out: returns the PSNR, dB, of the pictures held out, of Gaussians at a time; None: none are.
-        matched: pictures for block matching.
+        held_out: returns the PSNR, dB, of the images held out, of Gaussians at a time; None: none are.
+        matched: images for block matching.
     """
 
     times: tuple[float, ...]
@@ -134,16 +134,16 @@ class DynamicTraining:
         if scene.field is not None:
             scene.field.extend(seen, self._window.bounds(step))
 
-    def moment(self, scene: DynamicScene, picture: Picture, step: int) -> Moment:
-        """Return the moment drawn for ``picture`` at its time, and the regularizers of motion."""
+    def moment(self, scene: DynamicScene, image: Image, step: int) -> Moment:
+        """Return the moment drawn for ``image`` at its time, and the regularizers of motion."""
         if scene.field is None:
-            return scene.moment(picture.time)
-        time = self._jittered(picture.time or 0.0, step)
+            return scene.moment(image.time)
+        time = self._jittered(image.time or 0.0, step)
         gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
         penalties = scene.field.penalties(time) | self._sparsity(offsets)
-        if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the pictures
+        if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the images
             penalties.pop("node acceleration", None)
-        return Moment(gaussians, picture.time, None, penalties)
+        return Moment(gaussians, image.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         """Update the field."""
@@ -157,7 +157,7 @@ class DynamicTraining:
         return None if scene.field is None else scene.field.parameters
 
     def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
-        """Return the scene with its filter up to date, the field extended to new times, still Gaussians frozen."""
+        """Return the scene with its filter up to date, the field extended to new times, static Gaussians frozen."""
         if self._update.is_due(step, edited):
             scene = replace(scene, filter_std=self._update.of(scene.gaussians))
         if scene.field is None:
@@ -172,13 +172,13 @@ class DynamicTraining:
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def grown(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene with random Gaussians to begin motion with; None where a still model explains all."""
+        """Return the scene with random Gaussians to begin motion with; None where a static model explains all."""
         if step != self.schedule.fine:
             return None
         now = scene.gaussians
         found = self.capture.still_errors(lambda _: now)
         floor = self.options.motion_threshold
-        errs = bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_SHARE)
+        errs = bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION)
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
         first = self._first_motion(now.detach(), rows)
@@ -224,7 +224,7 @@ class DynamicTraining:
         return Variant(name, replace(scene, field=field), 0 if key in field.taken_untried else count)
 
     def all_moving(self, scene: DynamicScene, extent: float) -> DynamicScene:
-        if not scene.is_still:
+        if not scene.is_static:
             return scene
         count, means = len(scene), scene.gaussians.means.detach()
         setup = FieldSetup(means.mean(0), torch.full_like(means[0], extent), len(self.times), count, extent)
@@ -250,7 +250,7 @@ class DynamicTraining:
         self._tracked, self._window = tracked, TimeWindow.around_middle(self.capture.times, first, *phases)
 
     def _first_motion(self, still: Gaussians, rows: Tensor) -> FirstMotion:
-        """Return what travels before standing cameras, for a field that can begin on its way."""
+        """Return what travels before fixed cameras, for a field that can begin on its way."""
         if not can_begin_on_its_way(self.options.deform):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
@@ -272,7 +272,7 @@ class DynamicTraining:
 
     @torch.no_grad()
     def _registered(self, scene: DynamicScene, step: int) -> DynamicScene:
-        """Return the scene with its motion corrected by block matching, if that lowers the error of the pictures."""
+        """Return the scene with its motion corrected by block matching, if that lowers the error of the images."""
         views, times = self.capture.matched, self._window.bounds(step)
         if views is None or scene.field is None or not len(scene.moving):
             return scene

@@ -14,7 +14,7 @@ from dyngs.config import TrajectoryField
 from dyngs.deform.decoder import head_sizes, split_heads
 from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
 from dyngs.gaussians import TopologyEdit
-from dyngs.parameters import Parameters
+from dyngs.gaussians.parameters import Parameters
 from dyngs.state import Role
 
 LR_OTHERS = 1e-3

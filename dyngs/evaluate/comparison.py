@@ -13,7 +13,7 @@ import torch
 
 from dyngs.data.capture import Capture
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
 from dyngs.evaluate.temporal import Drawing
@@ -27,8 +27,8 @@ COMPARED_VIEWS = 20
 """Number of views compared per split; enough for before and after, not for a benchmark."""
 ROUNDS = 3
 
-_Shown: TypeAlias = list[tuple[Picture, list[Drawing]]]
-"""Pictures, each with one drawing per run."""
+_Shown: TypeAlias = list[tuple[Image, list[Drawing]]]
+"""Images, each with one drawing per run."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Cost:
 
 
 def compared(folders: Sequence[Path], threads: int, device: torch.device = CPU) -> list[Cost]:
-    """Return the costs of runs on one capture; pictures are drawn in turn, so that machine load affects all.
+    """Return the costs of runs on one capture; images are drawn in turn, so that machine load affects all.
 
     Args:
         folders: of runs, or of files that were exported from them; the capture is that of the first.
@@ -86,28 +86,28 @@ def _stored(folder: Path) -> float | None:
 
 def _psnr(num_runs: int, views: _Shown) -> list[float]:
     values: list[list[float]] = [[] for _ in range(num_runs)]
-    for picture, drawings in views:
+    for image, drawings in views:
         for found, drawing in zip(values, drawings, strict=True):
-            drawn = drawing.picture(picture.cameras, picture.time)
-            found.append(psnr(drawn, picture.composite(drawing.background), picture.mask))
+            drawn = drawing.image(image.cameras, image.time)
+            found.append(psnr(drawn, image.composite(drawing.background), image.mask))
     return [fmean(found) for found in values]
 
 
 def _fps(num_runs: int, views: _Shown, device: torch.device) -> list[float]:
     seconds: list[list[float]] = [[] for _ in range(num_runs)]
-    for picture, drawings in views * ROUNDS:
+    for image, drawings in views * ROUNDS:
         for found, drawing in zip(seconds, drawings, strict=True):
             start = time.perf_counter()
-            drawing.picture(picture.cameras, picture.time)
+            drawing.image(image.cameras, image.time)
             finish(device)
             found.append(time.perf_counter() - start)
     return [1 / median(found) for found in seconds]
 
 
 def _views(runs: Sequence[LoadedRun], capture: Capture, split: str, device: torch.device) -> _Shown:
-    """Return some pictures of a split, each with one drawing per run."""
+    """Return some images of a split, each with one drawing per run."""
     config = runs[0].config
-    loader = PictureLoader(split_views(capture, split), config.data)
+    loader = ImageLoader(split_views(capture, split), config.data)
     loader.device = device
     background = evaluation_background(config.data.background, capture.has_alpha)[1].to(device)
     drawings = [

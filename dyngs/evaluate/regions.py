@@ -1,6 +1,6 @@
-"""Parts of pictures that are measured on their own: the foreground, what moves, and what does not.
+"""Parts of images that are measured on their own: the foreground, what moves, and what does not.
 
-Local letters: T pictures of a camera, H x W pixels.
+Local letters: T images of a camera, H x W pixels.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dyngs.data.capture import View
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import static_cameras
 from dyngs.metrics import psnr
 
@@ -24,12 +24,12 @@ FEWEST_PIXELS = 25
 """A region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing."""
 CHANGE = 0.05
 """Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as moving."""
-MEDIAN_PICTURES = 31
-"""Number of pictures, spread over the clip, from which a camera's median is taken."""
-FEWEST_PICTURES = 3
+MEDIAN_IMAGES = 31
+"""Number of images, spread over the clip, from which a camera's median is taken."""
+FEWEST_IMAGES = 3
 
-NO_ALPHA = "the pictures have no alpha and no silhouettes"
-NO_TIMES = "the pictures have no times"
+NO_ALPHA = "the images have no alpha and no silhouettes"
+NO_TIMES = "the images have no times"
 NO_MOTION_KNOWN = "the views have no motion masks, and no camera of this split stands still while time passes"
 TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
 
@@ -44,25 +44,25 @@ class RegionScores:
 
 
 class Regions:
-    """The regions of the pictures of one split.
+    """The regions of the images of one split.
 
-    The foreground is where the true picture is not fully transparent. What moves is known, in this order, from motion
+    The foreground is where the true image is not fully transparent. What moves is known, in this order, from motion
     masks that the views come with, and from the truth's change over time before cameras that stand still: where it
     differs by ``CHANGE`` from the camera's median over time, less single pixels. What is left does not move. Where
     there is a foreground, both are parts of it, so that an empty background counts nowhere.
 
     Args:
         views: the split.
-        loader: pictures of ``views``, in their order.
+        loader: images of ``views``, in their order.
         background: (3,) colour behind the truth.
     """
 
-    def __init__(self, views: Sequence[View], loader: PictureLoader, background: Tensor) -> None:
+    def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:
         self._loader, self._background = loader, background
         self._cameras = {
             views[i].name: indices
             for indices in static_cameras(views)
-            if len(indices) >= FEWEST_PICTURES
+            if len(indices) >= FEWEST_IMAGES
             for i in indices
         }
         self._medians: dict[tuple[int, ...], Tensor] = {}
@@ -70,14 +70,14 @@ class Regions:
         self._moving_from: set[str] = set()
         self._has_alpha = False
 
-    def scores(self, picture: Picture, rendered: Tensor, truth: Tensor) -> RegionScores:
+    def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> RegionScores:
         """Return the PSNR of a view's regions.
 
         Args:
-            picture: of the view.
+            image: of the view.
             rendered, truth: (H, W, 3) on the same background.
         """
-        foreground, moves = foreground_of(picture), self.moving(picture)
+        foreground, moves = foreground_of(image), self.moving(image)
         self._has_alpha |= foreground is not None
         inside = torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
         parts = {
@@ -85,28 +85,28 @@ class Regions:
             "moving": None if moves is None else moves & inside,
             "still": None if moves is None else ~moves & inside,
         }
-        return RegionScores(**{name: _psnr_inside(part, picture, rendered, truth) for name, part in parts.items()})
+        return RegionScores(**{name: _psnr_inside(part, image, rendered, truth) for name, part in parts.items()})
 
-    def moving(self, picture: Picture) -> Tensor | None:
+    def moving(self, image: Image) -> Tensor | None:
         """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
-        given = given_motion(picture)
+        given = given_motion(image)
         if given is not None:
             self._moving_from.add("motion masks")
             return given
-        indices = self._cameras.get(picture.name)
+        indices = self._cameras.get(image.name)
         if indices is None:
             return None
         self._moving_from.add("change over time")
-        change = (picture.composite(self._background) - self._median(indices)).abs().mean(-1)
+        change = (image.composite(self._background) - self._median(indices)).abs().mean(-1)
         return _opened(change > CHANGE)
 
     @property
     def moving_from(self) -> str | None:
-        """How it was found what moves in the pictures so far; None where it was not."""
+        """How it was found what moves in the images so far; None where it was not."""
         return " and ".join(sorted(self._moving_from)) or None
 
     def reason(self, name: RegionName) -> str:
-        """Return why no picture so far has a score of this region."""
+        """Return why no image so far has a score of this region."""
         if name == "foreground":
             return TOO_SMALL if self._has_alpha else NO_ALPHA
         if self._moving_from:
@@ -114,29 +114,29 @@ class Regions:
         return NO_MOTION_KNOWN if self._has_times else NO_TIMES
 
     def _median(self, indices: Sequence[int]) -> Tensor:
-        """Return the (H, W, 3) median over time of the pictures of a camera that stands still."""
+        """Return the (H, W, 3) median over time of the images of a camera that stands still."""
         key = tuple(indices)
         if key not in self._medians:
-            chosen = [indices[i] for i in evenly_spaced(len(indices), MEDIAN_PICTURES)]
+            chosen = [indices[i] for i in evenly_spaced(len(indices), MEDIAN_IMAGES)]
             shown = [(255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte() for i in chosen]
             self._medians[key] = torch.stack(shown).median(dim=0).values
         return self._medians[key].float() / 255
 
 
-def foreground_of(picture: Picture) -> Tensor | None:
-    """Return (H, W) bool, the pixels that are not fully transparent; None where the picture has no alpha."""
-    return None if picture.alpha is None else picture.alpha > 0
+def foreground_of(image: Image) -> Tensor | None:
+    """Return (H, W) bool, the pixels that are not fully transparent; None where the image has no alpha."""
+    return None if image.alpha is None else image.alpha > 0
 
 
-def given_motion(picture: Picture) -> Tensor | None:
+def given_motion(image: Image) -> Tensor | None:
     """Return (H, W) bool, the pixels of which the view's motion mask says that they move; None without one."""
-    return None if picture.moves is None else picture.moves >= 0.5
+    return None if image.moves is None else image.moves >= 0.5
 
 
-def _psnr_inside(part: Tensor | None, picture: Picture, rendered: Tensor, truth: Tensor) -> float | None:
+def _psnr_inside(part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor) -> float | None:
     if part is None:
         return None
-    weights = part.float() if picture.mask is None else part * picture.mask
+    weights = part.float() if image.mask is None else part * image.mask
     return psnr(rendered, truth, weights) if int((weights > 0).sum()) >= FEWEST_PIXELS else None
 
 

@@ -14,29 +14,29 @@ import torch
 
 from dyngs.config.kinds import field_of
 from dyngs.data.capture import Capture, Split, View, all_views
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
-from dyngs.evaluate.own_poses import PoseRefinement, pictures_of_split, scores_from_own_poses
+from dyngs.evaluate.own_poses import PoseRefinement, images_of_split, scores_from_own_poses
 from dyngs.evaluate.regions import RegionName, Regions
 from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, mean_of, means_of, score_views
 from dyngs.files.write import write_text
+from dyngs.gaussians.scene import Scene, render_options
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
-from dyngs.scene import Scene, render_options
 from dyngs.training.background import evaluation_background
 from dyngs.training.views import training_cameras
 
 REGION_METRICS: dict[str, RegionName] = {
     "psnr_foreground": "foreground",
     "psnr_moving": "moving",
-    "psnr_still": "still",
+    "psnr_static": "still",
 }
 """Metrics of regions: their names, and the regions."""
 
@@ -48,18 +48,18 @@ class EvalReport:
     Attributes:
         split: which views.
         num_views, width, height: how many, and the size of the first in pixels.
-        background: name of the colour behind pictures and renders, "white" or "black".
+        background: name of the colour behind images and renders, "white" or "black".
         psnr, ssim, flip, lpips: means over the views of the per-view values.
         lpips_net: backbone that LPIPS uses, or would use.
         num_gaussians: N.
-        num_moving, moving_share: M and M / N.
+        num_moving, moving_fraction: M and M / N.
         model_mb: float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per
             Gaussian.
         field_mb: of these, the field's.
-        colour_floats: numbers per Gaussian that its colour takes, with its share of a network.
+        colour_floats: numbers per Gaussian that its colour takes, with its fraction of a network.
         fps: one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and
             metrics not counted.
-        deform_share: median share of that time that the deformation takes.
+        deform_fraction: median fraction of that time that the deformation takes.
         psnr_per_time: mean PSNR at each distinct time; empty for a still capture.
         flicker, flicker_error: see ``dyngs.evaluate.temporal``.
         seconds_train, step: how long and how far the run was trained.
@@ -67,20 +67,20 @@ class EvalReport:
         notes: anything else that a reader of the numbers should know.
         per_view: the single views.
         stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
-        psnr_person, ssim_person: means inside the box around the person, where the true picture is not transparent;
-            only of a human model, and None where pictures have no alpha.
-        psnr_black, ssim_black, lpips_black: means of the whole picture on black, as published figures of people have
+        psnr_person, ssim_person: means inside the box around the person, where the true image is not transparent;
+            only of a human model, and None where images have no alpha.
+        psnr_black, ssim_black, lpips_black: means of the whole image on black, as published figures of people have
             it; None in the same cases.
-        psnr_foreground, psnr_moving, psnr_still: means over the views that have such a region, see
+        psnr_foreground, psnr_moving, psnr_static: means over the views that have such a region, see
             ``dyngs.evaluate.regions``.
         moving_from: how it was found what moves, None where it was not.
         psnr_right, psnr_right_fitted: means of the PSNR of right halves, as the scene shows them, and after an affine
             colour fitted on left halves, see ``dyngs.evaluate.half_fit``; None where a half has no pixel that counts.
         track_error_px, track_within_5px, track_motion_px: see ``dyngs.evaluate.tracks``.
-        psnr_own_poses: PSNR from poses refined on the pictures themselves, of cameras (``dyngs.evaluate.own_poses``)
+        psnr_own_poses: PSNR from poses refined on the images themselves, of cameras (``dyngs.evaluate.own_poses``)
             or of the body (``dyngs.human.avatar.pose_fit``); None where that was not asked for.
         own_poses: of a person, all scores from these poses.
-        silhouette_poses: of a person, all scores from poses fitted to the silhouettes of these pictures alone.
+        silhouette_poses: of a person, all scores from poses fitted to the silhouettes of these images alone.
     """
 
     split: str
@@ -95,12 +95,12 @@ class EvalReport:
     lpips_net: str
     num_gaussians: int
     num_moving: int
-    moving_share: float
+    moving_fraction: float
     model_mb: float
     field_mb: float
     colour_floats: float
     fps: float
-    deform_share: float
+    deform_fraction: float
     seconds_train: float
     step: int
     flicker: float | None = None
@@ -114,7 +114,7 @@ class EvalReport:
     stored_mb: float | None = None
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
-    psnr_still: float | None = None
+    psnr_static: float | None = None
     moving_from: str | None = None
     track_error_px: float | None = None
     track_within_5px: float | None = None
@@ -150,12 +150,12 @@ def evaluate_run(
         lpips_net: "alex", "vgg" or "squeeze".
         threads: for rendering and metrics; 0 leaves the number as it is.
         refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
-            pictures themselves; always done for a run that refined its cameras.
-        device: "auto", "cpu" or "cuda": draws the views, and compares pictures, but for FLIP.
+            images themselves; always done for a run that refined its cameras.
+        device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
 
     Raises:
-        DyngsError: no such run or split, unreadable pictures, a render or metric that is not finite, unwritable folder,
-            poses of training views that are to be refined, no card that can be used.
+        DyngsError: no such run or split, unreadable images, a render or metric that is not finite, unwritable folder,
+            poses of training views that are to be refined, no GPU that can be used.
     """
     draws_on = device_for(device)
     _require_untrained(run_dir, split, refine_poses)
@@ -166,11 +166,11 @@ def evaluate_run(
     scene = scene_of_split(run, capture, split).to(draws_on)
     drawing = Drawing(scene, render_options(run.config.model), colour.to(draws_on))
     with _num_threads(threads):
-        loader = pictures_of_split(capture, views, run_dir, run)
+        loader = images_of_split(capture, views, run_dir, run)
         loader.device = draws_on
         regions = Regions(views, loader, drawing.background)
-        pictures, lpips = (loader[i] for i in range(len(loader))), load_lpips(lpips_net, draws_on)
-        scores, reasons = score_views(scene, pictures, drawing.options, drawing.background, lpips, regions)
+        images, lpips = (loader[i] for i in range(len(loader))), load_lpips(lpips_net, draws_on)
+        scores, reasons = score_views(scene, images, drawing.options, drawing.background, lpips, regions)
         temporal = _temporal(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
@@ -203,7 +203,7 @@ def _written(run_dir: Path, report: EvalReport) -> EvalReport:
 def _require_untrained(run_dir: Path, split: str, refine_poses: bool) -> None:
     if refine_poses and split == "train":
         raise DyngsError(
-            f"{run_dir}: --refine is for pictures that were not trained on; name them with --split test, val or pose"
+            f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"
         )
 
 
@@ -211,17 +211,17 @@ def _own_poses(fitted: PoseRefinement) -> dict[str, Any]:
     """Return the fields of a report on refined poses."""
     return {
         "psnr_own_poses": fitted.psnr,
-        "own_poses": fitted.to_pictures,
+        "own_poses": fitted.to_images,
         "silhouette_poses": fitted.to_silhouettes,
     }
 
 
 def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
-    """Return the fields of a report that no picture is needed for."""
+    """Return the fields of a report that no image is needed for."""
     return {
         "num_gaussians": len(scene),
-        "num_moving": 0 if scene.is_still else scene.num_moving,
-        "moving_share": scene.moving_share,
+        "num_moving": 0 if scene.is_static else scene.num_moving,
+        "moving_fraction": scene.moving_fraction,
         "model_mb": parameter_megabytes(scene),
         "field_mb": 4e-6 * scene.num_motion_values,
         "colour_floats": scene.num_colour_values / max(len(scene), 1),
@@ -232,12 +232,12 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
 
 
 def _sizes_and_speed(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the size of the first picture, and how fast all were drawn."""
+    """Return the size of the first image, and how fast all were drawn."""
     return {
         "width": scores[0].width,
         "height": scores[0].height,
         "fps": 1 / median(s.render_seconds for s in scores),
-        "deform_share": median(s.deform_seconds / s.render_seconds for s in scores),
+        "deform_fraction": median(s.deform_seconds / s.render_seconds for s in scores),
     }
 
 
@@ -261,7 +261,7 @@ def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> Ev
         report,
         psnr_foreground=means["foreground"],
         psnr_moving=means["moving"],
-        psnr_still=means["still"],
+        psnr_static=means["still"],
         psnr_right=right,
         psnr_right_fitted=fitted,
         moving_from=regions.moving_from,
@@ -303,7 +303,7 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
     return avatar.playing(shown.clip)
 
 
-def _temporal(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> dict[str, MetricValue]:
+def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> dict[str, MetricValue]:
     """Return the flicker of a split, and the error of its changes in time."""
     return {
         "flicker": flicker_of_split(drawing, loader, views),
@@ -337,7 +337,7 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
         )
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
-    if field_of(run.config) is not None and run.scene.is_still:
+    if field_of(run.config) is not None and run.scene.is_static:
         notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")

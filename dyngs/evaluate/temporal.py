@@ -1,7 +1,7 @@
-"""Quality of a model over time: at each moment, and the flicker of its pictures before a fixed camera.
+"""Quality of a model over time: at each moment, and the flicker of its images before a fixed camera.
 
 Both measures of flicker are in grey levels of 255 and mean absolute values over pixels, channels and moments, of
-pictures clamped to [0, 1]. Local letters: R a rendered picture, G the true one, t its time, k moments in order.
+images clamped to [0, 1]. Local letters: R a rendered image, G the true one, t its time, k moments in order.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Scene
 from dyngs.metrics import MetricValue
-from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene
 
 MAX_MOMENTS = 60
 """Number of training times up to which flicker is measured at all of them."""
 
 _SAMPLED_TRIPLES = MAX_MOMENTS // 3
-_NO_TIMES = "the pictures have no times"
+_NO_TIMES = "the images have no times"
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Drawing:
     background: Tensor
 
     @torch.no_grad()
-    def picture(self, cameras: Cameras, time: float | None) -> Tensor:
-        """Return the picture (H, W, 3) of the one camera at ``time``, clamped to [0, 1]."""
+    def image(self, cameras: Cameras, time: float | None) -> Tensor:
+        """Return the image (H, W, 3) of the one camera at ``time``, clamped to [0, 1]."""
         drawn = self.scene.render(cameras, time, options=self.options, background=self.background)
         return drawn.rgb[0].clamp(0, 1)
 
@@ -99,21 +99,21 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
         cameras: one camera.
         times: distinct, ascending; those of training.
     """
-    if drawing.scene.is_still:
+    if drawing.scene.is_static:
         return MetricValue(0.0)
     if len(times) < 3:
         return MetricValue(None, f"needs at least three training times, there are {len(times)}")
     seen: dict[int, Tensor] = {}
     values = []
     for k in _middles(len(times)):
-        seen = {i: seen[i] if i in seen else drawing.picture(cameras, times[i]) for i in (k - 1, k, k + 1)}
+        seen = {i: seen[i] if i in seen else drawing.image(cameras, times[i]) for i in (k - 1, k, k + 1)}
         before, now, after = (times[i] for i in (k - 1, k, k + 1))
         line = torch.lerp(seen[k + 1], seen[k - 1], (after - now) / (after - before))
         values.append(2 * 255 * _mean_change(line, seen[k]))
     return MetricValue(fmean(values))
 
 
-def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> MetricValue:
+def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
     """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time, at fixed cameras.
 
     Over all neighbours in time of each pose that has several times; a mask leaves out what does not count in one of
@@ -121,7 +121,7 @@ def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]
 
     Args:
         drawing: what is drawn.
-        loader: pictures of ``views``, in their order.
+        loader: images of ``views``, in their order.
         views: one split.
     """
     if all(view.time is None for view in views):
@@ -140,7 +140,7 @@ def flicker_error(drawing: Drawing, loader: PictureLoader, views: Sequence[View]
     return MetricValue(255 * total / weight)
 
 
-def flicker_of_split(drawing: Drawing, loader: PictureLoader, views: Sequence[View]) -> MetricValue:
+def flicker_of_split(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
     """Return ``flicker`` before the first camera of the split, at the training times."""
     if all(view.time is None for view in views):
         return MetricValue(None, _NO_TIMES)
@@ -154,11 +154,11 @@ def _middles(num_times: int) -> list[int]:
     return np.linspace(1, num_times - 2, _SAMPLED_TRIPLES).round().astype(int).tolist()
 
 
-def _signed_error(drawing: Drawing, picture: Picture) -> tuple[Tensor, Tensor]:
+def _signed_error(drawing: Drawing, image: Image) -> tuple[Tensor, Tensor]:
     """Return (H, W, 3) render minus truth and its mask (H, W): R' - R - (G' - G) is the difference of two of them."""
-    truth = picture.composite(drawing.background).clamp(0, 1)
-    counts = torch.ones(truth.shape[:2], device=truth.device) if picture.mask is None else picture.mask
-    return drawing.picture(picture.cameras, picture.time) - truth, counts
+    truth = image.composite(drawing.background).clamp(0, 1)
+    counts = torch.ones(truth.shape[:2], device=truth.device) if image.mask is None else image.mask
+    return drawing.image(image.cameras, image.time) - truth, counts
 
 
 def _mean_change(a: Tensor, b: Tensor) -> float:

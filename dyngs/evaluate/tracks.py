@@ -16,7 +16,7 @@ from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.times import SAME_TIME
 from dyngs.data.true_tracks import TRACKS_FILE, TrueTracks
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 
 CARRIERS = 4
 """K, nearest Gaussians that carry a point, weighted by opacity."""
@@ -34,8 +34,8 @@ class TrackScores:
     """Errors of tracks over all pairs of a view and a point that it shows; None where ``reason`` says why.
 
     Attributes:
-        error_px: mean distance in the picture between where the model carries a point and where it truly is.
-        within_5px: share of distances below ``CLOSE_PX``.
+        error_px: mean distance in the image between where the model carries a point and where it truly is.
+        within_5px: fraction of distances below ``CLOSE_PX``.
         motion_px: mean distance of a model in which nothing moves, for comparison.
     """
 
@@ -51,15 +51,15 @@ def track_scores(
     split: Sequence[tuple[View, Cameras]],
     views: Sequence[View],
 ) -> TrackScores:
-    """Return the errors of a scene's motion in the pictures of a split.
+    """Return the errors of a scene's motion in the images of a split.
 
     Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any
-    view shows it; from there their mean displacement carries it. Distances are at most the diagonal of the picture.
+    view shows it; from there their mean displacement carries it. Distances are at most the diagonal of the image.
 
     Args:
         scene: whose motion is measured.
         tracks: of its capture, in the same world; None without any.
-        split: views that are measured, each with its camera at the size of the evaluated picture.
+        split: views that are measured, each with its camera at the size of the evaluated image.
         views: of all splits.
     """
     if tracks is None:

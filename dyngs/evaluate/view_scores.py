@@ -15,16 +15,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.people import person_scores
 from dyngs.evaluate.regions import Regions, RegionScores
+from dyngs.gaussians.rendering import Rendering, RenderOptions
+from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, flip, psnr, ssim
 from dyngs.ops.device import finish
-from dyngs.rendering import Rendering, RenderOptions
-from dyngs.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ViewScore:
 
     ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. Of people, ``psnr_person``
     and ``ssim_person`` are those inside the person's box, and ``psnr_black``, ``ssim_black`` and ``lpips_black`` those
-    of the whole picture on black.
+    of the whole image on black.
     """
 
     name: str
@@ -50,7 +50,7 @@ class ViewScore:
     ssim_person: float | None = None
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
-    psnr_still: float | None = None
+    psnr_static: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
     psnr_black: float | None = None
@@ -81,56 +81,56 @@ class PoseScores:
 
 def score_views(
     scene: Scene,
-    pictures: Iterable[Picture],
+    images: Iterable[Image],
     options: RenderOptions,
     background: Tensor,
     lpips: Lpips,
     regions: Regions | None = None,
 ) -> tuple[list[ViewScore], dict[str, str]]:
-    """Return scores of the Gaussians against pictures, and the reasons for metrics that are None.
+    """Return scores of the Gaussians against images, and the reasons for metrics that are None.
 
     Args:
-        scene: what to draw, at the time of each picture; on the device of all else.
-        pictures: truth and camera of each view, drawn one at a time.
+        scene: what to draw, at the time of each image; on the device of all else.
+        images: truth and camera of each view, drawn one at a time.
         options: as in training, without depth.
         background: (3,) colour behind both the truth and the render.
         lpips: from ``load_lpips``.
-        regions: of the split of the pictures; None: they are not measured.
+        regions: of the split of the images; None: they are not measured.
 
     Raises:
         DyngsError: a value that is not finite, naming the view.
     """
     scores: list[ViewScore] = []
     reasons: dict[str, str] = {}
-    for picture in pictures:
+    for image in images:
         if not scores:
-            _timed_render(scene, picture, options, background)  # the warm-up
-        rendering, seconds, deform_seconds = _timed_render(scene, picture, options, background)
+            _timed_render(scene, image, options, background)  # the warm-up
+        rendering, seconds, deform_seconds = _timed_render(scene, image, options, background)
         rendered = rendering.rgb[0]
         if not rendered.isfinite().all():
-            raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
-        truth, mask = picture.composite(background), picture.mask
-        people = {} if avatar_of(scene) is None else person_scores(picture, rendering, background, lpips)
-        parts = RegionScores() if regions is None else regions.scores(picture, rendered, truth)
-        halves = right_half_scores(picture, rendering, background)
+            raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
+        truth, mask = image.composite(background), image.mask
+        people = {} if avatar_of(scene) is None else person_scores(image, rendering, background, lpips)
+        parts = RegionScores() if regions is None else regions.scores(image, rendered, truth)
+        halves = right_half_scores(image, rendering, background)
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
         for name, metric in optional.items():
             if metric.reason is not None:
                 reasons.setdefault(name, metric.reason)
         score = ViewScore(
-            name=picture.name,
-            width=picture.cameras.width,
-            height=picture.cameras.height,
+            name=image.name,
+            width=image.cameras.width,
+            height=image.cameras.height,
             psnr=psnr(rendered, truth, mask),
             ssim=ssim(rendered, truth, mask),
             flip=optional["flip"].value,
             lpips=optional["lpips"].value,
             render_seconds=seconds,
             deform_seconds=deform_seconds,
-            time=picture.time,
+            time=image.time,
             psnr_foreground=parts.foreground,
             psnr_moving=parts.moving,
-            psnr_still=parts.still,
+            psnr_static=parts.still,
             psnr_right=halves.plain,
             psnr_right_fitted=halves.fitted,
             **people,
@@ -153,17 +153,17 @@ def mean_of(values: Sequence[float | None]) -> float | None:
 
 
 def _timed_render(
-    scene: Scene, picture: Picture, options: RenderOptions, background: Tensor
+    scene: Scene, image: Image, options: RenderOptions, background: Tensor
 ) -> tuple[Rendering, float, float]:
     """Return the rendering, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
         device = scene.gaussians.means.device
         finish(device)
         start = time.perf_counter()
-        moment = scene.moment(picture.time)
+        moment = scene.moment(image.time)
         finish(device)
         deformed = time.perf_counter()
-        rendering = scene.render(picture.cameras, moment, options=options, background=background)
+        rendering = scene.render(image.cameras, moment, options=options, background=background)
         finish(device)
         end = time.perf_counter()
     return rendering, end - start, deformed - start
@@ -174,5 +174,5 @@ def _require_finite(score: ViewScore, mask: Tensor | None) -> None:
         value = getattr(score, name)
         if value is not None and not math.isfinite(value):
             empty = mask is not None and not bool((mask > 0).any())
-            why = "its mask ignores every pixel" if empty else "the picture holds NaN or Inf"
+            why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
             raise DyngsError(f"view {score.name!r}: {name} is not finite, {why}")

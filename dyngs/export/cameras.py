@@ -21,7 +21,7 @@ _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 def write_cameras(path: Path, capture: Capture, splits: Mapping[Split, Sequence[View]]) -> Path:
     """Write cameras in nerfstudio's layout, and the capture's points beside them; return ``path``.
 
-    Pictures stay where they are: ``file_path`` is the way to them from the folder of ``path``. Poses are in the world
+    Images stay where they are: ``file_path`` is the way to them from the folder of ``path``. Poses are in the world
     of the capture's files. Coefficients of distortion are those of the capture.
 
     Args:

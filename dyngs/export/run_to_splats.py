@@ -12,11 +12,11 @@ from typing import Literal
 
 import torch
 
-from dyngs.colour.bake import with_harmonics
 from dyngs.errors import DyngsError
 from dyngs.files.temporary import temporary_folder_beside
+from dyngs.gaussians.colour.bake import with_harmonics
+from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import LoadedRun, load_run
-from dyngs.scene import Scene
 from dyngs.splats.formats import Written, turned_file, write_splats
 from dyngs.splats.splat_file import SplatFile
 
@@ -138,7 +138,7 @@ def splats_at(run: LoadedRun, scene: Scene, time: float, how: Writing = AS_THEY_
     with torch.no_grad():
         moment = scene.moment(time)
     gaussians, shader = moment.gaussians, scene.shader(moment)
-    comments = [f"step: {run.step}"] if scene.is_still else [f"step: {run.step}", f"dyngs time {time!r}"]
+    comments = [f"step: {run.step}"] if scene.is_static else [f"step: {run.step}", f"dyngs time {time!r}"]
     if shader is not None:
         baked = with_harmonics(gaussians, shader)
         gaussians = baked.gaussians

@@ -1,4 +1,4 @@
-"""A finished run as one small file, and what that does to its pictures."""
+"""A finished run as one small file, and what that does to its images."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch import Tensor
 from dyngs.build import restored_scene
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
+from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
-from dyngs.scene import Scene
 from dyngs.storage.drawable import FIELD, drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
@@ -23,7 +23,7 @@ from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
 from dyngs.training.state import Checkpoint
 
 MISSED = 1.05
-"""A file whose pictures change by so many times what is allowed is not written; less is rounding of the drawing."""
+"""A file whose images change by so many times what is allowed is not written; less is rounding of the drawing."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class SceneFile:
 
     Attributes:
         path: of the file.
-        precision: steps, and how much the pictures change.
+        precision: steps, and how much the images change.
         num_bytes: of the file.
         num_bytes_exact: of the same tensors before, 4 bytes per value.
     """
@@ -49,12 +49,12 @@ def write_scene_file(run_dir: Path, out: Path, max_change: float | None = None, 
     Args:
         run_dir: a run with a checkpoint.
         out: a folder, made where it is missing; it may be the run's own, or hold a former export of that run.
-        max_change: root mean square over all values of some training pictures, grey levels of 255. None: what lowers
+        max_change: root mean square over all values of some training images, grey levels of 255. None: what lowers
             their PSNR by ``LOSS_DB``, if it is independent of the model's own errors.
         field_step: how many times as coarsely as that the field is rounded.
 
     Raises:
-        DyngsError: no such run, ``out`` holds another one, the pictures would change by more than ``max_change``, or
+        DyngsError: no such run, ``out`` holds another one, the images would change by more than ``max_change``, or
             the file cannot be written. Nothing is written then.
     """
     config = load_resolved(run_dir)
@@ -65,9 +65,9 @@ def write_scene_file(run_dir: Path, out: Path, max_change: float | None = None, 
         precision = plan.precision
         steps = {name: step * (field_step if name.startswith(FIELD) else 1) for name, step in precision.steps.items()}
         data = encoded(SceneInfo(**asdict(checkpoint.info)), scene, steps, plan.coarseness)
-        if plan.pictures is not None and precision.allowed is not None and field_step == 1:
+        if plan.images is not None and precision.allowed is not None and field_step == 1:
             stored = restored_scene(Checkpoint(checkpoint.info, decoded(data).tensors), config.model)
-            precision = _checked(run_dir, precision, plan.pictures(scene), plan.pictures(stored))
+            precision = _checked(run_dir, precision, plan.images(scene), plan.images(stored))
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
             write_config(config, folder)
@@ -75,7 +75,7 @@ def write_scene_file(run_dir: Path, out: Path, max_change: float | None = None, 
 
 
 def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], after: Sequence[Tensor]) -> Precision:
-    """The precision with the change from the pictures ``before`` to those of the file.
+    """The precision with the change from the images ``before`` to those of the file.
 
     Raises:
         DyngsError: it is more than what is allowed.
@@ -83,7 +83,7 @@ def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], afte
     change = GREY_LEVELS * math.sqrt(mean_square_change(before, after))
     if precision.allowed is not None and not change <= MISSED * precision.allowed:
         raise DyngsError(
-            f"{run_dir}: stored in little space, pictures would change by {change:.2g} grey levels of 255, more "
+            f"{run_dir}: stored in little space, images would change by {change:.2g} grey levels of 255, more "
             f"than the {precision.allowed:.2g} allowed; nothing was written. Give a larger --max-change"
         )
     return replace(precision, change=change)

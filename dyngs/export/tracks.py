@@ -12,7 +12,7 @@ import torch
 from dyngs.errors import DyngsError
 from dyngs.export.run_to_splats import scene_part
 from dyngs.files.write import atomic_file
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 
 MAX_BYTES = 4_000_000_000
 """Largest size of the positions, which are held in memory."""
@@ -52,8 +52,8 @@ def tracks_of(
     """
     device = scene.gaussians.means.device
     moves = torch.zeros(len(scene), dtype=torch.bool, device=device)
-    moves[scene.rows] = not scene.is_still
-    moving = scene_part(scene, "moving") if part == "moving" or not scene.is_still else None
+    moves[scene.rows] = not scene.is_static
+    moving = scene_part(scene, "moving") if part == "moving" or not scene.is_static else None
     ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
     kind = np.float64 if any(world_offset) else np.float32
     _require_room(len(ids), len(times), np.dtype(kind).itemsize)

@@ -1,7 +1,7 @@
-"""Containment of untrusted captures: their files must lie in their folder, their pictures must not be too large.
+"""Containment of untrusted captures: their files must lie in their folder, their images must not be too large.
 
-A capture may name any file of the user as one of its pictures, by a link, an absolute path or ``..``, and a picture of
-a few kilobytes may fill all memory. Every path is checked here before it is opened, every picture before it is decoded.
+A capture may name any file of the user as one of its images, by a link, an absolute path or ``..``, and an image of
+a few kilobytes may fill all memory. Every path is checked here before it is opened, every image before it is decoded.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from dyngs.errors import DyngsError, require_regular
 
 MAX_MEGAPIXELS = 150.0
-"""Default of ``data.max_megapixels``: 1e6 pixels that a picture may have."""
+"""Default of ``data.max_megapixels``: 1e6 pixels that an image may have."""
 _MAX_LISTED = 100_000
 """Entries of a capture that are searched for links."""
 
@@ -54,8 +54,8 @@ def staying_within(root: Path, follow_links: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def pictures_up_to(megapixels: float) -> Iterator[None]:
-    """Set how many 1e6 pixels a picture may have in the block, instead of ``MAX_MEGAPIXELS``."""
+def images_up_to(megapixels: float) -> Iterator[None]:
+    """Set how many 1e6 pixels an image may have in the block, instead of ``MAX_MEGAPIXELS``."""
     token = _max_megapixels.set(megapixels)
     try:
         yield
@@ -87,7 +87,7 @@ def _require_below(boundary: _Boundary, path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
-    """Check that a picture is not too large to be decoded; more than four channels count in proportion.
+    """Check that an image is not too large to be decoded; more than four channels count in proportion.
 
     Raises:
         DyngsError: it has more pixels than are allowed; says how many and which key allows more.
@@ -97,12 +97,12 @@ def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
         many = f" of {channels} channels" if channels > 4 else ""
         raise DyngsError(
             f"{path}: {width}x{height} pixels{many} are {megapixels:.5g} megapixels, but data.max_megapixels is "
-            f"{limit:g}; shrink the picture, or raise it if there is memory for that (some 30 MB per megapixel)"
+            f"{limit:g}; shrink the image, or raise it if there is memory for that (some 30 MB per megapixel)"
         )
 
 
 def max_decoded_mb() -> int:
-    """Return the 2^20 bytes that the largest allowed picture takes with four channels of floats."""
+    """Return the 2^20 bytes that the largest allowed image takes with four channels of floats."""
     return max(1, round(_max_megapixels.get() * 16e6 / 2**20))
 
 

@@ -1,4 +1,4 @@
-"""Atomic writing of files, text and pictures: a file appears complete or not at all."""
+"""Atomic writing of files, text and images: a file appears complete or not at all."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.errors import DyngsError
-from dyngs.files.picture_errors import picture_error
+from dyngs.files.image_errors import image_error
 from dyngs.files.temporary import temporary_beside
 
 
@@ -61,7 +61,7 @@ def write_text(path: Path, text: str, *, durable: bool = False) -> None:
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """Write a picture, atomically; the suffix names the format.
+    """Write an image, atomically; the suffix names the format.
 
     Args:
         path: ``.png`` or ``.jpg`` (8 bit), ``.exr`` (float32), or what else OpenImageIO writes.
@@ -86,16 +86,16 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     with atomic_file(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
-            picture_error(oiio)  # must be fetched, or it is printed when the program ends
+            image_error(oiio)  # must be fetched, or it is printed when the program ends
             raise DyngsError(f"cannot write {path}: no format has the suffix '{path.suffix}' (use .png or .exr)")
         written = output.open(str(temporary), spec) and output.write_image(np.ascontiguousarray(pixels))
-        problem = picture_error(output)
+        problem = image_error(output)
         if not (output.close() and written):
-            raise DyngsError(f"cannot write {path}: {problem or picture_error(output) or 'unknown error'}")
+            raise DyngsError(f"cannot write {path}: {problem or image_error(output) or 'unknown error'}")
 
 
 def to_uint8(pixels: np.ndarray) -> np.ndarray:
-    """Return the picture as uint8; floats in [0, 1] are rounded, NaN becomes 0."""
+    """Return the image as uint8; floats in [0, 1] are rounded, NaN becomes 0."""
     if pixels.dtype == np.uint8:
         return pixels
     clean = np.nan_to_num(pixels.astype(np.float32), nan=0.0)

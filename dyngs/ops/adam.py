@@ -14,7 +14,7 @@ from dyngs.ops.registration import has_kernel, register
 from dyngs.ops.transfer import sent
 
 Count: TypeAlias = int | Tensor
-"""A number, or a tensor () of one that may still be on a card, where ``int`` waits for it."""
+"""A number, or a tensor () of one that may still be on a GPU, where ``int`` waits for it."""
 
 
 def _adam_step(

@@ -1,4 +1,4 @@
-"""Which device computes: the CPU, or a CUDA card where torch, its driver and the compiled core can use one."""
+"""Which device computes: the CPU, or a CUDA GPU where torch, its driver and the compiled core can use one."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from dyngs.ops.options import check_choice
 CPU = torch.device("cpu")
 CHOICES = ("auto", "cpu", "cuda")
 OLDEST = (7, 5)
-"""Compute capability of the oldest cards that the kernels are compiled for."""
+"""Compute capability of the oldest GPUs that the kernels are compiled for."""
 
 _TORCH = "install a torch for CUDA, see pytorch.org"
 _BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc (docs/gpu.md)"
 
 
 def device_for(choice: str) -> torch.device:
-    """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a card where one can be used, else the CPU.
+    """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a GPU where one can be used, else the CPU.
 
     Raises:
-        DyngsError: ``cuda`` where no card can be used, in one line with the reason and what to do; or another choice.
+        DyngsError: ``cuda`` where no GPU can be used, in one line with the reason and what to do; or another choice.
     """
     check_choice("device", choice, CHOICES)
     if choice == "cpu":
         return CPU
-    reason = why_no_card()
+    reason = why_no_gpu()
     if reason is None:
         return torch.device("cuda", torch.cuda.current_device())
     if choice == "cuda":
@@ -43,26 +43,26 @@ def device_for(choice: str) -> torch.device:
 
 
 def why_on_cpu(choice: str) -> str | None:
-    """Return a line on why ``choice`` means the CPU although the machine seems to have a card; None otherwise."""
+    """Return a line on why ``choice`` means the CPU although the machine seems to have a GPU; None otherwise."""
     if choice != "auto" or not has_driver():
         return None
-    reason = why_no_card()
+    reason = why_no_gpu()
     return None if reason is None else f"computing on the CPU: {reason}; device=cpu ends this line"
 
 
-def card_memory(device: torch.device) -> tuple[int, int] | None:
-    """Return the bytes of a card's memory that nobody has taken, and all that it has; None where it is no card."""
+def gpu_memory(device: torch.device) -> tuple[int, int] | None:
+    """Return the bytes of a GPU's memory that nobody has taken, and all that it has; None where it is no GPU."""
     return torch.cuda.mem_get_info(device) if device.type == "cuda" else None
 
 
-def num_cards() -> int:
-    """Return the number of cards, at least 1."""
+def num_gpus() -> int:
+    """Return the number of GPUs, at least 1."""
     return max(torch.cuda.device_count(), 1)
 
 
 @contextmanager
 def deterministic(device: torch.device, wanted: bool = True) -> Generator[None]:
-    """Let torch's operators on a card give the same bytes every time, inside this context; ours always do.
+    """Let torch's operators on a GPU give the same bytes every time, inside this context; ours always do.
 
     Where torch has no such operator it warns. The CPU's need nothing of this.
     """
@@ -94,33 +94,33 @@ def has_driver() -> bool:
 
 
 @cache
-def why_no_card() -> str | None:
-    """Return why no card can be used and what to do, beginning with a small letter; None where one can be."""
+def why_no_gpu() -> str | None:
+    """Return why no GPU can be used and what to do, beginning with a small letter; None where one can be."""
     if torch.version.cuda is None:
         return f"this torch ({torch.__version__}) is built without CUDA: {_TORCH}"
     if not torch.cuda.is_available():
         return _why_torch_has_none()
     if not has_cuda_core():
-        return f"dyngs was built without its kernels for cards: {_BUILD}"
+        return f"dyngs was built without its kernels for GPUs: {_BUILD}"
     return _why_kernels_fail()
 
 
 def _why_torch_has_none() -> str:
-    """Return why torch, built with CUDA, finds no card."""
+    """Return why torch, built with CUDA, finds no GPU."""
     try:
         torch.cuda.init()
     except Exception as error:  # of torch: RuntimeError, or an AssertionError where it was built otherwise
         found = str(error).splitlines()[0].rstrip(".").partition(" Please ")[0].rstrip(".")
         if "too old" in found:
-            return f"{found}: update the driver of the card, or {_TORCH.replace('CUDA', 'an older CUDA')}"
+            return f"{found}: update the driver of the GPU, or {_TORCH.replace('CUDA', 'an older CUDA')}"
         if "no NVIDIA driver" in found.lower() or "no nvidia driver" in found.lower():
             return "no driver of NVIDIA is there: install it"
-        return f"torch finds no card ({found}): see `nvidia-smi`"
-    return "torch finds no card: see `nvidia-smi`, and CUDA_VISIBLE_DEVICES if it is set"
+        return f"torch finds no GPU ({found}): see `nvidia-smi`"
+    return "torch finds no GPU: see `nvidia-smi`, and CUDA_VISIBLE_DEVICES if it is set"
 
 
 def _why_kernels_fail() -> str | None:
-    """Return why the kernels cannot run on the card that torch has found; None where they can."""
+    """Return why the kernels cannot run on the GPU that torch has found; None where they can."""
     try:
         core = cuda_core()
     except DyngsError as error:
@@ -132,32 +132,32 @@ def _why_kernels_fail() -> str | None:
     capability = torch.cuda.get_device_capability()
     if capability < OLDEST:
         found, least = (f"{x[0]}.{x[1]}" for x in (capability, OLDEST))
-        return f"{torch.cuda.get_device_name()} has compute capability {found}, and {least} is needed: use another card"
+        return f"{torch.cuda.get_device_name()} has compute capability {found}, and {least} is needed: use another GPU"
     return None
 
 
 def findings() -> Mapping[str, str]:
-    """Return what there is of torch's CUDA, driver, card and compiled core, by name; for ``dyngs doctor``."""
+    """Return what there is of torch's CUDA, driver, GPU and compiled core, by name; for ``dyngs doctor``."""
     version = torch.version.cuda
     found = {"torch for": "the CPU alone" if version is None else f"CUDA {version}"}
     if has_cuda_core():
         try:
             core = cuda_core()
         except DyngsError as error:
-            return found | {"kernels for cards": str(error)}
-        found["kernels for cards"] = f"built with CUDA {_said(core.runtime_version())}"
+            return found | {"kernels for GPUs": str(error)}
+        found["kernels for GPUs"] = f"built with CUDA {_said(core.runtime_version())}"
         driver = core.driver_version()
         found["driver"] = f"knows CUDA {_said(driver)}" if driver else "none"
     else:
-        found["kernels for cards"] = "not built"
+        found["kernels for GPUs"] = "not built"
         found["driver"] = "there" if has_driver() else "none"
     if version is not None and torch.cuda.is_available():
         major, minor = torch.cuda.get_device_capability()
         gigabytes = torch.cuda.mem_get_info()[1] / 1e9
         name = torch.cuda.get_device_name()
-        found["card"] = f"{name}, compute capability {major}.{minor}, {gigabytes:.0f} GB"
+        found["GPU"] = f"{name}, compute capability {major}.{minor}, {gigabytes:.0f} GB"
     else:
-        found["card"] = "none"
+        found["GPU"] = "none"
     return found
 
 

@@ -17,19 +17,19 @@ REMEDY = "lower the resolution, the scales or the number of views"
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise an error unless pictures of this size can be drawn.
+    """Raise an error unless images of this size can be drawn.
 
     Raises:
         DyngsError: a side below 1 or above ``MAX_SIDE``.
     """
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise DyngsError(f"render refused: a picture of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px")
+        raise DyngsError(f"render refused: an image of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px")
 
 
 def check_memory(size: int, what: str, like: Tensor) -> None:
     """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and RLIMIT_AS leave free.
 
-    Only where ``like`` lies on the CPU: in a card's memory torch itself refuses what does not fit.
+    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit.
 
     Raises:
         DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)

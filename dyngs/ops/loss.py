@@ -1,4 +1,4 @@
-"""Fused L1 + SSIM loss of one picture, and SSIM as a measure.
+"""Fused L1 + SSIM loss of one image, and SSIM as a measure.
 
 In float32 the value and its gradient come from one native call; in other dtypes, and on devices without an
 implementation, from the plain torch formula, which is also the reference of the tests.
@@ -68,19 +68,19 @@ def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mas
     """Return the training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, differentiable in ``rendered``.
 
     L1 is the mean of ``|x - y|``; SSIM is the mean over pixels and channels of the SSIM map with an 11x11 Gaussian
-    window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both pictures are multiplied by it, and
+    window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both images are multiplied by it, and
     both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``; a mask of
-    zeros gives a loss of 0. In float32 on the CPU only first derivatives exist. Pictures may have any finite values:
+    zeros gives a loss of 0. In float32 on the CPU only first derivatives exist. Images may have any finite values:
     where they go beyond about 2, SSIM is computed in float64.
 
     Args:
-        rendered: (H, W, 3) picture x, any strides. Half precision is computed in float32.
-        target: (H, W, 3) picture y, a constant: no gradient flows to it.
-        ssim_weight: share of the SSIM part, in [0, 1]; at 0 no SSIM is computed.
+        rendered: (H, W, 3) image x, any strides. Half precision is computed in float32.
+        target: (H, W, 3) image y, a constant: no gradient flows to it.
+        ssim_weight: fraction of the SSIM part, in [0, 1]; at 0 no SSIM is computed.
         mask: (H, W) weights in [0, 1], a constant.
 
     Raises:
-        DyngsError: shapes that do not fit, an empty picture, or integer pictures.
+        DyngsError: shapes that do not fit, an empty image, or integer images.
     """
     _check(rendered, target, mask)
     x, y, m = _in_common_precision(rendered, target, mask)
@@ -91,7 +91,7 @@ def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mas
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Return the mean SSIM () of two (H, W, 3) pictures in [0, 1], differentiable in ``a``; see `l1_ssim_loss`."""
+    """Return the mean SSIM () of two (H, W, 3) images in [0, 1], differentiable in ``a``; see `l1_ssim_loss`."""
     return 1 - l1_ssim_loss(a, b, ssim_weight=1.0)
 
 
@@ -108,7 +108,7 @@ def reference_l1_ssim(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """Return the (H, W, 3) structural similarity of two pictures (Wang et al. 2004).
+    """Return the (H, W, 3) structural similarity of two images (Wang et al. 2004).
 
     Computed in float64, because the difference of second moments that gives a variance cancels.
     """
@@ -127,13 +127,13 @@ def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
 
 def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
     if rendered.ndim != 3 or rendered.shape[2] != 3 or rendered.numel() == 0:
-        raise DyngsError(f"loss: the rendered picture must be (H, W, 3) and not empty, got {tuple(rendered.shape)}")
+        raise DyngsError(f"loss: the rendered image must be (H, W, 3) and not empty, got {tuple(rendered.shape)}")
     if target.shape != rendered.shape:
-        raise DyngsError(f"loss: the target is {tuple(target.shape)}, but the picture {tuple(rendered.shape)}")
+        raise DyngsError(f"loss: the target is {tuple(target.shape)}, but the image {tuple(rendered.shape)}")
     if mask is not None and mask.shape != rendered.shape[:2]:
         raise DyngsError(f"loss: the mask must be (H, W) = {tuple(rendered.shape[:2])}, got {tuple(mask.shape)}")
     if not (rendered.is_floating_point() and target.is_floating_point()):
-        raise DyngsError(f"loss: pictures must be floating point, got {rendered.dtype} and {target.dtype}")
+        raise DyngsError(f"loss: images must be floating point, got {rendered.dtype} and {target.dtype}")
 
 
 def _in_common_precision(rendered: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:

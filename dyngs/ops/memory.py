@@ -10,7 +10,7 @@ def keep_freed_memory() -> bool:
 
     Why: by default glibc takes a block of 32 MiB or more (in a fresh process 128 KiB or more) from the system at each
     allocation and gives it back at each release, and the kernel clears all its pages again at first touch. A training
-    step allocates and frees pictures and gradients of such sizes, so that much of its time goes into page faults.
+    step allocates and frees images and gradients of such sizes, so that much of its time goes into page faults.
 
     What it costs: memory once used stays with the process until it ends. As torch's aligned blocks rarely fit exactly
     where one was freed, the first steps take fresh memory until the gaps suit: expect the large temporary blocks two or

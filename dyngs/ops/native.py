@@ -1,9 +1,9 @@
-"""The compiled cores for this processor and for CUDA cards, the number of threads, and tensors passed to a core.
+"""The compiled cores for this processor and for CUDA GPUs, the number of threads, and tensors passed to a core.
 
 There is one module per x86-64 level: all of them in a wheel, that of the compiling machine in an installation from
 source. The newest that the processor runs is imported; ``DYNGS_ISA=v2|v3|v4`` picks an older one, for tests. The module
-for CUDA cards is there if dyngs was built with it (docs/gpu.md), has the same functions, and is imported when the first
-tensor on a card comes.
+for CUDA GPUs is there if dyngs was built with it (docs/gpu.md), has the same functions, and is imported when the first
+tensor on a GPU comes.
 """
 
 from __future__ import annotations
@@ -79,13 +79,13 @@ core, _ISA = _load_core()
 
 
 def has_cuda_core() -> bool:
-    """Return whether dyngs was built with its kernels for CUDA cards."""
+    """Return whether dyngs was built with its kernels for CUDA GPUs."""
     return util.find_spec(_CUDA_CORE) is not None
 
 
 @cache
 def cuda_core() -> ModuleType:
-    """Return the compiled core for CUDA cards.
+    """Return the compiled core for CUDA GPUs.
 
     Raises:
         DyngsError: it was not built, or cannot be loaded.
@@ -94,14 +94,14 @@ def cuda_core() -> ModuleType:
         return import_module(_CUDA_CORE)
     except ImportError as error:
         advice = "install with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc"
-        raise DyngsError(f"the kernels for CUDA cards are not there ({error}); {advice}") from error
+        raise DyngsError(f"the kernels for CUDA GPUs are not there ({error}); {advice}") from error
 
 
 def core_for(x: Tensor) -> ModuleType:
-    """Return the compiled core that computes where ``x`` lies; on a card it goes on in torch's current stream there.
+    """Return the compiled core that computes where ``x`` lies; on a GPU it goes on in torch's current stream there.
 
     Raises:
-        DyngsError: ``x`` is float64 on a card.
+        DyngsError: ``x`` is float64 on a GPU.
     """
     if x.device.type == "cpu":
         return core
@@ -113,7 +113,7 @@ def core_for(x: Tensor) -> ModuleType:
 
 
 def lend(size: int, device: int) -> Tensor:
-    """Return ``size`` bytes of a card's memory; called by its core, which gives them back when its work is queued."""
+    """Return ``size`` bytes of a GPU's memory; called by its core, which gives them back when its work is queued."""
     return torch.empty(size, dtype=torch.uint8, device=f"cuda:{device}")
 
 

@@ -2,7 +2,7 @@
 
 Per-Gaussian decoders of deformation fields have tens of thousands of rows but layers of only 10 to 256 features. A
 matrix product, a bias and a ReLU per layer each go through memory once per step and direction; the fused kernel runs
-all layers of a hundred rows while they are in the cache, on a card in shared memory. Its results do not depend on the
+all layers of a hundred rows while they are in the cache, on a GPU in shared memory. Its results do not depend on the
 number of threads.
 """
 
@@ -22,9 +22,9 @@ from dyngs.ops.native import array, core_for, num_threads
 from dyngs.ops.registration import Gradient, has_kernel, register
 
 KEPT_BYTES = 2**30
-"""The backward pass computes activations again where keeping them would take more memory than this, and on a card."""
-CARD_LAYERS, CARD_WIDTH = 16, 256
-"""Networks of more layers, or with more features anywhere, are computed by torch's operators on a card."""
+"""The backward pass computes activations again where keeping them would take more memory than this, and on a GPU."""
+GPU_LAYERS, GPU_WIDTH = 16, 256
+"""Networks of more layers, or with more features anywhere, are computed by torch's operators on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,8 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
 
 
 def _is_large(widths: list[int]) -> bool:
-    """Return whether the kernel of a card does not take the network."""
-    return len(widths) - 1 > CARD_LAYERS or max(widths) > CARD_WIDTH
+    """Return whether the kernel of a GPU does not take the network."""
+    return len(widths) - 1 > GPU_LAYERS or max(widths) > GPU_WIDTH
 
 
 def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:

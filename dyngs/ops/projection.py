@@ -206,7 +206,7 @@ def project(
         options: see ``ProjectionOptions``.
 
     Raises:
-        DyngsError: a picture with sides above 2^23 px, or more splats than memory holds.
+        DyngsError: an image with sides above 2^23 px, or more splats than memory holds.
     """
     check_size(cameras.width, cameras.height)  # before torch, which takes no integers from 2^63 on
     limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]

@@ -33,7 +33,7 @@ def unit_quats(quats: Tensor) -> Tensor:
 
 def identity_quat(like: Tensor) -> Tensor:
     """Return the quaternion (4,) of no rotation, in the dtype and on the device of ``like``."""
-    return torch.arange(4, device=like.device).eq(0).to(like.dtype)  # numbers from a list would wait for a card
+    return torch.arange(4, device=like.device).eq(0).to(like.dtype)  # numbers from a list would wait for a GPU
 
 
 def quat_product(left: Tensor, right: Tensor) -> Tensor:

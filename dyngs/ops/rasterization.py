@@ -107,7 +107,7 @@ class Blended:
 
     Attributes:
         color: (V, H, W, D), background composited.
-        transmittance: (V, H, W) in [0, 1], the share of the background that is seen; alpha is 1 minus it.
+        transmittance: (V, H, W) in [0, 1], the fraction of the background that is seen; alpha is 1 minus it.
     """
 
     color: Tensor
@@ -165,19 +165,19 @@ def _fake_bin_tiles(
 bin_tiles_op = register("bin_tiles", _bin_tiles, fake=_fake_bin_tiles)
 
 
-def _picture(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return uninitialised colours, transmittances and stops of V pictures."""
+def _image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return uninitialised colours, transmittances and stops of V images."""
     check_size(*size)
     views, channels = colors.shape[0], colors.shape[2]
     needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)
-    check_memory(needed, f"{views} picture(s) of {size[0]}x{size[1]} px with {channels} channels", colors)
-    return _empty_picture(colors, size)
+    check_memory(needed, f"{views} image(s) of {size[0]}x{size[1]} px with {channels} channels", colors)
+    return _empty_image(colors, size)
 
 
-def _empty_picture(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+def _empty_image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     shape = (colors.shape[0], size[1], size[0])
-    picture = colors.new_empty(*shape, colors.shape[2])
-    return picture, colors.new_empty(shape), colors.new_empty(shape, dtype=torch.int32)
+    image = colors.new_empty(*shape, colors.shape[2])
+    return image, colors.new_empty(shape), colors.new_empty(shape, dtype=torch.int32)
 
 
 def _blend(
@@ -197,7 +197,7 @@ def _blend(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     core = core_for(colors)
-    color, transmittance, stop = _picture(colors, size)
+    color, transmittance, stop = _image(colors, size)
     with _refusals("rasterize"):
         core.rasterize_forward(
             _arrays(core, means2d, factors, opacities, radii),
@@ -227,7 +227,7 @@ def _fake_blend(
     thresholds: list[float],
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    return _empty_picture(colors, size)
+    return _empty_image(colors, size)
 
 
 def _blend_backward(
@@ -327,7 +327,7 @@ def _tally(
 ) -> Tensor:
     core = core_for(colors)
     sums = torch.empty_like(splats[2], memory_format=torch.contiguous_format)
-    image = (*_picture(colors, size), sums)
+    image = (*_image(colors, size), sums)
     with _refusals("tally"):
         core.rasterize_forward(
             _arrays(core, *splats),
@@ -395,7 +395,7 @@ def rasterize(
 
     Raises:
         DyngsError: too many channels, sides above 2^23 px, more (Gaussian, tile) pairs than ``options.max_entries`` or
-            than memory holds, a picture larger than memory, or ``entries`` of another shape or with indices out of
+            than memory holds, an image larger than memory, or ``entries`` of another shape or with indices out of
             range.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
@@ -427,13 +427,13 @@ class Tally(IntEnum):
     """Quantities that ``tally`` sums per Gaussian; numbers as in csrc/core/api.hpp."""
 
     WEIGHTS = 1
-    """alpha times transmittance: its share of the picture"""
+    """alpha times transmittance: its fraction of the image"""
     PIXELS = 2
     """pixels that it was blended into"""
     LANES = 3
     """pixels that were computed for it, blended or not"""
     SQUARED_SLOPES = 4
-    """squares of the derivative of the picture, its channels added up, with respect to G, the value of the 2D Gaussian
+    """squares of the derivative of the image, its channels added up, with respect to G, the value of the 2D Gaussian
     there (Tu et al. 2026)"""
 
 

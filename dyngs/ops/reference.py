@@ -146,8 +146,8 @@ def squared_slopes(
 ) -> Tensor:
     """As ``dyngs.ops.rasterization.tally`` of ``SQUARED_SLOPES``: (V, N), from autograd pixel for pixel."""
     raised = colors.new_zeros(*opacities.shape, size[1], size[0], requires_grad=True)
-    picture = _rasterize(projection, opacities.detach(), colors.detach(), raised, background, options).color
-    (slopes,) = torch.autograd.grad(picture.sum(), raised)  # a pixel depends on its own values only
+    image = _rasterize(projection, opacities.detach(), colors.detach(), raised, background, options).color
+    (slopes,) = torch.autograd.grad(image.sum(), raised)  # a pixel depends on its own values only
     return slopes.square().sum((2, 3))
 
 
@@ -163,11 +163,11 @@ def _rasterize(
     height, width = raised.shape[2:]
     rows, columns = (torch.arange(n, dtype=colors.dtype, device=colors.device) + 0.5 for n in (height, width))
     y, x = torch.meshgrid(rows, columns, indexing="ij")
-    pictures: list[Tensor] = []
+    images: list[Tensor] = []
     remains: list[Tensor] = []
     for v in range(len(opacities)):
         transmittance = colors.new_ones(height, width)
-        picture = colors.new_zeros(height, width, colors.shape[-1])
+        image = colors.new_zeros(height, width, colors.shape[-1])
         full = colors.new_zeros(height, width, dtype=torch.bool)
         visible = torch.nonzero((projection.radii[v] > 0).all(-1))[:, 0]
         for i in visible[projection.depths[v, visible].argsort(stable=True)]:
@@ -179,10 +179,10 @@ def _rasterize(
             after = transmittance * (1 - alpha)
             full = full | ((after < options.transmittance_min) & (alpha > 0))
             alpha = torch.where(full, 0.0, alpha)
-            picture = picture + (alpha * transmittance)[..., None] * colors[v, i]
+            image = image + (alpha * transmittance)[..., None] * colors[v, i]
             transmittance = transmittance * (1 - alpha)
         if background is not None:
-            picture = picture + transmittance[..., None] * background[v]
-        pictures.append(picture)
+            image = image + transmittance[..., None] * background[v]
+        images.append(image)
         remains.append(transmittance)
-    return Blended(torch.stack(pictures), torch.stack(remains))
+    return Blended(torch.stack(images), torch.stack(remains))

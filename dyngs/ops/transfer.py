@@ -1,4 +1,4 @@
-"""Copies between the CPU and a card for which the host does not wait while the card has work."""
+"""Copies between the CPU and a GPU for which the host does not wait while the GPU has work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def sent(x: Tensor, device: torch.device | str) -> Tensor:
 
 
 class ReadBack:
-    """Numbers of a tensor, which a card copies to the CPU as soon as it has them, while more work is queued.
+    """Numbers of a tensor, which a GPU copies to the CPU as soon as it has them, while more work is queued.
 
     Args:
         x: their tensor.
@@ -35,14 +35,14 @@ class ReadBack:
         self._ready.record(torch.cuda.current_stream(x.device))
 
     def numbers(self) -> Tensor:
-        """Return them on the CPU; waits until the card has come to them, not for what was queued later."""
+        """Return them on the CPU; waits until the GPU has come to them, not for what was queued later."""
         if self._ready is not None:
             self._ready.synchronize()
         return self._numbers
 
 
 class Upload:
-    """Arrays of the CPU that are copied to a card beside its work: by a stream of their own, from pinned memory.
+    """Arrays of the CPU that are copied to a GPU beside its work: by a stream of their own, from pinned memory.
 
     May be made in any thread. What has no such streams gets them when they are asked for.
 
@@ -63,7 +63,7 @@ class Upload:
             self._done.record(stream)
 
     def arrays(self) -> list[Tensor]:
-        """Return them on the card; what is queued after this in the current stream finds them there."""
+        """Return them on the GPU; what is queued after this in the current stream finds them there."""
         if self._done is None:
             return [sent(x, self._device) for x in self._arrays]
         current = torch.cuda.current_stream(self._device)

@@ -1,1 +1,1 @@
-"""Camera paths, render jobs, and the pictures, videos and contact sheets that they become."""
+"""Camera paths, render jobs, and the images, videos and contact sheets that they become."""

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.geometry.focus import focus_point, share_in_front
+from dyngs.data.geometry.focus import focus_point, fraction_in_front
 
 _LEVEL = 0.2
 """Largest root-mean-square cosine between right axes and up of cameras that are held level: 11.5 degrees."""
@@ -26,7 +26,7 @@ def look_at_point(cameras: Cameras) -> np.ndarray:
     middle = centers.mean(axis=0)
     spread = float(np.linalg.norm(centers - middle, axis=1).mean())
     point = focus_point(poses)
-    if point is not None and share_in_front(poses, point) > 0.5:
+    if point is not None and fraction_in_front(poses, point) > 0.5:
         return point
     mean_axis = axes.mean(axis=0)
     forward = unit(mean_axis) if np.linalg.norm(mean_axis) > 1e-6 else axes[0]

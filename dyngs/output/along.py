@@ -34,8 +34,8 @@ def path_along(
     Args:
         cameras: usually those of training, in the order of their names.
         num_frames: F.
-        times: (V,) scene times of the cameras in [0, 1]; None: a still scene.
-        up: (3,) up in the pictures; None: that of the cameras near.
+        times: (V,) scene times of the cameras in [0, 1]; None: a static scene.
+        up: (3,) up in the images; None: that of the cameras near.
 
     Returns:
         F cameras, with times if the path plays a clip.
@@ -60,7 +60,7 @@ def path_along(
 
 
 def _features(poses: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return (V, 6) numbers of poses (V, 4, 4) whose distances are those between the pictures, in world units.
+    """Return (V, 6) numbers of poses (V, 4, 4) whose distances are those between the images, in world units.
 
     Place, and viewing direction times the distance of the ``target`` (3,) that they look at.
     """

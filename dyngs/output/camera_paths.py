@@ -29,7 +29,7 @@ class CameraPath:
     Attributes:
         cameras: F cameras.
         fps: frames per second.
-        times: (F,) scene times in [0, 1], or None for a still scene.
+        times: (F,) scene times in [0, 1], or None for a static scene.
         warnings: messages about changed input.
         notes: messages about where the cameras were placed.
     """

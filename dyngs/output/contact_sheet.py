@@ -33,7 +33,7 @@ def contact_sheet(rows: Sequence[SheetRow], error_gain: float = 5.0, panel_width
     """Return a sheet (H', W', 3) uint8 with truth, render and error side by side, one labelled view per row.
 
     The error is the mean absolute difference of the channels times ``error_gain``, in magma colours (black = equal).
-    Pictures wider than ``panel_width`` are shrunk, after the difference was taken.
+    Images wider than ``panel_width`` are shrunk, after the difference was taken.
 
     Raises:
         ValueError: no rows, or a truth and a render of different sizes.
@@ -71,11 +71,11 @@ def depth_to_rgb(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, floa
     Args:
         depth: (H, W) expected depth in world units; non-finite values count as far.
         alpha: (H, W) in [0, 1].
-        limits: near and far; None: ``depth_limits`` of this picture.
+        limits: near and far; None: ``depth_limits`` of this image.
     """
     near, far = limits or depth_limits(depth, alpha)
-    share = (far - np.nan_to_num(depth, nan=far, posinf=far, neginf=near)) / max(far - near, 1e-12)
-    colors = color_map(np.clip(share, 0.0, 1.0), "turbo").astype(np.float32)
+    fraction = (far - np.nan_to_num(depth, nan=far, posinf=far, neginf=near)) / max(far - near, 1e-12)
+    colors = color_map(np.clip(fraction, 0.0, 1.0), "turbo").astype(np.float32)
     return (colors * np.clip(alpha, 0.0, 1.0)[..., None] + 0.5).astype(np.uint8)
 
 
@@ -114,16 +114,16 @@ def _write_text(strip: np.ndarray, text: str) -> None:
     """
     import OpenImageIO as oiio
 
-    picture = oiio.ImageBuf(np.ascontiguousarray(strip))
+    image = oiio.ImageBuf(np.ascontiguousarray(strip))
     ink, size = (0.85, 0.85, 0.85), LARGEST_TEXT
     while size > SMALLEST_TEXT and oiio.ImageBufAlgo.text_size(text, size).width > strip.shape[1] - 4:
         size -= 1
-    if oiio.ImageBufAlgo.render_text(picture, 2, LABEL_HEIGHT - 7, text, size, textcolor=ink):
-        strip[:] = picture.get_pixels(oiio.UINT8)
+    if oiio.ImageBufAlgo.render_text(image, 2, LABEL_HEIGHT - 7, text, size, textcolor=ink):
+        strip[:] = image.get_pixels(oiio.UINT8)
 
 
 def _shrink(rgb: np.ndarray, width: int) -> np.ndarray:
-    """Return the picture (H, W, 3) uint8, area-filtered to at most ``width`` columns."""
+    """Return the image (H, W, 3) uint8, area-filtered to at most ``width`` columns."""
     if rgb.shape[1] <= width:
         return rgb
     from skimage.transform import resize_local_mean

@@ -1,4 +1,4 @@
-"""Render to picture and video files: the frames of a job, or the views of a split beside their ground truth."""
+"""Render to image and video files: the frames of a job, or the views of a split beside their ground truth."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from torch import Tensor
 
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.files.write import to_uint8, write_image
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import psnr
 from dyngs.ops.device import CPU
 from dyngs.output.camera_paths import CameraPath
 from dyngs.output.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
 from dyngs.output.render_job import Frame, RenderJob, job_frames, render_frame
 from dyngs.output.video import VideoWriter
-from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import load_run
 
 _SHEET_ROWS = 12
@@ -33,12 +33,12 @@ _DEPTH_SAMPLES = 8
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Files to write besides the colour pictures.
+    """Files to write besides the colour images.
 
     Attributes:
         depth: ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis).
         alpha: ``NAME_alpha.png``, white = opaque.
-        video: MP4 of the colour pictures in order.
+        video: MP4 of the colour images in order.
         fps: frames per second of the video.
     """
 
@@ -58,7 +58,7 @@ def write_job_images(
 
     Args:
         job: F >= 1 cameras and times, in the order of the video.
-        out_dir: folder for the pictures; None writes only the video.
+        out_dir: folder for the images; None writes only the video.
         output: depth, alpha, video. Depth colours share one range over the whole path.
         report: is told of each frame.
 
@@ -68,7 +68,7 @@ def write_job_images(
     if len(job.path) == 0:
         raise DyngsError("the camera path has no cameras")
     if out_dir is None and output.video is None:
-        raise DyngsError("nothing to write: give a folder for the pictures or a video file")
+        raise DyngsError("nothing to write: give a folder for the images or a video file")
     job = replace(job, options=_with_depth(job.options, output))
     limits = None
     if output.depth and out_dir is not None:
@@ -97,18 +97,18 @@ def write_split_images(
     Args:
         run_dir: run folder with at least one checkpoint.
         split: "test", "val" or "train".
-        out_dir: folder for the pictures, which are named after the views (``file_stems``).
+        out_dir: folder for the images, which are named after the views (``file_stems``).
         output: depth, alpha, video (views of one size only).
         report: is told of each view.
         device: draws.
 
     Raises:
-        DyngsError: no such run or split, unreadable pictures, a file cannot be written.
+        DyngsError: no such run or split, unreadable images, a file cannot be written.
     """
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
-    loader = PictureLoader(views, run.config.data)
+    loader = ImageLoader(views, run.config.data)
     _, background = evaluation_background(run.config.data.background, capture.has_alpha)
     options = _with_depth(render_options(run.config.model), output)
     scene = scene_of_split(run, capture, split).to(device)
@@ -116,20 +116,20 @@ def write_split_images(
     rows: list[SheetRow] = []
     with _FrameWriter(out_dir, output, files_of(capture)) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
-            picture = loader[i]
-            frame = render_frame(scene, scene.moment(picture.time), picture.cameras, options, background)
+            image = loader[i]
+            frame = render_frame(scene, scene.moment(image.time), image.cameras, options, background)
             writer.write(stem, frame)
             report("views", i + 1, len(views))
             if i in shown:
-                truth = picture.composite(background)
-                label = f"{psnr(torch.from_numpy(frame.rgb), truth, picture.mask):.2f} dB  {picture.name}"
-                rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), picture.mask))
-    writer.write_picture(out_dir / "sheet.png", contact_sheet(rows))
+                truth = image.composite(background)
+                label = f"{psnr(torch.from_numpy(frame.rgb), truth, image.mask):.2f} dB  {image.name}"
+                rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), image.mask))
+    writer.write_image(out_dir / "sheet.png", contact_sheet(rows))
     return writer.written
 
 
 def files_of(capture: Capture) -> frozenset[Path]:
-    """Return the paths of the pictures, masks and maps of a capture, with symbolic links resolved."""
+    """Return the paths of the images, masks and maps of a capture, with symbolic links resolved."""
     views = [view for split in capture.splits.values() for view in split]
     own = ("image_path", "mask_path", "depth_path", "motion_mask_path", "flow_path")
     files = (path for view in views for name in own if (path := getattr(view, name)) is not None)
@@ -166,7 +166,7 @@ def file_stems(names: Sequence[str]) -> list[str]:
 
 
 class _FrameWriter:
-    """Context manager that writes frames to pictures and a video; ``written`` lists the files."""
+    """Context manager that writes frames to images and a video; ``written`` lists the files."""
 
     def __init__(
         self,
@@ -201,18 +201,16 @@ class _FrameWriter:
             self._video.add(rgb)
         if self._out_dir is None:
             return
-        self.write_picture(self._out_dir / f"{stem}.png", rgb)
+        self.write_image(self._out_dir / f"{stem}.png", rgb)
         if self._output.alpha:
-            self.write_picture(self._out_dir / f"{stem}_alpha.png", frame.alpha)
+            self.write_image(self._out_dir / f"{stem}_alpha.png", frame.alpha)
         if self._output.depth and frame.depth is not None:
-            self.write_picture(
-                self._out_dir / f"{stem}_depth.png", depth_to_rgb(frame.depth, frame.alpha, self._limits)
-            )
-            self.write_picture(self._out_dir / f"{stem}_depth.exr", frame.depth)
+            self.write_image(self._out_dir / f"{stem}_depth.png", depth_to_rgb(frame.depth, frame.alpha, self._limits))
+            self.write_image(self._out_dir / f"{stem}_depth.exr", frame.depth)
 
-    def write_picture(self, path: Path, pixels: np.ndarray) -> None:
+    def write_image(self, path: Path, pixels: np.ndarray) -> None:
         if self._protected and path.resolve() in self._protected:
-            raise DyngsError(f"{path}: is a picture of the capture and would be overwritten; give another --out")
+            raise DyngsError(f"{path}: is an image of the capture and would be overwritten; give another --out")
         write_image(path, pixels)
         self.written.append(path)
 

@@ -66,9 +66,9 @@ def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: 
         path = read_path(named, np.asarray(world_offset))
     else:
         path = CameraPath(
-            _around(scene, options, options.num_frames or (DEFAULT_FRAMES if scene.is_still else len(times)))
+            _around(scene, options, options.num_frames or (DEFAULT_FRAMES if scene.is_static else len(times)))
         )
-    if scene.is_still or (options.times is None and path.times is not None):
+    if scene.is_static or (options.times is None and path.times is not None):
         return path
     if options.times is None:
         return with_times(path, np.linspace(0, 1, len(path)).tolist())

@@ -44,9 +44,9 @@ def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
     _, background = evaluation_background(options.background or run.config.data.background, capture.has_alpha)
     path = _fixed_camera_path(run, capture, options) if options.path is None else _moving_path(run, capture, options)
     notes: tuple[str, ...] = ()
-    if run.scene.is_still and options.times is not None:
+    if run.scene.is_static and options.times is not None:
         notes = ("nothing moves in this run: it looks the same at all times",)
-    elif not run.scene.is_still and path.times is None:
+    elif not run.scene.is_static and path.times is None:
         path = with_times(path, np.linspace(0, 1, len(path)).tolist())
         notes = ("time runs from 0 to 1 along the path; --time or --times choose other times",)
     if options.size is not None:
@@ -71,7 +71,7 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
 
     Args:
         capture: with at least one view.
-        name: name of a view, of its picture as written by ``dyngs render RUN``, or its number in the split, from 0;
+        name: name of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0;
             names take precedence over numbers.
         split: "test", "val" or "train"; None looks for a name in all, for a number in the first that has views.
 
@@ -132,5 +132,5 @@ def _placed_path(name: str, run: LoadedRun, capture: Capture, options: RenderJob
         case _:
             views = capture.splits["train"]
             times = [view.time for view in views if view.time is not None]
-            clip = len(times) == len(views) and not run.scene.is_still and options.motion is None
+            clip = len(times) == len(views) and not run.scene.is_static and options.motion is None
             return path_along(cameras, frames, times if clip else None, up)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.geometry.focus import share_in_front
+from dyngs.data.geometry.focus import fraction_in_front
 from dyngs.errors import DyngsError
 from dyngs.output.aim import look_at, look_at_point, perpendicular, unit, up_direction, with_poses, world_from_cam
 
@@ -33,7 +33,7 @@ class Orbit:
         radii, heights: (V,) distances from the axis and along it, world units.
         middle: azimuth of the middle of the arc, radians.
         width: of the smallest arc that holds all cameras, radians; None: they stand all around.
-        looks_in: share of the cameras that have the point before them, in [0, 1].
+        looks_in: fraction of the cameras that have the point before them, in [0, 1].
     """
 
     center: np.ndarray
@@ -90,7 +90,7 @@ def orbit_of(cameras: Cameras, up: np.ndarray | None = None) -> Orbit:
     angles = np.arctan2(flat @ level[1], flat @ level[0])
     middle, width = _arc(angles[beside]) if len(beside) else (0.0, None)
     azimuths = (angles - middle + np.pi) % (2 * np.pi) - np.pi
-    return Orbit(center, up, level, azimuths, radii, heights, middle, width, share_in_front(poses, center))
+    return Orbit(center, up, level, azimuths, radii, heights, middle, width, fraction_in_front(poses, center))
 
 
 def orbit_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None) -> Cameras:
@@ -122,7 +122,7 @@ def spiral_path(
     Args:
         cameras: V >= 1 cameras, roughly facing one way.
         num_frames: F.
-        up: (3,) up in the pictures; None: ``up_direction`` of the cameras.
+        up: (3,) up in the images; None: ``up_direction`` of the cameras.
         turns: circles per loop.
         zoom: extent along the viewing axis, relative to the width of the spiral.
     """
@@ -144,7 +144,7 @@ def spiral_path(
 def frame_orbit_for_points(
     means: np.ndarray, num_frames: int, size: tuple[int, int] = (960, 720), up: tuple[float, float, float] = (0, 0, 1)
 ) -> Cameras:
-    """Return an orbit around a set of points whose robust extent fills the picture.
+    """Return an orbit around a set of points whose robust extent fills the image.
 
     The centre is the median. The extent is the sphere around it that holds 99% of the points within the 1st to 99th
     percentile of every axis, so that outliers have no effect.

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Moment, Scene
 from dyngs.output.camera_paths import CameraPath
-from dyngs.rendering import RenderOptions
-from dyngs.scene import Moment, Scene
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
@@ -24,7 +24,7 @@ DEFAULT_OPTIONS = RenderOptions()
 
 @dataclass(frozen=True)
 class Frame:
-    """One rendered picture, float32.
+    """One rendered image, float32.
 
     Attributes:
         rgb: (H, W, 3), composited on the background, clamped to [0, 1].
@@ -66,13 +66,13 @@ class RenderJobOptions:
         path: "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None:
             one fixed camera.
         num_frames: frames of a path that is not a file; None: as many as a motion has, else 120.
-        size: width and height in pixels; None: that of the pictures, of the JSON, or 960x720 for a .ply or avatar.
+        size: width and height in pixels; None: that of the images, of the JSON, or 960x720 for a .ply or avatar.
         background: "white" or "black"; None: that of training, black for a .ply.
         up: up axis of the paths, such as "z" or "-y"; None: up for the cameras of a run, for the person of an avatar
             file, and what a file of Gaussians says, else what is usual for its format.
         times: scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view
             for a fixed camera, from 0 to 1 along a path.
-        view: the view of the fixed camera: its name, the name of its picture, or its number from 0.
+        view: the view of the fixed camera: its name, the name of its image, or its number from 0.
         split: split of that view; None: test, or val or train if there is none.
         motion: motion file for the person of a run; None: the training motion.
         at_rest: show the person in the rest pose of the template.
@@ -120,7 +120,7 @@ def job_frames(job: RenderJob) -> Iterator[Frame]:
     times = job.path.times
     moment, moment_time = None, None
     for i in range(len(job.path)):
-        time = None if times is None or job.scene.is_still else times[i]
+        time = None if times is None or job.scene.is_static else times[i]
         if moment is None or time != moment_time:
             with torch.no_grad():
                 moment, moment_time = job.scene.moment(time), time
@@ -128,7 +128,7 @@ def job_frames(job: RenderJob) -> Iterator[Frame]:
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Return the cameras at another image size: the whole picture stays visible, pixels stay square."""
+    """Return the cameras at another image size: the whole image stays visible, pixels stay square."""
     scale = min(width / cameras.width, height / cameras.height)
     intrinsics = cameras.intrinsics.clone()
     intrinsics[:, :2] *= scale

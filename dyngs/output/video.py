@@ -16,10 +16,10 @@ from dyngs.files.temporary import temporary_beside
 
 
 class VideoWriter:
-    """Context manager that encodes pictures as MP4 for any player: H.264, yuv420p, BT.709, constant frame rate.
+    """Context manager that encodes images as MP4 for any player: H.264, yuv420p, BT.709, constant frame rate.
 
-    The file appears when the block ends without an error; otherwise (or without any picture) there is none, and an
-    earlier one stays. Pictures of odd width or height are padded by repeating the last column or row.
+    The file appears when the block ends without an error; otherwise (or without any image) there is none, and an
+    earlier one stays. Images of odd width or height are padded by repeating the last column or row.
 
         with VideoWriter(Path("orbit.mp4"), fps=30) as video:
             video.add(rgb)
@@ -47,13 +47,13 @@ class VideoWriter:
         return self
 
     def add(self, rgb: np.ndarray) -> None:
-        """Append a picture (H, W, 3) uint8; all must have the size of the first."""
+        """Append an image (H, W, 3) uint8; all must have the size of the first."""
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            raise ValueError(f"a video picture must be (H, W, 3) uint8, got {rgb.shape} {rgb.dtype}")
+            raise ValueError(f"a video image must be (H, W, 3) uint8, got {rgb.shape} {rgb.dtype}")
         if self._size is None:
             self._open(rgb.shape[0], rgb.shape[1])
         if rgb.shape[:2] != self._size:
-            raise ValueError(f"all pictures of a video must have one size, got {rgb.shape[:2]} after {self._size}")
+            raise ValueError(f"all images of a video must have one size, got {rgb.shape[:2]} after {self._size}")
         height, width = rgb.shape[:2]
         if height % 2 or width % 2:
             rgb = np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
@@ -64,7 +64,7 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None and self._container is None:
-            raise DyngsError(f"cannot write {self.path}: the video has no pictures")
+            raise DyngsError(f"cannot write {self.path}: the video has no images")
         try:
             if kind is None:
                 self._encode(None)
@@ -101,7 +101,7 @@ class VideoWriter:
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
 
     def _encode(self, rgb: np.ndarray | None) -> None:
-        """Encode a picture; None flushes the encoder."""
+        """Encode an image; None flushes the encoder."""
         import av
         from av.error import FFmpegError
 

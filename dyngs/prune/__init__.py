@@ -1,1 +1,1 @@
-"""Fewer Gaussians for nearly the same pictures: importance scores, selection and fine-tuning."""
+"""Fewer Gaussians for nearly the same images: importance scores, selection and fine-tuning."""

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.colour.training import HELD_OUT_EVERY, AutoTraining
-from dyngs.colour.view_dependence import MeasuredView, find_view_dependent
 from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
 from dyngs.conventions import SH_C0
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.scene import DynamicScene
+from dyngs.gaussians.colour.training import HELD_OUT_EVERY, AutoTraining
+from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
+from dyngs.gaussians.scene import Scene, render_options
 from dyngs.ops.transfer import sent
 from dyngs.prune.stage import remove_
-from dyngs.scene import Scene, render_options
 from dyngs.training.background import background_colour
 from dyngs.training.trainer import Trainer
 
@@ -40,13 +40,13 @@ class Cut:
         harmonics: PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay.
     """
 
-    share: float = 0.0
+    fraction: float = 0.0
     alpha_min: float | None = None
     field: FieldSize | None = None
     harmonics: float = 0.0
 
     def __str__(self) -> str:
-        words = [f"{self.share:.1%} of the Gaussians"] if self.share else []
+        words = [f"{self.fraction:.1%} of the Gaussians"] if self.fraction else []
         words += [f"alphas below {self.alpha_min:.3g}"] if self.alpha_min else []
         words += [f"all but {self.field.nodes} nodes of {self.field.pieces} pieces"] if self.field else []
         words += [f"harmonics worth {self.harmonics:g} dB"] if self.harmonics else []
@@ -56,7 +56,7 @@ class Cut:
 def field_size(scene: Scene) -> FieldSize | None:
     """Return the size of the field of ``scene``; None where no control nodes move anything."""
     match scene:
-        case DynamicScene(field=ControlNodes() as field, is_still=False) if field.num_nodes:
+        case DynamicScene(field=ControlNodes() as field, is_static=False) if field.num_nodes:
             return FieldSize(field.num_nodes, field.num_pieces)
         case _:
             return None
@@ -65,7 +65,7 @@ def field_size(scene: Scene) -> FieldSize | None:
 def with_field(scene: Scene, size: FieldSize) -> Scene:
     """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move anything."""
     match scene:
-        case DynamicScene(field=ControlNodes() as field, is_still=False):
+        case DynamicScene(field=ControlNodes() as field, is_static=False):
             means = scene.gaussians.means.detach()[scene.moving]
             return replace(scene, field=field.reduced(size.nodes, size.pieces, means))
         case _:
@@ -86,7 +86,7 @@ def cut_config(config: Config, cut: Cut) -> Config:
     colour = config.colour
     if cut.harmonics:
         colour = AutoColour(opacity_entropy=colour.opacity_entropy)
-    prune = config.prune.model_copy(update={"share": cut.share})
+    prune = config.prune.model_copy(update={"fraction": cut.fraction})
     return config.model_copy(update={"model": model, "colour": colour, "prune": prune})
 
 
@@ -102,7 +102,7 @@ def apply_cut(trainer: Trainer, cut: Cut, scores: Tensor) -> None:
     options = render_options(trainer.config.model)
     trainer.options = replace(trainer.options, alpha_min=options.alpha_min)
     trainer.scene = replace(trainer.scene, options=options)
-    remove_(trainer, scores if cut.share else None)
+    remove_(trainer, scores if cut.fraction else None)
     if cut.field is not None:
         trainer.scene = with_field(trainer.scene, cut.field)
     if cut.harmonics:
@@ -112,7 +112,7 @@ def apply_cut(trainer: Trainer, cut: Cut, scores: Tensor) -> None:
 
 def _drop_harmonics(trainer: Trainer, tolerance: float) -> None:
     """Drop the harmonics of the Gaussians that need none, and keep them zero."""
-    usable = [i for i in range(len(trainer.pictures)) if i not in trainer.held_out]
+    usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
     background = sent(background_colour(trainer.background), trainer.device)
@@ -124,7 +124,7 @@ def _drop_harmonics(trainer: Trainer, tolerance: float) -> None:
     colours = AutoTraining(
         AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy),
         trainer.config.train.steps,
-        len(trainer.pictures),
+        len(trainer.images),
     )
     colours.freeze(~found.keeps)
     trainer.colours = colours
@@ -132,7 +132,7 @@ def _drop_harmonics(trainer: Trainer, tolerance: float) -> None:
 
 def _looks(trainer: Trainer, indices: Sequence[int], background: Tensor) -> Iterator[MeasuredView]:
     """Yield training views as they are drawn now."""
-    for picture in (trainer.pictures[i] for i in indices):
+    for image in (trainer.images[i] for i in indices):
         with torch.no_grad():
-            now = trainer.training.moment(trainer.scene, picture, trainer.done).gaussians.detach()
-        yield MeasuredView(now, picture.cameras, picture.composite(background), picture.mask)
+            now = trainer.training.moment(trainer.scene, image, trainer.done).gaussians.detach()
+        yield MeasuredView(now, image.cameras, image.composite(background), image.mask)

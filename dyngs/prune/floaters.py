@@ -1,6 +1,6 @@
-"""Floaters: Gaussians close before one camera that explain its picture alone, and haze all views from beside it.
+"""Floaters: Gaussians close before one camera that explain its image alone, and haze all views from beside it.
 
-A Gaussian that belongs to a surface contributes to the pictures of many cameras. One that hangs between a camera and
+A Gaussian that belongs to a surface contributes to the images of many cameras. One that hangs between a camera and
 the scene shows mostly there. It is cheap to tell: most of its blending weight, over all training views, lies in one of
 them, and it is much nearer to that camera than the scene usually is.
 """
@@ -15,14 +15,14 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import StaticModel
-from dyngs.rendering import contributions
+from dyngs.gaussians.rendering import contributions
 from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
 
-MAIN_SHARE = 0.5
-"""Share of the weight of a Gaussian that must lie in one view."""
+MAIN_FRACTION = 0.5
+"""Fraction of the weight of a Gaussian that must lie in one view."""
 NEAR = 0.6
 """Depth of a Gaussian in that view, over the median depth of the view, below which it is near."""
 SEEN = 0.3
@@ -32,11 +32,11 @@ LONGEST_SIDE = 200
 SOLID = 0.5
 """Alpha from which a pixel has a depth."""
 FEWEST_VIEWS, MOST = 20, 0.01
-"""With fewer views, or with a larger share of such Gaussians, much of the scene is seen by one view only."""
+"""With fewer views, or with a larger fraction of such Gaussians, much of the scene is seen by one view only."""
 
 
 class FloaterRemoval:
-    """Listener that removes floaters when training ends, if that is asked for; still scenes only.
+    """Listener that removes floaters when training ends, if that is asked for; static scenes only.
 
     Args:
         loop: of the run.
@@ -55,30 +55,30 @@ class FloaterRemoval:
     def _remove(self, step: int) -> None:
         trainer = self._trainer()
         match trainer.config.model:
-            case StaticModel() if trainer.config.train.remove_floaters and len(trainer.pictures) >= FEWEST_VIEWS:
+            case StaticModel() if trainer.config.train.remove_floaters and len(trainer.images) >= FEWEST_VIEWS:
                 found = floaters(trainer)
             case _:
                 return
         before, count = len(trainer.scene), int(found.sum())
         if not count:
             return
-        share = f"{count:,} of {before:,} Gaussians hang close before single cameras"
+        fraction = f"{count:,} of {before:,} Gaussians hang close before single cameras"
         if count > MOST * before:
-            self._loop.tell(Message(f"{share}: too many to be floaters, none is removed"))
+            self._loop.tell(Message(f"{fraction}: too many to be floaters, none is removed"))
             return
         trainer.keep(~found)
-        self._loop.tell(Message(f"{share}: removed (train.remove_floaters)"))
+        self._loop.tell(Message(f"{fraction}: removed (train.remove_floaters)"))
         self._loop.tell(TopologyChanged(step, before, len(trainer.scene)))
 
 
 @torch.no_grad()
 def floaters(trainer: Trainer) -> Tensor:
-    """Return (N,) bool which Gaussians of a still scene are floaters, by all of its training views."""
+    """Return (N,) bool which Gaussians of a static scene are floaters, by all of its training views."""
     scene, background = trainer.scene, background_colour(trainer.background)
     gaussians, options = scene.gaussians.detach(), replace(trainer.options, depth="expected", absgrad=False)
     total, most = torch.zeros_like(gaussians.logit_opacities), torch.zeros_like(gaussians.logit_opacities)
     nearness = torch.full_like(total, torch.inf)
-    for camera in trainer.pictures.cameras():
+    for camera in trainer.images.cameras():
         small = _small(camera)
         drawn = scene.render(small, None, options=options, background=background)
         assert drawn.depth is not None
@@ -89,11 +89,11 @@ def floaters(trainer: Trainer) -> Tensor:
         is_main = weight > most
         nearness = torch.where(is_main, (gaussians.means @ pose[2, :3] + pose[2, 3]) / depth, nearness)
         total, most = total + weight, torch.where(is_main, weight, most)
-    return (total > SEEN) & (most > MAIN_SHARE * total) & (nearness < NEAR)
+    return (total > SEEN) & (most > MAIN_FRACTION * total) & (nearness < NEAR)
 
 
 def _small(camera: Cameras) -> Cameras:
-    """Return ``camera`` with pictures of at most ``LONGEST_SIDE``."""
+    """Return ``camera`` with images of at most ``LONGEST_SIDE``."""
     factor = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
     width, height = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
     scale = camera.intrinsics.new_tensor([width / camera.width, height / camera.height, 1.0])

@@ -1,4 +1,4 @@
-"""Importance of each Gaussian: its share of pictures over views and times, weighted in one of several ways.
+"""Importance of each Gaussian: its fraction of images over views and times, weighted in one of several ways.
 
 Local letters: K moments, C (K, N) sums over pixels and views of what a Gaussian contributes at each moment.
 """
@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.rendering import RenderOptions, contributions, sensitivities
-from dyngs.scene import Scene
+from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
+from dyngs.gaussians.scene import Scene
 
 STEEPNESS = 4.0
 """Slope of the hyperbolic tangent: second differences of a profile are small numbers."""
@@ -27,7 +27,7 @@ class ScoringViews:
     Attributes:
         scene: N Gaussians; none is masked.
         cameras: V groups of one camera.
-        times: K moments in [0, 1], ascending; one None for a still scene.
+        times: K moments in [0, 1], ascending; one None for a static scene.
         options: how the scene is drawn.
         background: (3,) colour.
     """
@@ -50,7 +50,7 @@ class Importance:
         log_volumes: (K, N) sums of the logarithms of the scales.
     """
 
-    shares: Tensor
+    fractions: Tensor
     slopes: Tensor | None
     opacities: Tensor
     log_volumes: Tensor
@@ -58,7 +58,7 @@ class Importance:
     @property
     def contribution(self) -> Tensor:
         """(N,) sum of C over moments."""
-        return self.shares.sum(0)
+        return self.fractions.sum(0)
 
     @property
     def temporal(self) -> Tensor:
@@ -74,14 +74,14 @@ class Importance:
         (1, 2] with the second difference d of the profile p over moments. p is the opacity over its maximum where it
         changes, and otherwise what is seen, C, smoothed by [1 2 1] / 4, over its maximum.
         """
-        return (self._volumes() * self._variation() * self.shares).sum(0)
+        return (self._volumes() * self._variation() * self.fractions).sum(0)
 
     def _volumes(self) -> Tensor:
         return (VOLUME_POWER * (self.log_volumes - self.log_volumes.mean())).exp()
 
     def _variation(self) -> Tensor:
         fades = bool((self.opacities != self.opacities[:1]).any())
-        profile = self.opacities if fades else _smoothed(self.shares)
+        profile = self.opacities if fades else _smoothed(self.fractions)
         profile = profile / profile.amax(0).clamp_min(torch.finfo(profile.dtype).tiny)
         padded = torch.cat([profile[:1], profile, profile[-1:]])
         bend = padded[2:] - 2 * profile + padded[:-2]
@@ -90,21 +90,21 @@ class Importance:
 
 @torch.no_grad()
 def importance(views: ScoringViews, *, slopes: bool) -> Importance:
-    """Return the contribution of each Gaussian to the pictures of ``views``; ``slopes`` cost the larger half."""
+    """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the larger half."""
     scene, options, behind = views.scene, views.options, views.background
-    shares, opacities, volumes, squares = [], [], [], torch.zeros((), device=behind.device)
+    fractions, opacities, volumes, squares = [], [], [], torch.zeros((), device=behind.device)
     for time in views.times:
         moment = scene.moment(time)
         now = moment.gaussians
         sums = [contributions(now, camera, options)[0] for camera in views.cameras]
-        shares.append(torch.stack(sums).sum(0))
+        fractions.append(torch.stack(sums).sum(0))
         opacities.append(now.opacities)
         volumes.append(now.log_scales.sum(1))
         if slopes:
             shader = scene.shader(moment)
             for camera in views.cameras:
                 squares = squares + sensitivities(now, camera, options, background=behind, shader=shader)[0]
-    return Importance(torch.stack(shares), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
+    return Importance(torch.stack(fractions), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
 
 
 def _smoothed(x: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ other views may be kind to a candidate by chance), and
   candidate, too, before it is compared.
 
 One kind of thing after the other is taken away, as listed in ``ALLOWED``: of each the most, by bisection, that keeps
-the loss below a share of what is allowed, with what was found for those before.
+the loss below a fraction of what is allowed, with what was found for those before.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ import torch
 
 from dyngs.config import Config
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
+from dyngs.gaussians.scene import Scene
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
-from dyngs.prune.stage import PROBED_VIEWS, chosen_scores, probe_pictures, quality_of
-from dyngs.scene import Scene
+from dyngs.prune.stage import PROBED_VIEWS, chosen_scores, probe_images, quality_of
 from dyngs.storage.coarsest import CoarseFile, coarsest_file
 from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
-HELD_OUT_SHARE, MOST_HELD_OUT = 1 / 8, 32
+HELD_OUT_FRACTION, MOST_HELD_OUT = 1 / 8, 32
 """Share and number of the training views that are held out; the number also limits those never trained on."""
 LEFT_GAUSSIANS = tuple(2 ** (-step / 2) for step in range(1, 13))
-"""Shares of the Gaussians that are left, tried by bisection."""
+"""Fractions of the Gaussians that are left, tried by bisection."""
 CUT_OFFS = (0.01, 0.02, 0.03)
 FIELD_LOSSES = (0.03, 0.1, 0.3, 1.0, 3.0)
-"""Losses of training pictures, dB, before fine-tuning, by fewer pieces and by fewer nodes each."""
+"""Losses of training images, dB, before fine-tuning, by fewer pieces and by fewer nodes each."""
 HARMONIC_LOSSES = (0.01, 0.03, 0.1)
-"""Losses of training pictures, dB, before fine-tuning, by dropping harmonics."""
+"""Losses of training images, dB, before fine-tuning, by dropping harmonics."""
 ALLOWED = {"cut-off": 0.1, "Gaussians": 0.65, "field": 0.8, "harmonics": 0.85}
-"""Share of the allowed loss up to which each kind is taken, those before it included; the rest is for rounding."""
+"""Fraction of the allowed loss up to which each kind is taken, those before it included; the rest is for rounding."""
 FEWEST_NODES = 8
 
 SMALLEST_FILE_LOSS = 0.01
@@ -127,7 +127,7 @@ class Stored:
 
 def evenly_held_out(count: int) -> tuple[int, ...]:
     """Return the indices of those of ``count`` training views that are held out, evenly spread; none of one view."""
-    chosen = min(max(1, round(HELD_OUT_SHARE * count)), MOST_HELD_OUT) if count > 1 else 0
+    chosen = min(max(1, round(HELD_OUT_FRACTION * count)), MOST_HELD_OUT) if count > 1 else 0
     return tuple((2 * i + 1) * count // (2 * chosen) for i in range(chosen))
 
 
@@ -138,17 +138,17 @@ class Search:
         trainer: of the run, restored from ``start``; it is changed.
         start: checkpoint at the end of the run.
         tell: is told what is tried and found.
-        unseen: pictures that the run was never trained on; without any, training views are held out.
+        unseen: images that the run was never trained on; without any, training views are held out.
     """
 
-    def __init__(self, trainer: Trainer, start: Checkpoint, tell: Tell, unseen: Sequence[Picture] = ()) -> None:
+    def __init__(self, trainer: Trainer, start: Checkpoint, tell: Tell, unseen: Sequence[Image] = ()) -> None:
         self.trainer, self.start, self.tell = trainer, start, tell
-        self.held_out = () if unseen else evenly_held_out(len(trainer.pictures))
+        self.held_out = () if unseen else evenly_held_out(len(trainer.images))
         self.trials = 0
         self._begin = trainer.config, trainer.options, trainer.colours
         trainer.held_out, trainer.held_out_until = frozenset(self.held_out), math.inf
         self._scores = chosen_scores(trainer)
-        self._truths = list(unseen) or [trainer.pictures[i] for i in self.held_out] or probe_pictures(trainer)
+        self._truths = list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         self.views = f"{len(self._truths)} training views held out" if self.held_out else "its only training view"
         if unseen:
             self.views = f"{len(self._truths)} views never trained on"
@@ -182,10 +182,10 @@ class Search:
             self.tell(f"fine-tuning alone costs {cost:.2f} dB, which counts as lost: more --steps may cost less")
         return psnr + max(cost, 0.0)
 
-    def _others(self) -> list[Picture]:
-        """Return some training pictures that are not held out."""
-        others = [i for i in range(len(self.trainer.pictures)) if i not in self.held_out]
-        return [self.trainer.pictures[others[i]] for i in evenly_spaced(len(others), PROBED_VIEWS)]
+    def _others(self) -> list[Image]:
+        """Return some training images that are not held out."""
+        others = [i for i in range(len(self.trainer.images)) if i not in self.held_out]
+        return [self.trainer.images[others[i]] for i in evenly_spaced(len(others), PROBED_VIEWS)]
 
     def stored(self, found: Found, max_loss: float) -> Stored:
         """Return the smallest accepted candidate whose file keeps the promise, and that file, rounded as far as it may.
@@ -261,7 +261,7 @@ class Search:
 
     def _fewer_gaussians(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
         count = len(self._scores)
-        return [(f"{1 - left:.1%}", replace(so_far, share=1 - left)) for left in LEFT_GAUSSIANS if left * count >= 1]
+        return [(f"{1 - left:.1%}", replace(so_far, fraction=1 - left)) for left in LEFT_GAUSSIANS if left * count >= 1]
 
     def _higher_cut_offs(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
         own = self._begin[0].model
@@ -276,12 +276,12 @@ class Search:
         whole = field_size(trainer.scene)
         if whole is None:
             return []
-        pictures = self._others()
+        images = self._others()
         at_most: list[FieldSize] = []
-        exact = quality_of(trainer, trainer.scene, pictures)
+        exact = quality_of(trainer, trainer.scene, images)
 
         def loss(size: FieldSize) -> float:
-            return exact - quality_of(trainer, with_field(trainer.scene, size), pictures)
+            return exact - quality_of(trainer, with_field(trainer.scene, size), images)
 
         pieces = {n: loss(FieldSize(whole.nodes, n)) for n in _halved(whole.pieces, 1)}
         nodes = {n: loss(FieldSize(n, whole.pieces)) for n in _halved(whole.nodes, FEWEST_NODES)}

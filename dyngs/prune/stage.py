@@ -19,24 +19,24 @@ from dyngs.camera import Cameras
 from dyngs.config import PruneConfig
 from dyngs.config.kinds import field_of
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
+from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.metrics import psnr
 from dyngs.ops.transfer import sent
 from dyngs.prune.score import Importance, ScoringViews, importance
 from dyngs.prune.selection import highest
-from dyngs.scene import Scene
 from dyngs.static.fixed import FixedDensifier
 from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
-from dyngs.visibility import VisibilityMasks
 
 MOVING_VIEWS, MOVING_TIMES = 8, 24
 """Numbers of training cameras and times whose pairs are scored in dynamic scenes."""
 STILL_VIEWS = 100
 PROBED_VIEWS = 16
-"""Number of training pictures on which the loss is measured."""
+"""Number of training images on which the loss is measured."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Pruned:
 
     Attributes:
         before, after: numbers of Gaussians.
-        loss: dB on training pictures, before anything is trained again.
-        active: mean share of the kept that masks let through; 1 without masks.
+        loss: dB on training images, before anything is trained again.
+        active: mean fraction of the kept that masks let through; 1 without masks.
     """
 
     before: int
@@ -87,7 +87,7 @@ def prune_(trainer: Trainer) -> Pruned:
     """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their number stays."""
     trainer.scene = trainer.scene.unmasked()
     before, whole = len(trainer.scene), training_quality(trainer, trainer.scene)
-    remove_(trainer, chosen_scores(trainer) if trainer.config.prune.share > 0 else None)
+    remove_(trainer, chosen_scores(trainer) if trainer.config.prune.fraction > 0 else None)
     scene, active = trainer.scene, 1.0
     loss = whole - training_quality(trainer, scene.unmasked())
     if scene.masks is not None:
@@ -98,15 +98,15 @@ def prune_(trainer: Trainer) -> Pruned:
 
 @torch.no_grad()
 def remove_(trainer: Trainer, scores: Tensor | None) -> None:
-    """Leave all but the share ``prune.share`` with the lowest ``scores`` (N,), and mask them if that is asked for."""
+    """Leave all but the fraction ``prune.fraction`` with the lowest ``scores`` (N,), and mask them if requested."""
     options = trainer.config.prune
     whole = trainer.scene = trainer.scene.unmasked()
     kept = torch.ones(len(whole), dtype=torch.bool, device=whole.gaussians.means.device)
     if scores is not None:
-        kept = highest(scores, options.share)
+        kept = highest(scores, options.fraction)
         trainer.keep(kept)
     trainer.densifier = FixedDensifier()
-    if options.mask_times > 1 and field_of(trainer.config) is not None and not whole.is_still:
+    if options.mask_times > 1 and field_of(trainer.config) is not None and not whole.is_static:
         trainer.scene = replace(trainer.scene, masks=_masks(trainer, whole, kept))
 
 
@@ -149,31 +149,31 @@ def scoring_views(trainer: Trainer, scene: Scene, times: Sequence[float | None] 
     """Return all pairs of some training cameras and some times; with no times all that matters are cameras."""
     background = background_colour(trainer.background)
     if times is None:
-        times = [None] if scene.is_still else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
-    views = STILL_VIEWS if scene.is_still else MOVING_VIEWS
-    cameras = distinct_cameras(trainer.pictures.cameras(), views)
+        times = [None] if scene.is_static else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
+    views = STILL_VIEWS if scene.is_static else MOVING_VIEWS
+    cameras = distinct_cameras(trainer.images.cameras(), views)
     return ScoringViews(scene, cameras, times, trainer.options, background)
 
 
 @torch.no_grad()
 def training_quality(trainer: Trainer, scene: Scene) -> float:
-    """Return the mean PSNR of at most 16 training pictures drawn of ``scene``, dB."""
-    return quality_of(trainer, scene, probe_pictures(trainer))
+    """Return the mean PSNR of at most 16 training images drawn of ``scene``, dB."""
+    return quality_of(trainer, scene, probe_images(trainer))
 
 
-def probe_pictures(trainer: Trainer) -> list[Picture]:
-    """Return at most 16 training pictures, evenly chosen."""
-    return [trainer.pictures[i] for i in evenly_spaced(len(trainer.pictures), PROBED_VIEWS)]
+def probe_images(trainer: Trainer) -> list[Image]:
+    """Return at most 16 training images, evenly chosen."""
+    return [trainer.images[i] for i in evenly_spaced(len(trainer.images), PROBED_VIEWS)]
 
 
 @torch.no_grad()
-def quality_of(trainer: Trainer, scene: Scene, pictures: Sequence[Picture]) -> float:
-    """Return the mean PSNR of ``pictures`` drawn of ``scene``, dB."""
+def quality_of(trainer: Trainer, scene: Scene, images: Sequence[Image]) -> float:
+    """Return the mean PSNR of ``images`` drawn of ``scene``, dB."""
     background, options = sent(background_colour(trainer.background), trainer.device), trainer.options
     scene, values = scene.to(trainer.device), []
-    for picture in pictures:
-        drawn = scene.render(picture.cameras, picture.time, options=options, background=background).rgb[0]
-        values.append(psnr(drawn, picture.composite(background), picture.mask))
+    for image in images:
+        drawn = scene.render(image.cameras, image.time, options=options, background=background).rgb[0]
+        values.append(psnr(drawn, image.composite(background), image.mask))
     return fmean(values)
 
 
@@ -182,5 +182,5 @@ def _masks(trainer: Trainer, scene: Scene, kept: Tensor) -> VisibilityMasks:
     options, last = trainer.config.prune, len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
-    shares = importance(scoring_views(trainer, scene, times), slopes=False).shares
-    return VisibilityMasks.pack(tuple(times), shares[:, kept] > options.mask_below)
+    fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
+    return VisibilityMasks.pack(tuple(times), fractions[:, kept] > options.mask_below)

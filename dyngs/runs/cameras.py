@@ -8,7 +8,7 @@ from pathlib import Path
 from dyngs.data.capture import View
 from dyngs.errors import reading
 from dyngs.runs.checkpoint import LoadedRun, checkpoint_paths, latest_checkpoint
-from dyngs.training.camera_refinement import CameraCorrections, CameraRefinement
+from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
 from dyngs.training.state import OTHER_CONFIG
 
 

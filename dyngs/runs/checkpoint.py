@@ -25,7 +25,7 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 from dyngs.storage.file import read_scene
 from dyngs.training.state import Checkpoint, CheckpointInfo
 

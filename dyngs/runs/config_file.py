@@ -14,7 +14,7 @@ BODY_FOLDER = "body"
 """In a run folder: the fit that ``data.body`` named when the run began."""
 _PARAMETERS = ("body_train.npz", "body_pose.npz")
 _KEPT = (*_PARAMETERS, "fit_report.json")
-"""Files of a fit that are kept; pictures are not."""
+"""Files of a fit that are kept; images are not."""
 
 
 def write_config(config: Config, folder: Path) -> None:

@@ -22,7 +22,7 @@ EXPORT_FOLDER = "export"
 FORMER_EXPORT_FOLDER = "small"
 """Name of ``EXPORT_FOLDER`` in runs of earlier versions; nothing is written there."""
 STILL_FOLDER = "still"
-"""In the folder of a run of a moving scene: the run of the still model that it is compared with."""
+"""In the folder of a run of a moving scene: the run of the static model that it is compared with."""
 ASKED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
 _BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER, BODY_FOLDER)

@@ -23,7 +23,7 @@ class LogRecord:
     Attributes:
         step: steps done.
         loss: of this step, regularizers included.
-        psnr: of this step's picture, dB; None where its mask leaves nothing.
+        psnr: of this step's image, dB; None where its mask leaves nothing.
         num_gaussians: after the step.
         num_moving: those of them that depend on time.
         bad_gradients: how often so far a Gaussian was left out of a step because its gradient was not finite.

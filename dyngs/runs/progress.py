@@ -68,7 +68,7 @@ class Progress:
 
     def update(self, record: LogRecord, pixels: int = 0) -> None:
         """Show ``record``, of a step that drew ``pixels``; PSNR is averaged over the last few of them."""
-        # One picture says little: views differ by several dB.
+        # One image says little: views differ by several dB.
         if record.psnr is not None:
             self._psnr = record.psnr if self._psnr is None else 0.95 * self._psnr + 0.05 * record.psnr
         now = time.perf_counter()

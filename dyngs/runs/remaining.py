@@ -1,6 +1,6 @@
 """The time that a run still takes, from its pace so far and from what its schedule does to the cost of a step.
 
-Pictures begin small, Gaussians are added, motion begins: steps at the end may cost ten times as much as those at the
+Images begin small, Gaussians are added, motion begins: steps at the end may cost ten times as much as those at the
 start. The cost of a step is taken as a sum of a constant, of pixels and of Gaussians, in proportions measured on two
 CPU cores; only their ratios matter, as the pace is measured.
 """
@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from dyngs.config import Config
-from dyngs.training.schedule import motion_begins_after, picture_divisor, scaled
+from dyngs.training.schedule import image_divisor, motion_begins_after, scaled
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 18.0, 300.0, 9e-4
 """Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two cores."""
 MOTION = 2.0
 """Factor by which steps cost more once things may move."""
 DETAIL = 0.5
-"""Power of the pictures' side with which the number of Gaussians grows: 2 to 4.7 times were seen from 1/4 to full."""
+"""Power of the images' side with which the number of Gaussians grows: 2 to 4.7 times were seen from 1/4 to full."""
 SAMPLES = 64
 """Steps ahead whose costs are predicted."""
 
@@ -62,7 +62,7 @@ class RemainingTime:
             step: steps done.
             seconds: on the clock now.
             num_gaussians: there are now.
-            pixels: of the picture drawn last.
+            pixels: of the image drawn last.
         """
         last = self._marks[-1]
         self._pixels = pixels * self._divisor(step) ** 2
@@ -87,7 +87,7 @@ class RemainingTime:
     def _expected(self, step: int, since: _Mark) -> float:
         """Return how many Gaussians are expected at ``step``.
 
-        They go on growing as since ``since`` until densification ends, and larger pictures hold detail for more; at
+        They go on growing as since ``since`` until densification ends, and larger images hold detail for more; at
         most up to the configured cap.
         """
         now = self._marks[-1]
@@ -103,7 +103,7 @@ class RemainingTime:
         return max(now.num_gaussians, min(detailed, strategy.growth_limit))
 
     def _divisor(self, step: int) -> int:
-        return 1 if self._config is None else picture_divisor(self._config().train, max(step, 1))
+        return 1 if self._config is None else image_divisor(self._config().train, max(step, 1))
 
     def _motion(self, step: int) -> float:
         if self._config is None:

@@ -60,9 +60,9 @@ def read_compressed(header: PlyHeader, file: BinaryIO, path: Path) -> Gaussians:
 
     def ranged(packed: str, name: str) -> np.ndarray:
         low, high = (_columns(chunks, names, path)[chunk_of] for names in (_RANGES[name][:3], _RANGES[name][3:]))
-        share = unpack_fractions(vertices[packed].astype(np.uint32), _BITS_3)
+        fraction = unpack_fractions(vertices[packed].astype(np.uint32), _BITS_3)
         with np.errstate(all="ignore"):  # ranges of others may be NaN or infinite
-            return (low + share * (high - low)).astype(np.float32)
+            return (low + fraction * (high - low)).astype(np.float32)
 
     colour = unpack_fractions(vertices["packed_color"].astype(np.uint32), _BITS_4)
     rgb = colour[:, :3]
@@ -95,18 +95,18 @@ def write_compressed(path: Path, splat: SplatFile) -> None:
         "scale": (gaussians.log_scales.numpy().clip(-_MOST_LOG, min(_MOST_LOG, MOST_LOG_SCALE)), _BITS_3),
         "colour": (sh[:, 0] * SH_C0 + 0.5, _BITS_3),
     }
-    ranges, shares = [], {}
+    ranges, fractions = [], {}
     for name, (values, _) in kinds.items():
         low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
         ranges += [low, high]
         span = np.where(high > low, high - low, 1)
-        shares[name] = (values - low[chunk_of]) / span[chunk_of]
+        fractions[name] = (values - low[chunk_of]) / span[chunk_of]
     alpha = gaussians.opacities.numpy()[:, None]
     words = [
-        pack_fractions(shares["position"], _BITS_3),
+        pack_fractions(fractions["position"], _BITS_3),
         smallest_three(gaussians.quats.numpy()),
-        pack_fractions(shares["scale"], _BITS_3),
-        pack_fractions(np.concatenate([shares["colour"], alpha], axis=1), _BITS_4),
+        pack_fractions(fractions["scale"], _BITS_3),
+        pack_fractions(np.concatenate([fractions["colour"], alpha], axis=1), _BITS_4),
     ]
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, -1)
     coded = np.clip(np.trunc((rest / _SH_RANGE + 0.5) * 256), 0, 255).astype(np.uint8)
@@ -139,8 +139,8 @@ def _read_rest(header: PlyHeader, file: BinaryIO, path: Path, count: int) -> np.
     if len(table) != count or len(names) not in _DEGREE_OF_REST:
         raise DyngsError(f"{path}: its element sh has {len(table)} rows of {len(names)} numbers; export it again")
     coded = _columns(table, tuple(f"f_rest_{i}" for i in range(len(names))), path)
-    share = np.where(coded == 0, 0, np.where(coded == 255, 1, (coded + 0.5) / 256))
-    return ((share - 0.5) * _SH_RANGE).reshape(count, 3, -1).transpose(0, 2, 1).astype(np.float32)
+    fraction = np.where(coded == 0, 0, np.where(coded == 255, 1, (coded + 0.5) / 256))
+    return ((fraction - 0.5) * _SH_RANGE).reshape(count, 3, -1).transpose(0, 2, 1).astype(np.float32)
 
 
 def _columns(table: np.ndarray, names: tuple[str, ...], path: Path) -> np.ndarray:

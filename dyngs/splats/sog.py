@@ -1,4 +1,4 @@
-"""PlayCanvas' ``.sog``: a zip of lossless WebP pictures with a pixel per Gaussian, and ``meta.json``; version 2.
+"""PlayCanvas' ``.sog``: a zip of lossless WebP images with a pixel per Gaussian, and ``meta.json``; version 2.
 
 Positions take 16 bits per axis on a logarithmic scale, rotations 26 bits, scales and colours index a table of 256
 values, and harmonics above degree 0 a palette of up to 65,536 rows of such indices. Axes are those of the .ply.
@@ -89,13 +89,13 @@ def write_sog(path: Path, splat: SplatFile) -> None:
     n = len(gaussians)
     width = 4 * int(np.ceil(np.sqrt(n) / 4))
     height = int(np.ceil(n / width))
-    pictures: dict[str, np.ndarray] = {}
+    images: dict[str, np.ndarray] = {}
 
     def draw(name: str, pixels: np.ndarray) -> str:
         whole = np.zeros((width * height, 4), np.uint8)
         whole[:, 3] = 255
         whole[:n, : pixels.shape[1]] = pixels
-        pictures[name] = whole.reshape(height, width, 4)
+        images[name] = whole.reshape(height, width, 4)
         return name
 
     far = gaussians.means.double().numpy()
@@ -126,17 +126,17 @@ def write_sog(path: Path, splat: SplatFile) -> None:
         rows, labels = palette(gaussians.sh[:, 1:].flatten(1).numpy())
         values = codebook(rows.ravel())
         labelled = draw("shN_labels.webp", np.stack([labels & 255, labels >> 8, 0 * labels], axis=1).astype(np.uint8))
-        pictures["shN_centroids.webp"] = _palette_picture(nearest_entries(values, rows))
+        images["shN_centroids.webp"] = _palette_image(nearest_entries(values, rows))
         files = ["shN_centroids.webp", labelled]
         meta["shN"] = {"count": len(rows), "bands": gaussians.sh_degree, "codebook": values.tolist(), "files": files}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr("meta.json", json.dumps(meta))
-        for name, picture in pictures.items():
-            archive.writestr(name, _encoded(picture))
+        for name, image in images.items():
+            archive.writestr(name, _encoded(image))
 
 
-def _palette_picture(indices: np.ndarray) -> np.ndarray:
-    """Return the picture (H, W, 4) of palette rows (P, 3 T): 64 rows side by side, T pixels each."""
+def _palette_image(indices: np.ndarray) -> np.ndarray:
+    """Return the image (H, W, 4) of palette rows (P, 3 T): 64 rows side by side, T pixels each."""
     count, terms = len(indices), indices.shape[1] // 3
     whole = np.zeros((_PER_ROW * -(-count // _PER_ROW), terms, 4), np.uint8)
     whole[..., 3] = 255
@@ -144,11 +144,11 @@ def _palette_picture(indices: np.ndarray) -> np.ndarray:
     return whole.reshape(-1, _PER_ROW * terms, 4)
 
 
-def _encoded(picture: np.ndarray) -> bytes:
+def _encoded(image: np.ndarray) -> bytes:
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(picture, "RGBA").save(out, "WEBP", lossless=True, exact=True, quality=75, method=4)
+    Image.fromarray(image, "RGBA").save(out, "WEBP", lossless=True, exact=True, quality=75, method=4)
     return out.getvalue()
 
 
@@ -158,7 +158,7 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
     require_at_most(path, n, MOST_GAUSSIANS, "Gaussians")
 
     def pixels(name: str) -> np.ndarray:
-        found = _picture(path, archive, name).reshape(-1, 4)
+        found = _image(path, archive, name).reshape(-1, 4)
         if len(found) < n:
             raise DyngsError(f"{path}: {name:.60} has {len(found):,} pixels for {n:,} Gaussians; export it again")
         return found[:n]
@@ -189,14 +189,14 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
 def _rest(path: Path, archive: zipfile.ZipFile, rest: _Rest, labels: np.ndarray) -> np.ndarray:
     """Return the harmonics above degree 0, (N, K - 1, 3)."""
     name, terms = rest.files[0], num_sh_terms(rest.bands) - 1
-    picture = _picture(path, archive, name)
+    image = _image(path, archive, name)
     row = labels[:, 0].astype(np.int64) | (labels[:, 1].astype(np.int64) << 8)
-    fits = picture.shape[1] == _PER_ROW * terms and picture.shape[0] * _PER_ROW >= rest.count
+    fits = image.shape[1] == _PER_ROW * terms and image.shape[0] * _PER_ROW >= rest.count
     if not fits or int(row.max()) >= rest.count:
         raise DyngsError(
             f"{path}: {name:.60} does not hold the {rest.count:,} harmonics that are named; export it again"
         )
-    table = np.array(rest.codebook, np.float32)[picture[..., :3]].reshape(-1, terms, 3)
+    table = np.array(rest.codebook, np.float32)[image[..., :3]].reshape(-1, terms, 3)
     return table[row]
 
 
@@ -219,19 +219,19 @@ def _meta(path: Path, archive: zipfile.ZipFile) -> _Meta:
         raise DyngsError(f"{path}: its meta.json is no .sog's ({problem:.120}); export it again") from error
 
 
-def _picture(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """Return a picture (H, W, 4) uint8 of the archive."""
+def _image(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """Return an image (H, W, 4) uint8 of the archive."""
     from PIL import Image
 
     try:
         info = archive.getinfo(name)
     except KeyError:
         raise DyngsError(f"{path}: {name:.60} is missing; export it again") from None
-    require_at_most(path, info.file_size, 8 * _MOST_PIXELS, "bytes of a picture")
+    require_at_most(path, info.file_size, 8 * _MOST_PIXELS, "bytes of an image")
     try:
-        with Image.open(io.BytesIO(_content(archive, info)), formats=("WEBP", "PNG")) as picture:
-            require_at_most(path, picture.width * picture.height, _MOST_PIXELS, "pixels of a picture")
-            return np.asarray(picture.convert("RGBA"))
+        with Image.open(io.BytesIO(_content(archive, info)), formats=("WEBP", "PNG")) as image:
+            require_at_most(path, image.width * image.height, _MOST_PIXELS, "pixels of an image")
+            return np.asarray(image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DyngsError(f"{path}: {name:.60} cannot be read ({str(error)[:80]}); export it again") from error
 

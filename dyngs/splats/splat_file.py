@@ -13,7 +13,7 @@ from dyngs.conventions import RasterizeMode, num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions
+from dyngs.gaussians.rendering import RenderOptions
 
 Nonfinite = Literal["error", "skip"]
 

@@ -59,7 +59,7 @@ class Densifier(Protocol):
         ...
 
     def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
-        """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of pictures of ``size`` (width, height)."""
+        """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of images of ``size`` (width, height)."""
         ...
 
     def tallies(self, step: int, count: int) -> list[Tensor]:

@@ -26,7 +26,7 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
 
     Args:
         means: (N, 3) in the world.
-        cameras: the training cameras, with the intrinsics of the pictures that are trained on.
+        cameras: the training cameras, with the intrinsics of the images that are trained on.
     """
     means = means.detach()
     nearest = torch.full((len(means),), torch.inf, device=means.device)

@@ -55,13 +55,13 @@ class McmcDensifier:
         source, is_new = torch.arange(n, device=opacities.device), ~alive
         if len(dead) > 0:
             picks = _drawn(torch.where(alive, opacities, 0.0), len(dead), generator)
-            opacities, log_scales, shared = self._share(opacities, log_scales, picks)
+            opacities, log_scales, shared = self._fraction(opacities, log_scales, picks)
             source[dead], opacities[dead], log_scales[dead] = picks, opacities[picks], log_scales[picks]
             is_new = is_new | shared
         added = max(0, int(min(self.max_gaussians, (1 + self.growth) * n)) - n)
         if added > 0:
             picks = _drawn(opacities, added, generator)
-            opacities, log_scales, shared = self._share(opacities, log_scales, picks)
+            opacities, log_scales, shared = self._fraction(opacities, log_scales, picks)
             is_new = torch.cat([is_new | shared, torch.ones(added, dtype=torch.bool, device=opacities.device)])
             source = torch.cat([source, source[picks]])
             opacities = torch.cat([opacities, opacities[picks]])
@@ -106,7 +106,7 @@ class McmcDensifier:
     def load_state(self, state: dict[str, Tensor]) -> None:
         return None
 
-    def _share(self, opacities: Tensor, log_scales: Tensor, picks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _fraction(self, opacities: Tensor, log_scales: Tensor, picks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return opacities, log scales and a mask of changed rows after each picked row has become several copies."""
         copies = torch.bincount(picks, minlength=len(opacities)) + 1
         shared = copies > 1

@@ -12,8 +12,8 @@ class Rates:
     Attributes:
         steps: of training, at the end of which rates are at their lowest.
         tuning: steps of a stage after that, with fewer Gaussians.
-        rewind: share of training whose rates that stage goes back to (learning-rate rewinding, Renda et al. 2020), to
-            fall to the lowest again; 1: they stay at their lowest.
+        rewind: fraction of training whose rates that stage goes back to (learning-rate rewinding, Renda et al. 2020),
+            to fall to the lowest again; 1: they stay at their lowest.
     """
 
     steps: int

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.scene import Moment, Scene, clamped_time
+from dyngs.gaussians.scene import Moment, Scene, clamped_time
 from dyngs.state import Role, State, StateTensor, with_role
 from dyngs.static.filters import fuse_filter
 from dyngs.tensor_checks import require_moments, require_tensor
@@ -43,7 +43,7 @@ class StaticScene(Scene):
         return self.seen_at
 
     @property
-    def is_still(self) -> bool:
+    def is_static(self) -> bool:
         return True
 
     @property

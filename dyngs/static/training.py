@@ -1,4 +1,4 @@
-"""Training of a static scene: on every picture, with its 3D filter kept up to date."""
+"""Training of a static scene: on every image, with its 3D filter kept up to date."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.scene import Moment, Scene
+from dyngs.gaussians.scene import Moment, Scene
 from dyngs.state import State
 from dyngs.static.filters import filter_std
 from dyngs.static.scene import StaticScene
@@ -48,7 +48,7 @@ class StaticTraining:
         return StaticScene(gaussians=gaussians, filter_std=self._update.of(gaussians))
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return true: every picture, always."""
+        """Return true: every image, always."""
         return True
 
     def window(self, step: int) -> tuple[float, float]:
@@ -58,8 +58,8 @@ class StaticTraining:
     def extend(self, scene: Scene, seen: tuple[float, float], step: int) -> None:
         """Do nothing: all times are trained on."""
 
-    def moment(self, scene: Scene, picture: Picture, step: int) -> Moment:
-        return scene.moment(picture.time)
+    def moment(self, scene: Scene, image: Image, step: int) -> Moment:
+        return scene.moment(image.time)
 
     def optimize(self, scene: Scene, step: int) -> int:
         """Return 0: the scene learns nothing beside its Gaussians."""

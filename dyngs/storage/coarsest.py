@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 from dyngs.build import restored_scene
 from dyngs.config import Config
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 from dyngs.storage.drawable import completed, drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded
 from dyngs.storage.measure import storage_plan

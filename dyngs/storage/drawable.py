@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 from dyngs.state import tensors_of
 from dyngs.storage.order import storage_order
 from dyngs.storage.quantize import sorted_axes

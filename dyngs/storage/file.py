@@ -26,7 +26,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
 from dyngs.storage.drawable import completed, drawable, stored_edit
 from dyngs.storage.tensors import (

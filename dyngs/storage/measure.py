@@ -1,4 +1,4 @@
-"""Storage precision of a trained scene, measured on pictures of its capture."""
+"""Storage precision of a trained scene, measured on images of its capture."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from dyngs.build import restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import Config
 from dyngs.data.capture import Capture, View
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.rendering import contributions
-from dyngs.scene import Scene, render_options
+from dyngs.gaussians.rendering import contributions
+from dyngs.gaussians.scene import Scene, render_options
 from dyngs.storage.drawable import drawable
 from dyngs.storage.precision import (
     GREY_LEVELS,
@@ -33,7 +33,7 @@ from dyngs.training.state import Checkpoint
 from dyngs.training.views import training_cameras
 
 LOSS_DB = 0.025
-"""Allowed loss of PSNR on training pictures, dB. On others it is up to twice as much."""
+"""Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""
 COMPARED = 6
 """Number of training views in which the change is measured."""
 SMALLEST_CHANGE = 0.01
@@ -41,7 +41,7 @@ SMALLEST_CHANGE = 0.01
 LOOKED_AT = 50
 """Number of training views in which the visibility of each Gaussian is measured."""
 
-Pictures = Callable[[Scene], list[Tensor]]
+Images = Callable[[Scene], list[Tensor]]
 """Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
 
 
@@ -50,19 +50,19 @@ class StoragePlan:
     """Precision and coarseness with which a scene is stored.
 
     Attributes:
-        precision: steps, and how much the pictures change.
+        precision: steps, and how much the images change.
         coarseness: (N,) uint8 of the Gaussians, or None.
-        pictures: draws what was compared; None where no picture can be drawn.
+        images: draws what was compared; None where no image can be drawn.
     """
 
     precision: Precision
     coarseness: Tensor | None = None
-    pictures: Pictures | None = None
+    images: Images | None = None
 
 
 @dataclass(frozen=True)
 class _Shot:
-    """Camera and time of one training picture."""
+    """Camera and time of one training image."""
 
     cameras: Cameras
     time: float | None
@@ -75,7 +75,7 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_chang
         config: of the run.
         checkpoint: of ``scene``.
         scene: N Gaussians.
-        max_change: root mean square over all values of some training pictures, grey levels of 255. None: what lowers
+        max_change: root mean square over all values of some training images, grey levels of 255. None: what lowers
             their PSNR by ``LOSS_DB``, if it is independent of the scene's own errors.
     """
     try:
@@ -87,22 +87,20 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_chang
     shots, options = _shots(config, capture, scene, COMPARED), render_options(config.model)
 
     @torch.no_grad()
-    def pictures(drawn: Scene) -> list[Tensor]:
+    def images(drawn: Scene) -> list[Tensor]:
         return [drawn.render(shot.cameras, shot.time, options=options, background=background).rgb[0] for shot in shots]
 
     def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
-        return pictures(restored_scene(replace(checkpoint, tensors=dict(tensors)), config.model))
+        return images(restored_scene(replace(checkpoint, tensors=dict(tensors)), config.model))
 
-    wanted = pictures(scene)
+    wanted = images(scene)
     if max_change is None:
-        loader = PictureLoader(_chosen(capture, COMPARED), config.data)
+        loader = ImageLoader(_chosen(capture, COMPARED), config.data)
         truth = (loader[i].composite(background) for i in range(len(loader)))
         errors = [float((x.clamp(0, 1) - y).square().mean()) for x, y in zip(wanted, truth, strict=True)]
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
     exact = drawable(scene) | {COARSENESS: coarseness}
-    return StoragePlan(
-        measured_precision(exact, wanted, redrawn, max(max_change, SMALLEST_CHANGE)), coarseness, pictures
-    )
+    return StoragePlan(measured_precision(exact, wanted, redrawn, max(max_change, SMALLEST_CHANGE)), coarseness, images)
 
 
 def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_Shot]:
@@ -123,7 +121,7 @@ def _chosen(capture: Capture, count: int) -> list[View]:
 
 
 def _visibility(scene: Scene, shots: Sequence[_Shot]) -> Tensor:
-    """Return (N,) sums of blending weights over the pictures."""
+    """Return (N,) sums of blending weights over the images."""
     scene = scene.unmasked()
     total = torch.zeros(len(scene), device=scene.gaussians.means.device)
     for shot in shots:

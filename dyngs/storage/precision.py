@@ -1,8 +1,8 @@
-"""Precision of each attribute at which the pictures change by no more than is allowed.
+"""Precision of each attribute at which the images change by no more than is allowed.
 
-Rounding with step s adds an error of about c s^2 to the pictures and costs -log2 s bits per value. The sum of errors is
+Rounding with step s adds an error of about c s^2 to the images and costs -log2 s bits per value. The sum of errors is
 given, the sum of bits is to be least: then every group of tensors may add errors in proportion to its number of values
-(the water-filling of rate-distortion theory). Which step does that is measured, on pictures.
+(the water-filling of rate-distortion theory). Which step does that is measured, on images.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ GREY_LEVELS = 255.0
 TRIALS = 4
 """Number of steps tried per group."""
 CLOSE = 0.8
-"""Share of the allowed error from which the search ends."""
+"""Fraction of the allowed error from which the search ends."""
 FIRST_STEP = 2.0**-6
-"""First step as a share of the mean magnitude of the values."""
+"""First step as a fraction of the mean magnitude of the values."""
 WIDEST_JUMP = 32.0
-OUTLYING, USUAL_SHARE = 64.0, 0.95
-"""Values so many times as large as this share of those that are not 0 are outliers: steps are chosen without them."""
+OUTLYING, USUAL_FRACTION = 64.0, 0.95
+"""Values so many times as large as this fraction of those that are not 0 are outliers: steps are chosen without
+them."""
 MOST_VISIBLE = 0.9
 """Quantile of visibility above which Gaussians are stored most finely."""
 ASSUMED_STEPS = {"quats": 2**-8, "log_scales": 2**-6, "logit_opacities": 2**-10, "sh_base": 2**-7, "sh_rest": 2**-7}
 
 Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]
-"""Pictures (H, W, 3), always from the same cameras at the same times, of a checkpoint's tensors."""
+"""Images (H, W, 3), always from the same cameras at the same times, of a checkpoint's tensors."""
 
 
 @dataclass(frozen=True)
 class Precision:
-    """Quantisation steps and the change of pictures that they cause.
+    """Quantisation steps and the change of images that they cause.
 
     Attributes:
         steps: of each group of tensors; 0: it is stored as it is.
-        change: root mean square change of the pictures, grey levels of 255; None where none could be drawn.
+        change: root mean square change of the images, grey levels of 255; None where none could be drawn.
         allowed: what it was to be at most; None likewise.
     """
 
@@ -55,10 +56,10 @@ class Precision:
 def coarseness_of(visibility: Tensor) -> Tensor:
     """Return (N,) uint8 octaves by which each Gaussian may be stored more coarsely than the most visible ones.
 
-    An error of a Gaussian counts with the square of its weight in the pictures: half an octave per octave.
+    An error of a Gaussian counts with the square of its weight in the images: half an octave per octave.
 
     Args:
-        visibility: (N,) sums of its blending weights over pictures.
+        visibility: (N,) sums of its blending weights over images.
     """
     if not len(visibility):
         return torch.zeros(0, dtype=torch.uint8, device=visibility.device)
@@ -68,7 +69,7 @@ def coarseness_of(visibility: Tensor) -> Tensor:
 
 
 def assumed_precision(gaussians: Gaussians) -> Precision:
-    """Return steps where no picture can be drawn: fine ones; those of positions follow the size of the Gaussians."""
+    """Return steps where no image can be drawn: fine ones; those of positions follow the size of the Gaussians."""
     log_scales = gaussians.log_scales.detach().double()
     size = float(log_scales.median(1).values.median().exp()) if len(log_scales) else 1.0
     return Precision(
@@ -79,11 +80,11 @@ def assumed_precision(gaussians: Gaussians) -> Precision:
 def measured_precision(
     exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
 ) -> Precision:
-    """Return the largest steps found that change the pictures by at most ``max_change``.
+    """Return the largest steps found that change the images by at most ``max_change``.
 
     Args:
         exact: from ``drawable``, and the coarseness of the Gaussians if they have any.
-        wanted: the pictures that count.
+        wanted: the images that count.
         draw: draws them anew from the tensors of a checkpoint.
         max_change: root mean square over all of their values, grey levels of 255, more than 0.
 
@@ -100,9 +101,9 @@ def measured_precision(
     num_values = sum(sum(x.numel() for x in group.values()) for group in groups.values())
     steps, too_coarse = {}, {}
     for name, group in groups.items():
-        share = sum(x.numel() for x in group.values()) / num_values
+        fraction = sum(x.numel() for x in group.values()) / num_values
         steps[name], is_enough = _largest_step(
-            lambda step, name=name, group=group: change({name: step}, group), list(group.values()), allowed * share
+            lambda step, name=name, group=group: change({name: step}, group), list(group.values()), allowed * fraction
         )
         too_coarse |= {} if is_enough else {name: 0.0}
     kept, found = _scaled(steps, change, allowed)
@@ -133,7 +134,7 @@ def rounded(
 
 
 def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> float:
-    """Return the mean square over all values of pictures in [0, 1], after clamping; NaN where one of them is."""
+    """Return the mean square over all values of images in [0, 1], after clamping; NaN where one of them is."""
     total = sum(
         float((x.clamp(0, 1) - y.clamp(0, 1)).double().square().sum()) for x, y in zip(before, after, strict=True)
     )
@@ -143,7 +144,7 @@ def mean_square_change(before: Sequence[Tensor], after: Sequence[Tensor]) -> flo
 def _scaled(
     steps: dict[str, float], change: Callable[[Mapping[str, float]], float], allowed: float
 ) -> tuple[dict[str, float], float]:
-    """Return all steps times one factor, so that together they change the pictures by what is allowed or less.
+    """Return all steps times one factor, so that together they change the images by what is allowed or less.
 
     And the mean square change that they make, which is larger only where no factor that was tried is small enough.
     """
@@ -163,9 +164,9 @@ def _scaled(
 
 
 def _largest_step(change: Callable[[float], float], group: Sequence[Tensor], allowed: float) -> tuple[float, bool]:
-    """Return the largest step tried that changes pictures by at most ``allowed``, else the finest; and whether it does.
+    """Return the largest step tried that changes images by at most ``allowed``, else the finest; and whether it does.
 
-    The first one tried where these pictures do not depend on the group at all: others may.
+    The first one tried where these images do not depend on the group at all: others may.
     """
     size, mean_square = _usual_size(torch.cat([x.flatten() for x in group]))
     if size == 0:
@@ -194,7 +195,7 @@ def _usual_size(values: Tensor) -> tuple[float, float]:
     nonzero = sizes[sizes > 0]
     if not len(nonzero):
         return 0.0, 0.0
-    usual = nonzero.kthvalue(max(int(USUAL_SHARE * len(nonzero)), 1)).values
+    usual = nonzero.kthvalue(max(int(USUAL_FRACTION * len(nonzero)), 1)).values
     sizes = sizes[sizes <= OUTLYING * usual]
     return float(sizes.max()), float(sizes.square().mean())
 

@@ -56,7 +56,7 @@ FEW = 64
 """Number of values up to which tensors are stored as they are."""
 LARGEST_HALF = 65504.0
 MOST_FAR = 1 / 8
-"""Largest share of values out of the integer range; with more, all are stored as they are."""
+"""Largest fraction of values out of the integer range; with more, all are stored as they are."""
 RELATIVE = "model.filter_std"
 """Stored in half precision: it spans orders of magnitude."""
 POSITIVE = "model.field.buffers.radii"
@@ -68,7 +68,7 @@ FIXED_STEPS = {
     "model.anchors.uv": 2.0**-9,
     "model.anchors.barycentric": 2.0**-6,
 }
-"""Steps of a person's anchors on the template, m or shares: pictures hardly depend on them."""
+"""Steps of a person's anchors on the template, m or shares: images hardly depend on them."""
 
 
 @dataclass(frozen=True)

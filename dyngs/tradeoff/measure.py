@@ -14,13 +14,13 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import render_options
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Scene
 from dyngs.metrics import Lpips, psnr, ssim
 from dyngs.ops.device import finish
-from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene
 from dyngs.tradeoff.measurements import Quartiles, Speed
 from dyngs.tradeoff.variants import Variant
 
@@ -42,7 +42,7 @@ class VariantRenderer:
     scale: float = 1.0
 
     @torch.no_grad()
-    def picture(self, cameras: Cameras, time: float | None) -> Tensor:
+    def image(self, cameras: Cameras, time: float | None) -> Tensor:
         """Return (H, W, 3), seen by one camera at ``time``; upscaled bilinearly if ``scale`` < 1."""
         small = scaled_cameras(cameras, self.scale)
         rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[0]
@@ -56,7 +56,7 @@ class VariantRenderer:
 
 @dataclass(frozen=True)
 class Quality:
-    """Means over pictures; LPIPS is None where it cannot be computed."""
+    """Means over images; LPIPS is None where it cannot be computed."""
 
     psnr: float
     ssim: float
@@ -88,44 +88,44 @@ def scaled_cameras(cameras: Cameras, scale: float) -> Cameras:
     return Cameras(cameras.cam_from_world, factors[:, None] * cameras.intrinsics, width, height)
 
 
-def measure_quality(renderer: VariantRenderer, pictures: Iterable[Picture], lpips: Lpips) -> Quality:
-    """Return mean metrics over pictures, each rendered at its own time.
+def measure_quality(renderer: VariantRenderer, images: Iterable[Image], lpips: Lpips) -> Quality:
+    """Return mean metrics over images, each rendered at its own time.
 
     Raises:
         DyngsError: a render holds NaN or Inf.
     """
     psnrs, ssims, distances = [], [], []
-    for picture in pictures:
-        rendered, truth = renderer.picture(picture.cameras, picture.time), picture.composite(renderer.background)
+    for image in images:
+        rendered, truth = renderer.image(image.cameras, image.time), image.composite(renderer.background)
         if not bool(rendered.isfinite().all()):
-            raise DyngsError(f"view {picture.name!r}: the render holds NaN or Inf")
-        psnrs.append(psnr(rendered, truth, picture.mask))
-        ssims.append(ssim(rendered, truth, picture.mask))
-        distances.append(lpips(rendered, truth, picture.mask).value)
+            raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
+        psnrs.append(psnr(rendered, truth, image.mask))
+        ssims.append(ssim(rendered, truth, image.mask))
+        distances.append(lpips(rendered, truth, image.mask).value)
     known = [x for x in distances if x is not None]
     return Quality(fmean(psnrs), fmean(ssims), fmean(known) if len(known) == len(distances) else None)
 
 
-def time_interleaved(renderers: Sequence[VariantRenderer], pictures: Sequence[Picture], rounds: int) -> list[Speed]:
+def time_interleaved(renderers: Sequence[VariantRenderer], images: Sequence[Image], rounds: int) -> list[Speed]:
     """Return the speed of each renderer, relative to the first one.
 
-    All render each picture in turn, starting with another one each time, so that other load on the machine affects all
+    All render each image in turn, starting with another one each time, so that other load on the machine affects all
     alike.
 
     Args:
         renderers: at least one.
-        pictures: their cameras and times are rendered.
-        rounds: renders of each picture.
+        images: their cameras and times are rendered.
+        rounds: renders of each image.
     """
-    seconds = np.zeros((len(renderers), rounds * len(pictures)))
+    seconds = np.zeros((len(renderers), rounds * len(images)))
     for renderer in renderers:
-        renderer.picture(pictures[0].cameras, pictures[0].time)  # warm-up
+        renderer.image(images[0].cameras, images[0].time)  # warm-up
     for column in range(seconds.shape[1]):
-        picture = pictures[column % len(pictures)]
+        image = images[column % len(images)]
         for turn in range(len(renderers)):
             row = (column + turn) % len(renderers)
             start = time.perf_counter()
-            finish(renderers[row].picture(picture.cameras, picture.time).device)
+            finish(renderers[row].image(image.cameras, image.time).device)
             seconds[row, column] = time.perf_counter() - start
     return [Speed(ms=quartiles(1e3 * own), gain=quartiles(seconds[0] / own)) for own in seconds]
 

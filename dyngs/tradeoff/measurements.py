@@ -28,7 +28,7 @@ class Speed:
     """Rendering speed, with deformation and upscaling.
 
     Attributes:
-        ms: milliseconds per picture.
+        ms: milliseconds per image.
         gain: speed relative to the run itself, over pairs of renders taken right after each other.
     """
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
 from dyngs.tradeoff.measure import VariantRenderer, render_options_of
@@ -43,7 +43,7 @@ class MemoryMeter:
             self._process.communicate()
 
     def peak_megabytes(
-        self, folder: Path, variant: Variant, pictures: Sequence[Picture], background: Tensor
+        self, folder: Path, variant: Variant, images: Sequence[Image], background: Tensor
     ) -> float | None:
         """Return the largest growth of resident memory, 1e6 bytes, while loading a run and rendering on one thread.
 
@@ -52,7 +52,7 @@ class MemoryMeter:
         Args:
             folder: run folder.
             variant: its render settings are used.
-            pictures: their cameras and times are rendered; a person shows the training motion.
+            images: their cameras and times are rendered; a person shows the training motion.
             background: (3,) colour.
         """
         process = self._started()
@@ -60,12 +60,12 @@ class MemoryMeter:
             return None
         views = [
             {
-                "pose": picture.cameras.cam_from_world.tolist(),
-                "intrinsics": picture.cameras.intrinsics.tolist(),
-                "size": [picture.cameras.width, picture.cameras.height],
-                "time": picture.time,
+                "pose": image.cameras.cam_from_world.tolist(),
+                "intrinsics": image.cameras.intrinsics.tolist(),
+                "size": [image.cameras.width, image.cameras.height],
+                "time": image.time,
             }
-            for picture in pictures
+            for image in images
         ]
         request = {"folder": str(folder.absolute()), "variant": variant.changes, "background": background.tolist()}
         try:
@@ -108,7 +108,7 @@ def _measure(request: dict[str, Any]) -> None:
         renderer = VariantRenderer(run.scene, options, background, variant.scale)
         for view in request["views"]:
             pose, intrinsics = (torch.tensor(view[name], device="cpu") for name in ("pose", "intrinsics"))
-            renderer.picture(Cameras(pose, intrinsics, *view["size"]), view["time"])
+            renderer.image(Cameras(pose, intrinsics, *view["size"]), view["time"])
     print(1024e-6 * (_kilobytes("VmHWM") - before), flush=True)
 
 

@@ -14,7 +14,7 @@ import torch
 from dyngs.api.train import num_cores
 from dyngs.config.io import load_resolved
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split, split_views
@@ -99,7 +99,7 @@ class _Session:
         config = load_resolved(runs.run_dir)
         self._runs, self._plan, self._meter, self._log = runs, plan, meter, log
         self._capture = read_capture(config.data)
-        self._loader = PictureLoader(split_views(self._capture, plan.split), config.data)
+        self._loader = ImageLoader(split_views(self._capture, plan.split), config.data)
         self._loader.device = plan.device
         self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1].to(plan.device)
         self._lpips = load_lpips("alex", plan.device)
@@ -123,7 +123,7 @@ class _Session:
             return read_measurement(path)
         folder, renderer = self._runs.folder(variant), self._renderer(variant)
         quality = measure_quality(renderer, (self._loader[i] for i in range(len(self._loader))), self._lpips)
-        shown = self._pictures(MEMORY_VIEWS)
+        shown = self._images(MEMORY_VIEWS)
         measurement = Measurement(
             variant=variant,
             num_views=len(self._loader),
@@ -148,11 +148,11 @@ class _Session:
         groups = [missing[i : i + SERIES] for i in range(0, len(missing), SERIES)]
         if first.speed is None and not groups:
             groups = [[]]
-        pictures = self._pictures(TIMED_VIEWS)
+        images = self._images(TIMED_VIEWS)
         for group in groups:
             self._log(f"timing {len(group) + 1} variants in turn")
             together = [first, *group]
-            speeds = time_interleaved([self._renderer(m.variant) for m in together], pictures, self._plan.rounds)
+            speeds = time_interleaved([self._renderer(m.variant) for m in together], images, self._plan.rounds)
             for m, speed in zip(together, speeds, strict=True):
                 if m.speed is None:
                     write_measurement(self._path(m.variant), replace(m, speed=speed))
@@ -163,7 +163,7 @@ class _Session:
         scene = scene_of_split(run, self._capture, self._plan.split).to(self._plan.device)
         return VariantRenderer(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
 
-    def _pictures(self, count: int) -> list[Picture]:
+    def _images(self, count: int) -> list[Image]:
         return [self._loader[i] for i in evenly_spaced(len(self._loader), count)]
 
     def _path(self, variant: Variant) -> Path:

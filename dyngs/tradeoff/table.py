@@ -22,7 +22,7 @@ class TableRow:
         psnr, ssim, lpips: means over the split; LPIPS is None where it cannot be computed.
         fps: frames per second of the run itself times ``gain``, so that variants timed at another hour compare.
         gain, gain_low, gain_high: speed relative to the run: median and quartiles of interleaved pairs.
-        ms: median time of one picture as measured.
+        ms: median time of one image as measured.
         mb, memory_mb, gaussians: see ``Measurement``.
         on_front: on the Pareto front of PSNR, speed and size.
     """

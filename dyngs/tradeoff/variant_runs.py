@@ -151,7 +151,7 @@ def run_settings(run_dir: Path) -> RunSettings:
         transmittance_min=model.transmittance_min,
         mask_times=config.prune.mask_times,
         colour=config.colour.kind,
-        field=None if moves_by is None or scene.is_still else moves_by.kind,
+        field=None if moves_by is None or scene.is_static else moves_by.kind,
     )
 
 
@@ -185,7 +185,7 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
 def _pruning_overrides(wanted: Variant, own: PruneConfig) -> Sequence[str]:
     """Return overrides of the pruning stage; masks are those of the run where the variant has none."""
     masks = (f"prune.mask_times={wanted.mask_times or own.mask_times}", f"prune.mask_below={own.mask_below}")
-    return (f"prune.share={wanted.prune}", *masks)
+    return (f"prune.fraction={wanted.prune}", *masks)
 
 
 def field_changes(config: Config, wanted: Variant) -> Iterator[str]:

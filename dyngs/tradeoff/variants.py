@@ -26,11 +26,11 @@ class Variant:
         colour: ``colour.kind`` to train with.
         field: ``model.deform.kind`` to train with.
         field_size: factor on the nodes, channels, neurons or frequencies of the field to train with.
-        prune: share of the Gaussians removed, by ``sensitivity``.
+        prune: fraction of the Gaussians removed, by ``sensitivity``.
         mask_times: key times of visibility masks.
         finetune: training steps after pruning and masking.
         sh_degree: higher spherical harmonics are dropped.
-        storage: allowed change of pictures by quantisation, grey levels of 255, or "auto"; None: float32.
+        storage: allowed change of images by quantisation, grey levels of 255, or "auto"; None: float32.
         field_step: factor on the quantisation steps of the field.
         mode, alpha_min, transmittance_min: ``model.rasterize_mode`` and so on to render with.
         scale: width and height rendered, relative to those shown.

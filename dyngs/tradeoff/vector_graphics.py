@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 PIXELS = 2
 """Pixels per unit of a drawing."""
 SUPERSAMPLING = 2
-"""Pictures are drawn larger by this factor and reduced, which smooths their edges."""
+"""Images are drawn larger by this factor and reduced, which smooths their edges."""
 _ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}
 _INK = "#222222"
 

@@ -1,4 +1,4 @@
-"""Training of a network of people on the pictures of one person, before that person is predicted from them."""
+"""Training of a network of people on the images of one person, before that person is predicted from them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import Tensor
 
 from dyngs.config import Config, HumanPredictorModel
 from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.gaussians.scene import render_options
 from dyngs.human.prediction.network import AtlasNetwork
 from dyngs.human.prediction.predict import predict_gaussians
-from dyngs.scene import render_options
 from dyngs.static.rates import Rates
 from dyngs.training.background import evaluation_background
-from dyngs.training.prediction import MAX_GRADIENT, Filmed, human_options, picture_loss, scene_of
+from dyngs.training.prediction import MAX_GRADIENT, Filmed, human_options, image_loss, scene_of
 
 _RATE = 1e-4
-"""Highest learning rate of Adam per picture, which falls linearly: a single one says little about the other sides."""
+"""Highest learning rate of Adam per image, which falls linearly: a single one says little about the other sides."""
 
 
 def adapt_network(
@@ -31,11 +31,11 @@ def adapt_network(
     steps: int,
     report: ReportProgress = report_nothing,
 ) -> None:
-    """Train ``network`` in place until its prediction shows the pictures better that it is predicted from.
+    """Train ``network`` in place until its prediction shows the images better that it is predicted from.
 
     Args:
         network: trained on other people.
-        person: with pictures.
+        person: with images.
         views: predicted from, and compared with.
         mean: (3, S, S) colours of the training people.
         config: of the network's run.
@@ -45,17 +45,17 @@ def adapt_network(
     """
     options = replace(render_options(model), nonfinite="trust")
     background = evaluation_background(config.data.background, True)[1]
-    pictures, maps = [person.pictures[i] for i in views], person.look(list(views))
+    images, maps = [person.images[i] for i in views], person.look(list(views))
     rate, human = _RATE * len(views), human_options(model)
     optimizer = torch.optim.Adam(network.parameters(), lr=rate)
     for step in range(steps):
-        avatar = predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_share)
+        avatar = predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_fraction)
         scene = scene_of(human, avatar, Rates(1))[0]
         total = torch.zeros((), device=mean.device)
-        for picture in pictures:
-            moment = scene.moment(picture.time)
-            rendering = scene.render(picture.cameras, moment, options=options, background=background)
-            total = total + picture_loss(rendering, picture, picture.composite(background), config) / len(pictures)
+        for image in images:
+            moment = scene.moment(image.time)
+            rendering = scene.render(image.cameras, moment, options=options, background=background)
+            total = total + image_loss(rendering, image, image.composite(background), config) / len(images)
         optimizer.zero_grad(set_to_none=True)
         total.backward()
         if not bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT).isfinite()):
@@ -63,4 +63,4 @@ def adapt_network(
         for group in optimizer.param_groups:
             group["lr"] = rate * (1.0 - step / steps)
         optimizer.step()
-        report("training on the pictures", step + 1, steps)
+        report("training on the images", step + 1, steps)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
 OPAQUE = 0.99
@@ -16,12 +16,12 @@ OPAQUE = 0.99
 ALIKE = 0.1
 """Largest difference of a channel up to which a colour counts as that of the background."""
 MANY_ALIKE = 0.05
-"""Share of the opaque pixels of the background's colour from which silhouettes are trained on: with 0.12 (orbits) the
-whole picture gains 0.8 dB, with 0 (flag) nothing; in between nothing was measured."""
+"""Fraction of the opaque pixels of the background's colour from which silhouettes are trained on: with 0.12 (orbits)
+the whole image gains 0.8 dB, with 0 (flag) nothing; in between nothing was measured."""
 WEIGHT = 0.1
 """Weight of the mean error of alpha there."""
-PICTURES = 12
-"""Number of pictures in which colours are compared with the background."""
+IMAGES = 12
+"""Number of images in which colours are compared with the background."""
 
 
 @dataclass(frozen=True)
@@ -37,32 +37,32 @@ class AlphaWeight:
     finding: str | None = None
 
 
-def measured_alpha_weight(pictures: Iterable[Picture], background: Tensor) -> AlphaWeight:
-    """Return the weight of the mean error of alpha that suits ``pictures`` on the colour ``background`` (3,)."""
-    share = share_alike(pictures, background)
-    if share is None:
+def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> AlphaWeight:
+    """Return the weight of the mean error of alpha that suits ``images`` on the colour ``background`` (3,)."""
+    fraction = share_alike(images, background)
+    if fraction is None:
         return AlphaWeight()
-    uses = share >= MANY_ALIKE
-    text = f"{share:.1%} of the opaque pixels have nearly the background's colour: " + (
+    uses = fraction >= MANY_ALIKE
+    text = f"{fraction:.1%} of the opaque pixels have nearly the background's colour: " + (
         f"silhouettes count, too (train.alpha_weight={WEIGHT:g})" if uses else "silhouettes are not needed"
     )
     return AlphaWeight(WEIGHT if uses else 0.0, text)
 
 
-def share_alike(pictures: Iterable[Picture], background: Tensor) -> float | None:
-    """Return the share of the opaque pixels whose channels all differ from ``background`` (3,) by ``ALIKE`` or less.
+def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
+    """Return the fraction of the opaque pixels whose channels all differ from ``background`` (3,) by ``ALIKE`` or less.
 
     None where there are no opaque pixels beside a background. Masked pixels do not count.
     """
     opaque, alike, shows_background = 0, 0, False
-    for picture in pictures:
-        if picture.alpha is None:
+    for image in images:
+        if image.alpha is None:
             continue
-        shows_background |= bool((picture.alpha < OPAQUE).any())
-        counts = picture.alpha >= OPAQUE
-        if picture.mask is not None:
-            counts &= picture.mask > 0
-        colours = picture.rgb_premultiplied[counts] / picture.alpha[counts][:, None]
+        shows_background |= bool((image.alpha < OPAQUE).any())
+        counts = image.alpha >= OPAQUE
+        if image.mask is not None:
+            counts &= image.mask > 0
+        colours = image.rgb_premultiplied[counts] / image.alpha[counts][:, None]
         opaque += len(colours)
         alike += int(((colours - background).abs() <= ALIKE).all(1).sum())
     return alike / opaque if opaque and shows_background else None

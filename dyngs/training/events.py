@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.metrics import psnr
 
 if TYPE_CHECKING:
@@ -27,22 +27,22 @@ class StepReport:
     Attributes:
         step: its number, from 1.
         loss: regularizers included.
-        picture: what was trained on.
+        image: what was trained on.
         rendered, truth: (H, W, 3) on the same background.
         finding: lines about what was found out after the step, or None.
     """
 
     step: int
     loss: float
-    picture: Picture
+    image: Image
     rendered: Tensor
     truth: Tensor
     finding: str | None = None
 
     @cached_property
     def psnr(self) -> float:
-        """PSNR of the picture, dB, at most 100; NaN where its mask leaves nothing, or it is not finite."""
-        return psnr(self.rendered, self.truth, self.picture.mask)
+        """PSNR of the image, dB, at most 100; NaN where its mask leaves nothing, or it is not finite."""
+        return psnr(self.rendered, self.truth, self.image.mask)
 
 
 @dataclass(frozen=True)

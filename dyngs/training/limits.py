@@ -16,12 +16,12 @@ from dyngs.deform.fields import new_field
 from dyngs.errors import DyngsError
 from dyngs.training.processes import Processes
 
-RANDOM_SHARE = 0.1
-"""Share of the limit that is kept free for the random Gaussians with which motion begins."""
+RANDOM_FRACTION = 0.1
+"""Fraction of the limit that is kept free for the random Gaussians with which motion begins."""
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
 """Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in docs/storage.md."""
 CLOSE = 0.8
-"""Share of the limit from which the limit counts as having held growth back."""
+"""Fraction of the limit from which the limit counts as having held growth back."""
 FEWEST = 500
 """Fewest Gaussians that a limit on the size must have room for."""
 
@@ -65,7 +65,7 @@ def shared(config: Config, processes: Processes) -> Config:
 
 
 def _require_batch(config: Config) -> None:
-    """Raise where several views per step are asked for, and something that follows single pictures."""
+    """Raise where several views per step are asked for, and something that follows single images."""
     if config.train.batch_size == 1:
         return
     asked = f"train.batch_size={config.train.batch_size}"
@@ -78,7 +78,7 @@ def _require_batch(config: Config) -> None:
     }
     for key, value in single.items():
         if value != "never":
-            raise DyngsError(f"{asked}: {key}={value} follows one picture per step; give {key}=never, or one process")
+            raise DyngsError(f"{asked}: {key}={value} follows one image per step; give {key}=never, or one process")
 
 
 def within_cap(config: Config, num_times: int) -> Config:
@@ -96,7 +96,7 @@ def within_cap(config: Config, num_times: int) -> Config:
         return config
     added = added_for_motion(config)
     if added:
-        added = min(added, int(RANDOM_SHARE * cap))
+        added = min(added, int(RANDOM_FRACTION * cap))
         changes["model"] = config.model.model_copy(update={"num_random_moving": added})
     cap -= added
     return config.model_copy(update=changes | {"strategy": config.strategy.limited(cap)})

@@ -35,7 +35,7 @@ class Trainable(Protocol):
     def has_test_views(self) -> bool: ...
 
     def step(self) -> StepReport:
-        """Train on one picture, or one choice of them.
+        """Train on one image, or one choice of them.
 
         Raises:
             DyngsError: the loss is not finite.

@@ -1,4 +1,4 @@
-"""The memory that a run will take: its pictures, its Gaussians with the state of Adam, and what a step draws into."""
+"""The memory that a run will take: its images, its Gaussians with the state of Adam, and what a step draws into."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dyngs.config import (
 from dyngs.config.kinds import added_for_motion, field_of, person_of, stored_sh_degree
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
-from dyngs.ops.device import card_memory, num_cards
+from dyngs.ops.device import gpu_memory, num_gpus
 from dyngs.training.limits import num_field_values
 from dyngs.training.schedule import densify_schedule, growth_per_change
 from dyngs.training.trainer import Trainer
@@ -50,7 +50,7 @@ FEW_TIMES = 100
 SHAPE_VALUES = 11
 """Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity."""
 DRAWING_BYTES = 200
-"""Bytes per pixel of the largest picture that a step takes beside them: rendering, truth, windows of SSIM."""
+"""Bytes per pixel of the largest image that a step takes beside them: rendering, truth, windows of SSIM."""
 STEP_BYTES = 30_000_000
 """Bytes of any step: code and buffers that the first one touches."""
 DECODING_BYTES = 45
@@ -60,7 +60,7 @@ USUAL_GAUSSIANS, USUAL_CHANGES = 250_000, 34
 """Gaussians that photos led to in 7,000 steps (fox 268,000, cup 204,000, lego 173,000: docs/benchmarks.md), in which
 their set changes so often; fewer in proportion in shorter runs."""
 USUAL_SIDE = 400
-"""Longest side of the pictures, px, from which on that holds; below it goes with the root of the side."""
+"""Longest side of the images, px, from which on that holds; below it goes with the root of the side."""
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _SWAP = "/sys/fs/cgroup/memory.swap.max"
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
@@ -72,7 +72,7 @@ class MemoryForecast:
 
     Attributes:
         program: taken already.
-        pictures: that decoded ones will take, in the cache or on their way to it.
+        images: that decoded ones will take, in the cache or on their way to it.
         drawing: for a step.
         field: of what all Gaussians share: grids and networks of a deformation field.
         count: Gaussians that may be expected.
@@ -82,15 +82,15 @@ class MemoryForecast:
         least_each: bytes that a Gaussian certainly takes.
         free: of this machine and this process's limits, beside what is taken already; None: not known.
         whole: of this machine with its swap, or the limit of its container; None: not known.
-        all_kept: every picture has its place in the cache.
+        all_kept: every image has its place in the cache.
         processes: on this machine that take as much.
-        longest_side: of the pictures, px.
-        on_card: it is the memory of a card, where pictures take no more than their share.
+        longest_side: of the images, px.
+        on_gpu: it is the memory of a GPU, where images take no more than their share.
         limits: key that limits the number of Gaussians, and its value at ``count`` of them.
     """
 
     program: int
-    pictures: int
+    images: int
     drawing: int
     field: int
     count: int
@@ -103,24 +103,24 @@ class MemoryForecast:
     all_kept: bool
     processes: int = 1
     longest_side: int = 0
-    on_card: bool = False
+    on_gpu: bool = False
     limits: tuple[str, int] = ("strategy.max_gaussians", 0)
 
     @property
     def total(self) -> int:
         """Of a process."""
-        return self.program + self.pictures + self.drawing + self.field + self.count * self.each
+        return self.program + self.images + self.drawing + self.field + self.count * self.each
 
     @property
     def certain(self) -> int:
         """What a process takes at least: without the room that an allocator needs, and whatever is drawn."""
-        return self.program + self.pictures + self.least * self.least_each
+        return self.program + self.images + self.least * self.least_each
 
     def __str__(self) -> str:
-        limit = "a quarter of it" if self.on_card else "data.cache_mb"
+        limit = "a quarter of it" if self.on_gpu else "data.cache_mb"
         kept = "all kept" if self.all_kept else f"as many as {limit} keeps"
         parts = f"{_gb(self.program)} program, " if self.program else ""
-        parts += f"{_gb(self.pictures)} pictures ({kept}), {_gb(self.drawing)} drawing, "
+        parts += f"{_gb(self.images)} images ({kept}), {_gb(self.drawing)} drawing, "
         parts += f"{_gb(self.field)} field, " if self.field else ""
         parts += f"{_gb(self.count * self.each)} for some {self.count:,} Gaussians" if self.count else "no Gaussians"
         if self.most > 2 * self.count:
@@ -149,13 +149,13 @@ class MemoryForecast:
         if self.whole is None or needed <= self.whole:
             return
         raise DyngsError(
-            f"at least {_gb(needed)} GB of {self._place} are needed, and this {'card' if self.on_card else 'machine'} "
+            f"at least {_gb(needed)} GB of {self._place} are needed, and this {'GPU' if self.on_gpu else 'machine'} "
             f"gives {_gb(self.whole)}: give {self._advice()}"
         )
 
     @property
     def _place(self) -> str:
-        return "memory of the card" if self.on_card else "memory"
+        return "memory of the GPU" if self.on_gpu else "memory"
 
     @property
     def _growth(self) -> int:
@@ -167,7 +167,7 @@ class MemoryForecast:
         return f"{_gb((self.free or 0) + self.program)} are there"
 
     @property
-    def _share(self) -> int:
+    def _fraction(self) -> int:
         """Bytes that this process may still take."""
         return min(x for x in (self.free, self.whole) if x is not None) // self.processes
 
@@ -175,19 +175,19 @@ class MemoryForecast:
         """Return how many Gaussians there is room for beside the rest; None: not known."""
         if self.free is None:
             return None
-        return max(self._share - (self.total - self.program - self.count * self.each), 0) // self.each
+        return max(self._fraction - (self.total - self.program - self.count * self.each), 0) // self.each
 
     def _advice(self) -> str:
         """Return the keys to lower, with values that make the run fit, the least that does first."""
-        rest = self.total - self.program - self.pictures
-        room, gaussians = 0.95 * self._share, self.count * self.each
-        if rest < room and not self.on_card:
-            return f"data.cache_mb={1e-6 * (room - rest):.0f} (pictures are then decoded again and again)"
+        rest = self.total - self.program - self.images
+        room, gaussians = 0.95 * self._fraction, self.count * self.each
+        if rest < room and not self.on_gpu:
+            return f"data.cache_mb={1e-6 * (room - rest):.0f} (images are then decoded again and again)"
         found, left = [], room - 0.2 * room
-        if self.pictures > 0.2 * room and not self.on_card:
+        if self.images > 0.2 * room and not self.on_gpu:
             found.append(f"data.cache_mb={0.2e-6 * room:.0f}")
         else:
-            left = room - self.pictures
+            left = room - self.images
         fixed = self.drawing + self.field
         if fixed > 0.5 * left and self.drawing and self.longest_side:
             allowed = max(0.5 * left - self.field, 0.05 * left)
@@ -209,42 +209,42 @@ class MemoryForecast:
 def memory_forecasts(trainer: Trainer, processes: int = 1) -> list[MemoryForecast]:
     """Return the memory that the run of ``trainer``, which has not begun to step, is expected to take.
 
-    On a card first that of the card, with the scene, and then that of the machine, with what stays on the CPU.
+    On a GPU first that of the GPU, with the scene, and then that of the machine, with what stays on the CPU.
 
     Args:
         trainer: of the run.
         processes: on this machine that train it together.
     """
     whole = memory_forecast(trainer, processes)
-    card = card_memory(trainer.device)
-    if card is None:
+    gpu = gpu_memory(trainer.device)
+    if gpu is None:
         return [whole]
-    free, there = card
-    on_card = replace(
+    free, there = gpu
+    on_gpu = replace(
         whole,
         program=0,  # the driver and torch have taken theirs when this is asked
-        pictures=trainer.pictures.bytes_on_card,
+        images=trainer.images.bytes_on_gpu,
         free=free,
         whole=there,
-        all_kept=trainer.pictures.keeps_all_on_card,
-        processes=-(-processes // num_cards()),
-        on_card=True,
+        all_kept=trainer.images.keeps_all_on_gpu,
+        processes=-(-processes // num_gpus()),
+        on_gpu=True,
     )
-    return [on_card, replace(whole, drawing=STEP_BYTES, field=0, count=0, most=0, least=0)]
+    return [on_gpu, replace(whole, drawing=STEP_BYTES, field=0, count=0, most=0, least=0)]
 
 
 def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
     """Return what ``memory_forecasts`` says of the machine, as if the scene were there."""
-    pictures, config = trainer.pictures, trainer.config
-    pixels = max((width * height for width, height in pictures.sizes), default=0)
-    files = max((view.width * view.height for view in pictures.views), default=0)
-    waiting = (pictures.decoded_ahead // 2 or 1) * DECODING_BYTES * files
-    now, side = trainer.num_gaussians, max((max(size) for size in pictures.sizes), default=0)
+    images, config = trainer.images, trainer.config
+    pixels = max((width * height for width, height in images.sizes), default=0)
+    files = max((view.width * view.height for view in images.views), default=0)
+    waiting = (images.decoded_ahead // 2 or 1) * DECODING_BYTES * files
+    now, side = trainer.num_gaussians, max((max(size) for size in images.sizes), default=0)
     return MemoryForecast(
         program=resident_memory(),
-        pictures=pictures.bytes_to_come + waiting,
+        images=images.bytes_to_come + waiting,
         drawing=STEP_BYTES + DRAWING_BYTES * pixels,
-        field=field_bytes(config, len(set(pictures.times))),
+        field=field_bytes(config, len(set(images.times))),
         count=expected_gaussians(config, now, side),
         most=max(config.strategy.growth_limit, now),
         least=now,
@@ -252,7 +252,7 @@ def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
         least_each=4 * NEEDED_COPIES * stored_values(config),
         free=free_memory(),
         whole=whole_memory(),
-        all_kept=pictures.keeps_all,
+        all_kept=images.keeps_all,
         processes=processes,
         longest_side=side,
         limits=_limit_of_gaussians(config),
@@ -340,7 +340,7 @@ def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE)
     Args:
         config: of the run.
         now: Gaussians at its beginning.
-        longest_side: of its pictures, px.
+        longest_side: of its images, px.
     """
     match config.strategy:
         case McmcStrategy():

@@ -1,4 +1,4 @@
-"""What other views show at the places that a rendering says a picture shows, in coarse cells."""
+"""What other views show at the places that a rendering says an image shows, in coarse cells."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 
 CELLS = 40
-"""Cells along the longest side of a picture."""
+"""Cells along the longest side of an image."""
 NEAREST = 24
 """Views that are asked, at most."""
 FEWEST = 3
 """Views that must see a place, at least."""
 SOLID = 0.5
-"""Alpha from which the drawn depth means anything; and the share of a cell that its picture's mask must keep."""
+"""Alpha from which the drawn depth means anything; and the fraction of a cell that its image's mask must keep."""
 _TINY = 1e-6
 
 
 def grid_of(width: int, height: int) -> tuple[int, int]:
-    """Return the rows and columns of the cells of a picture."""
+    """Return the rows and columns of the cells of an image."""
     longest = max(width, height)
     return max(1, round(CELLS * height / longest)), max(1, round(CELLS * width / longest))
 
 
 class OtherViews:
-    """Mean colours of the cells of all training pictures, and where cells of one are found in the others.
+    """Mean colours of the cells of all training images, and where cells of one are found in the others.
 
     Args:
-        pictures: of training.
+        images: of training.
         cameras: V cameras of their full size.
-        corrected: returns the camera of a view as it is by now, see ``PictureLoader``; None: it stays.
+        corrected: returns the camera of a view as it is by now, see ``ImageLoader``; None: it stays.
     """
 
     def __init__(
         self,
-        pictures: PictureLoader,
+        images: ImageLoader,
         cameras: Sequence[Cameras],
         corrected: Callable[[int, Cameras], Cameras] | None = None,
     ) -> None:
-        self._pictures, self._cameras, self._corrected = pictures, list(cameras), corrected
+        self._images, self._cameras, self._corrected = images, list(cameras), corrected
         self._poses = torch.cat([camera.cam_from_world for camera in cameras]).cpu()
         self._intrinsics = torch.cat([camera.intrinsics for camera in cameras]).cpu()
         self._sizes = torch.tensor([[camera.width, camera.height] for camera in cameras], device="cpu")
@@ -56,7 +56,7 @@ class OtherViews:
         self._cells: dict[int, Tensor] = {}
 
     def cells_of(self, index: int, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the (3, h, w) mean colours of a picture on ``background`` (3,), and (h, w) bool which cells count."""
+        """Return the (3, h, w) mean colours of an image on ``background`` (3,), and (h, w) bool which cells count."""
         rows, columns = self._grids[index].tolist()
         cells = self._table(index)[:, :rows, :columns]
         return cells[:3] + (1 - cells[3]) * background[:, None, None], cells[4] > SOLID
@@ -65,10 +65,10 @@ class OtherViews:
         """Return (P,) the median difference of other views from the rendering; infinite where too few see a place.
 
         Args:
-            index: of the picture.
+            index: of the image.
             which: (h, w) bool, P of its cells.
             drawn: (5, h, w) colour, expected depth and alpha of the rendering.
-            background: (3,) behind all pictures.
+            background: (3,) behind all images.
         """
         shown, others = drawn[:, which], self._asked(index)
         if not len(others) or not shown.shape[1]:
@@ -88,7 +88,7 @@ class OtherViews:
         return order[self._distance[index][order].isfinite()]
 
     def _found(self, index: int, which: Tensor, depth: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the (J, P) indices of the cells where other views see P cells of a picture, and whether they do."""
+        """Return the (J, P) indices of the cells where other views see P cells of an image, and whether they do."""
         grid, size = self._grids[index], self._sizes[index].float()
         poses, intrinsics = self._now(torch.cat([others.new_tensor([index]), others]))
         places = which.nonzero().flip(1)  # column, row
@@ -116,12 +116,12 @@ class OtherViews:
         return poses, intrinsics
 
     def _table(self, index: int) -> Tensor:
-        """Return the (5, CELLS, CELLS) cells of a picture: premultiplied colour, alpha, mask; zeros beyond its grid."""
+        """Return the (5, CELLS, CELLS) cells of an image: premultiplied colour, alpha, mask; zeros beyond its grid."""
         if index not in self._cells:
-            picture = self._pictures[index]
-            rgb = picture.rgb_premultiplied
+            image = self._images[index]
+            rgb = image.rgb_premultiplied
             ones = torch.ones_like(rgb[..., 0])
-            alpha, mask = (ones if x is None else x for x in (picture.alpha, picture.mask))
+            alpha, mask = (ones if x is None else x for x in (image.alpha, image.mask))
             rows, columns = self._grids[index].tolist()
             table = torch.zeros(5, CELLS, CELLS, device="cpu")
             pixels = torch.cat([rgb, alpha[..., None], mask[..., None]], -1).permute(2, 0, 1)

@@ -1,4 +1,4 @@
-"""Training of the network that predicts people from a few pictures, on captures of several (GHG, Kwon et al. 2024)."""
+"""Training of the network that predicts people from a few images, on captures of several (GHG, Kwon et al. 2024)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
 from dyngs.config.kinds import network_of
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
+from dyngs.gaussians.rendering import Rendering
+from dyngs.gaussians.scene import render_options
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.prediction.network import AtlasNetwork
@@ -24,8 +26,6 @@ from dyngs.human.template.load import load_template
 from dyngs.ops.device import CPU, device_for
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.transfer import sent
-from dyngs.rendering import Rendering
-from dyngs.scene import render_options
 from dyngs.state import fields_moved_to
 from dyngs.static.rates import Rates
 from dyngs.tensor_checks import require_tensor
@@ -35,13 +35,13 @@ from dyngs.training.sampler import ViewSampler
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 
 WARM_UP = 0.05
-"""Share of the run in which the highest learning rate is reached."""
+"""Fraction of the run in which the highest learning rate is reached."""
 WEIGHT_DECAY = 1e-5
 """Weight decay of AdamW."""
 MAX_GRADIENT = 1.0
 """Norm to which gradients are clipped."""
 MEAN_VIEWS = 8
-"""Pictures of each person that the mean colours are taken from."""
+"""Images of each person that the mean colours are taken from."""
 
 _LOWEST = 1e-3
 """Ratio of the last to the highest learning rate."""
@@ -49,19 +49,19 @@ _LOWEST = 1e-3
 
 @dataclass
 class Filmed:
-    """A person to train on: pictures, and the choices of those that are predicted from, with their maps once known.
+    """A person to train on: images, and the choices of those that are predicted from, with their maps once known.
 
     All that is observed is observed on the CPU.
     """
 
     sitter: CapturedPerson
-    pictures: PictureLoader
+    images: ImageLoader
     choices: list[list[int]]
     _maps: dict[int, TexelMaps] = field(default_factory=dict)
     _there: CapturedPerson | None = None
 
     def maps(self, choice: int, device: torch.device) -> TexelMaps:
-        """Return the maps of the pictures of a choice on ``device``; kept."""
+        """Return the maps of the images of a choice on ``device``; kept."""
         if choice not in self._maps:
             self._maps[choice] = fields_moved_to(self.look(self.choices[choice]), device)
         return self._maps[choice]
@@ -73,10 +73,8 @@ class Filmed:
         return self._there
 
     def look(self, views: list[int]) -> TexelMaps:
-        """Return the maps of these pictures."""
-        return observe_texels(
-            self.sitter, ((self.pictures[i], self.sitter.pose_in(self.sitter.views[i])) for i in views)
-        )
+        """Return the maps of these images."""
+        return observe_texels(self.sitter, ((self.images[i], self.sitter.pose_in(self.sitter.views[i])) for i in views))
 
 
 @dataclass
@@ -115,7 +113,7 @@ class NetworkTrainer:
         return self.num_gaussians
 
     def step(self) -> StepReport:
-        """Train on one person: predicted from one choice of pictures, compared with others of one moment.
+        """Train on one person: predicted from one choice of images, compared with others of one moment.
 
         Raises:
             DyngsError: the loss is not finite.
@@ -127,20 +125,20 @@ class NetworkTrainer:
         background = sent(background_colour(self.background, self.generator), self.device)
         drawing = replace(render_options(self.model), nonfinite="trust")
         sitter, maps = person.sitter_on(self.device), person.maps(choice, self.device)
-        avatar = predict_gaussians(sitter, maps, self.mean, self.network, self.model.min_silhouette_share)
+        avatar = predict_gaussians(sitter, maps, self.mean, self.network, self.model.min_silhouette_fraction)
         scene, training = scene_of(human_options(self.model), avatar, Rates(1))
         moment = training.moment(scene, targets[0], step)
         total = torch.zeros((), device=self.mean.device)
-        for picture in targets:
-            rendering = scene.render(picture.cameras, moment, options=drawing, background=background)
-            truth = picture.composite(background)
-            total = total + picture_loss(rendering, picture, truth, self.config) / len(targets)
+        for image in targets:
+            rendering = scene.render(image.cameras, moment, options=drawing, background=background)
+            truth = image.composite(background)
+            total = total + image_loss(rendering, image, truth, self.config) / len(targets)
         value = float(total.detach())
         if not math.isfinite(value):
             raise DyngsError(f"step {step}, {sitter.name}: the loss is {value}; lower model.lr")
         self._update(total, step)
         self.done, self.num_gaussians = step, len(avatar.gaussians)
-        return StepReport(step, value, picture, rendering.rgb[0].detach(), truth)
+        return StepReport(step, value, image, rendering.rgb[0].detach(), truth)
 
     def checkpoint(self) -> Checkpoint:
         """Return everything that ``restore`` needs."""
@@ -174,14 +172,14 @@ class NetworkTrainer:
                 }
         self.done = checkpoint.info.step
 
-    def _targets(self, person: Filmed, inputs: list[int]) -> list[Picture]:
-        """Return pictures of one moment that were not predicted from, where there are any."""
+    def _targets(self, person: Filmed, inputs: list[int]) -> list[Image]:
+        """Return images of one moment that were not predicted from, where there are any."""
         views = person.sitter.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
         frame = views[others[self._draw(len(others))]].frame
         shown = [i for i in others if views[i].frame == frame]
         order = torch.randperm(len(shown), generator=self.generator, device="cpu").tolist()
-        return [person.pictures[shown[i]].to(self.device) for i in order[: self.model.target_views]]
+        return [person.images[shown[i]].to(self.device) for i in order[: self.model.target_views]]
 
     def _update(self, loss: Tensor, step: int) -> None:
         self.optimizer.zero_grad(set_to_none=True)
@@ -198,16 +196,16 @@ class NetworkTrainer:
         return int(torch.randint(count, (1,), generator=self.generator, device="cpu"))
 
 
-def picture_loss(rendering: Rendering, picture: Picture, truth: Tensor, config: Config) -> Tensor:
-    """Return the loss of a rendering of one view against ``truth`` (H, W, 3), the picture on the same background."""
+def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config) -> Tensor:
+    """Return the loss of a rendering of one view against ``truth`` (H, W, 3), the image on the same background."""
     options, model = config.train, network_of(config)
-    loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, picture.mask)
+    loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, image.mask)
     if model is not None and model.squared_weight:
         difference = rendering.rgb[0] - truth
-        known = difference if picture.mask is None else difference * picture.mask[..., None]
+        known = difference if image.mask is None else difference * image.mask[..., None]
         loss = loss + model.squared_weight * known.square().mean()
-    if options.alpha_weight and picture.alpha is not None:
-        loss = loss + options.alpha_weight * (rendering.alpha[0] - picture.alpha).abs().mean()
+    if options.alpha_weight and image.alpha is not None:
+        loss = loss + options.alpha_weight * (rendering.alpha[0] - image.alpha).abs().mean()
     return loss
 
 
@@ -272,7 +270,7 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
 
 def human_options(model: HumanPredictorModel) -> HumanModel:
     """Return the section of one person with the same template, texels and scaffolds; nothing of it is learned."""
-    shared = ("body", "uv", "resolution", "scaffold_heights", "min_silhouette_share")
+    shared = ("body", "uv", "resolution", "scaffold_heights", "min_silhouette_fraction")
     drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
     return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn})
@@ -292,19 +290,17 @@ def captures_in(data: DataConfig) -> list[DataConfig]:
 
 
 def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> Filmed:
-    """Return the person of one capture, without choices of pictures.
+    """Return the person of one capture, without choices of images.
 
     Raises:
         DyngsError: no capture there, or not one of a person.
     """
     capture = read_capture(data)
-    return Filmed(
-        captured_person(capture, human_options(model), body), PictureLoader(capture.splits["train"], data), []
-    )
+    return Filmed(captured_person(capture, human_options(model), body), ImageLoader(capture.splits["train"], data), [])
 
 
 def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
-    """Return (3, S, S) mean over people of the colours that their pictures show of the lowest scaffold.
+    """Return (3, S, S) mean over people of the colours that their images show of the lowest scaffold.
 
     Where nobody is seen: the mean of all that is.
     """
@@ -325,8 +321,8 @@ def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
 def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
     """Return the learning rate of AdamW: a linear rise, then a linear fall (one cycle; Smith and Topin 2017)."""
     top = max(1, round(WARM_UP * steps))
-    share = step / top if step <= top else (steps - step) / max(steps - top, 1)
-    return model.lr * max(share, _LOWEST)
+    fraction = step / top if step <= top else (steps - step) / max(steps - top, 1)
+    return model.lr * max(fraction, _LOWEST)
 
 
 def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:

@@ -1,4 +1,4 @@
-"""The processes that train one scene together, as ``torchrun`` starts them: each takes its share of a step's views.
+"""The processes that train one scene together, as ``torchrun`` starts them: each takes its fraction of a step's views.
 
 All hold the same scene and make the same changes to it, from gradients that are summed over them. Sums are formed in
 the order of the processes, whatever arrives first: a run repeats byte by byte, and where each process takes one view,

@@ -28,16 +28,16 @@ MIN_START = 100
 """Densification never starts earlier: the first gradients say little."""
 MIN_RESET_GAP = 400
 """Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)."""
-RESET_SHARE = 0.2
-"""Share of a short run between opacity resets."""
+RESET_FRACTION = 0.2
+"""Fraction of a short run between opacity resets."""
 MAX_GROWTH = 0.25
 FILTER_EVERY = 100
 MIN_COARSE_STEPS = 1000
-"""Steps that a still model needs to show where it fails; short runs spend at most a third on it."""
+"""Steps that a static model needs to show where it fails; short runs spend at most a third on it."""
 SPLITS = (0.1, 0.3, 0.5)
-"""Steps at which still Gaussians are frozen, as shares of the part of the run that sees all times."""
-MATCH_SHARE, MATCHES_UNTIL = 0.04, 0.85
-"""Share of the run between two rounds of block matching, and after which there are no more."""
+"""Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all times."""
+MATCH_FRACTION, MATCHES_UNTIL = 0.04, 0.85
+"""Fraction of the run between two rounds of block matching, and after which there are no more."""
 GROUPS = 0.12
 """The step at which nodes may form rigid groups, likewise: after the first split."""
 LIFETIMES = 0.16
@@ -49,12 +49,12 @@ def scaled(step: int, steps: int) -> int:
     return max(1, round(step * steps / PUBLISHED_STEPS))
 
 
-def picture_divisor(options: TrainConfig, step: int) -> int:
-    """Return the divisor of the pictures' sides at ``step``: ``initial_downscale``, halved evenly until it is 1."""
+def image_divisor(options: TrainConfig, step: int) -> int:
+    """Return the divisor of the images' sides at ``step``: ``initial_downscale``, halved evenly until it is 1."""
     halvings = options.initial_downscale.bit_length() - 1
     first, last = options.resolution_grows_from, max(options.resolution_grows_from, options.resolution_full_at)
-    shares = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
-    return options.initial_downscale >> sum(step / options.steps >= share for share in shares)
+    fractions = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
+    return options.initial_downscale >> sum(step / options.steps >= fraction for fraction in fractions)
 
 
 def hold_out_until(options: TrainConfig) -> int:
@@ -94,7 +94,7 @@ def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white
             every = strategy.reset_every
             if every is None:
                 return DensifySchedule(start, stop, strategy.every, prune_scale_after=steps)
-            recovery = max(MIN_RESET_GAP, round(RESET_SHARE * steps))
+            recovery = max(MIN_RESET_GAP, round(RESET_FRACTION * steps))
             period = max(scaled(every, steps), min(every, recovery))
             resets = tuple(range(period, stop - period + 1, period))
             if white_background and steps >= PUBLISHED_STEPS and start < period:
@@ -139,9 +139,11 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     opens = max(fine, round(model.time_window_grows_from * steps))
     full = max(opens, round(model.time_window_full_at * steps))
     decays = full if model.time_window < 1 else fine
-    splits = sorted({full + round(share * (steps - full)) for share in SPLITS}) if model.freeze_below_px > 0 else []
+    splits = (
+        sorted({full + round(fraction * (steps - full)) for fraction in SPLITS}) if model.freeze_below_px > 0 else []
+    )
     splits = tuple(step for step in splits if step > full)
-    groups, lifetimes = (full + round(share * (steps - full)) for share in (GROUPS, LIFETIMES))
+    groups, lifetimes = (full + round(fraction * (steps - full)) for fraction in (GROUPS, LIFETIMES))
     return DeformSchedule(fine, opens, full, decays, splits, rates, groups, lifetimes, _matches(model, fine, steps))
 
 
@@ -149,7 +151,7 @@ def _matches(model: DynamicModel, fine: int, steps: int) -> tuple[int, ...]:
     """Return the steps after which block matching corrects motion that begins after ``fine``."""
     match model.deform:
         case ControlNodesField(block_matching=True):
-            every = max(1, round(MATCH_SHARE * steps))
+            every = max(1, round(MATCH_FRACTION * steps))
             return tuple(range(fine + every, round(MATCHES_UNTIL * steps) + 1, every))
         case _:
             return ()

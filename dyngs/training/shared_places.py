@@ -1,4 +1,4 @@
-"""Gains of pictures from the places that several of them show, solved for all at once.
+"""Gains of images from the places that several of them show, solved for all at once.
 
 Each place p that view v shows has log c_vp = g_v + a_p, the log gain of the view and the log colour of the place, for
 each channel. Whoever follows the rendering view by view finds only what differs between neighbours: a scene that was
@@ -19,10 +19,10 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.camera import Cameras
-from dyngs.colour.affine import SATURATED
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import PictureLoader
-from dyngs.rendering import Rendering
+from dyngs.data.loader import ImageLoader
+from dyngs.gaussians.colour.affine import SATURATED
+from dyngs.gaussians.rendering import Rendering
 from dyngs.training.other_views import grid_of
 
 DRAWN_FROM, ASKED = 100, 40
@@ -61,15 +61,15 @@ class _Places:
 
 
 @torch.no_grad()
-def log_gains(pictures: PictureLoader, which: Sequence[int], draw: Draw) -> Tensor:
-    """Return (V, 3) log gains of the pictures ``which``, of mean 0; 0 of all others.
+def log_gains(images: ImageLoader, which: Sequence[int], draw: Draw) -> Tensor:
+    """Return (V, 3) log gains of the images ``which``, of mean 0; 0 of all others.
 
     Args:
-        pictures: V of training.
+        images: V of training.
         which: indices of those that may be looked at.
         draw: the scene, as far as it is learned.
     """
-    cells = [_cells_of(pictures, index, draw) for index in which]
+    cells = [_cells_of(images, index, draw) for index in which]
     centres = torch.cat([x.camera.centers for x in cells]).cpu()
     distance = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
     places = [
@@ -78,7 +78,7 @@ def log_gains(pictures: PictureLoader, which: Sequence[int], draw: Draw) -> Tens
     found = torch.zeros(len(cells), 3, dtype=torch.float64, device="cpu")
     for _ in range(ROUNDS):
         found = _solved(places, found)
-    gains = torch.zeros(len(pictures), 3, device="cpu")
+    gains = torch.zeros(len(images), 3, device="cpu")
     gains[list(which)] = (found - found.mean(0)).float()
     return gains
 
@@ -102,18 +102,18 @@ def _solved(places: Sequence[_Places], gains: Tensor) -> Tensor:
     return torch.linalg.solve(products, sides)
 
 
-def _cells_of(pictures: PictureLoader, index: int, draw: Draw) -> _Cells:
-    picture = pictures[index]
-    old = picture.cameras
+def _cells_of(images: ImageLoader, index: int, draw: Draw) -> _Cells:
+    image = images[index]
+    old = image.cameras
     rows, columns = grid_of(old.width, old.height)
     scale = old.intrinsics.new_tensor([columns / old.width, rows / old.height, 1.0])
     camera = Cameras(old.cam_from_world, scale[:, None] * old.intrinsics, columns, rows)
-    drawn = draw(camera, picture.time)
+    drawn = draw(camera, image.time)
     assert drawn.depth is not None
-    rgb = picture.rgb_premultiplied
+    rgb = image.rgb_premultiplied
     bad = (rgb >= SATURATED).any(-1)
-    bad = bad if picture.alpha is None else bad | (picture.alpha < SOLID)
-    bad = bad if picture.mask is None else bad | (picture.mask < 1)
+    bad = bad if image.alpha is None else bad | (image.alpha < SOLID)
+    bad = bad if image.mask is None else bad | (image.mask < 1)
     pooled = adaptive_avg_pool2d(torch.cat([rgb, bad[..., None].float()], -1).permute(2, 0, 1).cpu(), (rows, columns))
     colours = pooled[:3].flatten(1).T
     known = (pooled[3].flatten() == 0) & (colours > DARK).all(1) & (drawn.alpha[0].flatten().cpu() > SOLID)

@@ -1,4 +1,4 @@
-"""The value of the loss, and whether it and what was drawn are finite: read at once, while a card goes on."""
+"""The value of the loss, and whether it and what was drawn are finite: read at once, while a GPU goes on."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.transfer import ReadBack, sent
@@ -31,12 +31,12 @@ class StepCheck:
         numbers += [x.detach().isfinite().all().double() for x in parts.values()]
         self._read = ReadBack(torch.stack(numbers))
 
-    def loss(self, step: int, picture: Picture, moves_by: tuple[str, str]) -> float:
+    def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:
         """Return the sum of the terms; waits for them.
 
         Args:
             step: that is being done.
-            picture: that was drawn.
+            image: that was drawn.
             moves_by: what moves the Gaussians, and its section of the configuration, for messages.
 
         Raises:
@@ -45,16 +45,16 @@ class StepCheck:
         numbers = self._read.numbers().tolist()
         values, finite = numbers[: len(self._terms)], numbers[len(self._terms) :]
         broken = [name for name, is_finite in zip(self._parts, finite, strict=True) if not is_finite]
-        where = f"step {step}, view {picture.name!r}"
+        where = f"step {step}, view {image.name!r}"
         if broken:
             what, section = moves_by
             raise DyngsError(
-                f"{where}: the {what} makes {', '.join(broken)} at {picture.time or 0:g} not finite; lower the rates "
+                f"{where}: the {what} makes {', '.join(broken)} at {image.time or 0:g} not finite; lower the rates "
                 f"in {section}"
             )
         for name, value in zip(self._terms, values, strict=True):
             if not math.isfinite(value):
-                of_picture = "look at that picture; lower the rates in optim"
-                what = of_picture if name == "picture" else "lower its weight or rate"
+                of_image = "look at that image; lower the rates in optim"
+                what = of_image if name == "image" else "lower its weight or rate"
                 raise DyngsError(f"{where}: the loss term {name!r} is {value}; {what}")
         return sum(values)

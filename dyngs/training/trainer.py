@@ -13,33 +13,33 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.colour.network import network_of
-from dyngs.colour.training import ColourTraining, TrainingLooks
-from dyngs.colour.view_dependence import MeasuredView
 from dyngs.config import Config
 from dyngs.conventions import SH_C0
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.colour.training import ColourTraining, TrainingLooks
+from dyngs.gaussians.colour.view_dependence import MeasuredView
+from dyngs.gaussians.rendering import Rendering, RenderOptions
+from dyngs.gaussians.scene import Scene, SceneTraining
 from dyngs.ops.adam import Count
 from dyngs.ops.device import CPU
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.transfer import sent
-from dyngs.rendering import Rendering, RenderOptions
-from dyngs.scene import Scene, SceneTraining
 from dyngs.state import Role, State, prefixed, tensors_of, with_role
 from dyngs.static.densify import Densifier
 from dyngs.static.fixed import FixedDensifier
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.training.background import AlphaWeight, background_colour
-from dyngs.training.camera_refinement import CameraRefinement, watched
+from dyngs.training.corrections.camera_refinement import CameraRefinement, watched
+from dyngs.training.corrections.exposure import ViewExposures
+from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.events import StepReport
-from dyngs.training.exposure import ViewExposures
 from dyngs.training.priors.used import StepView, UsedPriors
 from dyngs.training.processes import Processes
-from dyngs.training.robust import RobustMasks
 from dyngs.training.sampler import ViewSampler
-from dyngs.training.schedule import active_sh_degree, means_rate, picture_divisor, rates_of
+from dyngs.training.schedule import active_sh_degree, image_divisor, means_rate, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.training.step_check import StepCheck
 from dyngs.training.trial import decide
@@ -53,19 +53,19 @@ class Trainer:
         scene: what is trained; its Gaussians are the optimizer's parameters.
         training: how its kind is trained.
         densifier: the strategy, which adds and removes Gaussians.
-        options: how training pictures are drawn.
+        options: how training images are drawn.
         background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
         alpha: how much silhouettes count in the loss.
         generator: the only source of randomness, on the CPU.
         priors: what the user knows about the capture.
         robust: masks of what disagrees with the other views; None: all pixels count.
-        exposures: affine colours of the training pictures; None: they agree.
+        exposures: affine colours of the training images; None: they agree.
         refinement: of the cameras; None: they stay as the capture has them.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
         held_out: indices of the training views that are not trained on up to ``held_out_until``.
         held_out_until: the last step without them.
-        processes: that take a share of the views of each step; one: this.
+        processes: that take a fraction of the views of each step; one: this.
         device: where the scene is trained; see ``place``.
     """
 
@@ -75,7 +75,7 @@ class Trainer:
     optimizer: GaussianOptimizer
     densifier: Densifier
     colours: ColourTraining
-    pictures: PictureLoader
+    images: ImageLoader
     sampler: ViewSampler
     options: RenderOptions
     background: str
@@ -104,7 +104,7 @@ class Trainer:
         return self.scene.num_moving
 
     def step(self) -> StepReport:
-        """Train on this process's share of the pictures of a step; the report is of the first of them.
+        """Train on this process's fraction of the images of a step; the report is of the first of them.
 
         Raises:
             DyngsError: the loss is not finite; says which term, and leaves the parameters as they were. Other processes
@@ -142,50 +142,50 @@ class Trainer:
         return float(loss) / batch
 
     def _backward(self, step: int, index: int) -> StepReport:
-        """Add the gradients of the picture of view ``index`` to those that are there, and return how it was drawn."""
+        """Add the gradients of the image of view ``index`` to those that are there, and return how it was drawn."""
         config, scene = self.config, self.scene
-        divisor = picture_divisor(config.train, step)
-        picture = self._picture(index, step, divisor)
+        divisor = image_divisor(config.train, step)
+        image = self._image(index, step, divisor)
         background = sent(background_colour(self.background, self.generator), self.device)
-        moment = self.training.moment(scene, picture, step)
+        moment = self.training.moment(scene, image, step)
         probe = (
             torch.zeros(1, len(scene), 4, requires_grad=True, device=scene.gaussians.means.device)
             if self.densifier.wants_signal(step)
             else None
         )
-        options = self.priors.options(self._options(step), picture)
-        rendering = scene.render(picture.cameras, moment, options=options, background=background, probe=probe)
+        options = self.priors.options(self._options(step), image)
+        rendering = scene.render(image.cameras, moment, options=options, background=background, probe=probe)
         if self.robust is not None:
             coarse = replace(options, depth="expected", absgrad=False)
             with_depth = partial(scene.render, time=moment, options=coarse, background=background)
-            picture = self.robust.masked(index, step, picture, rendering.rgb[0], background, with_depth)
-        rendered, truth = rendering.rgb[0], picture.composite(background)
+            image = self.robust.masked(index, step, image, rendering.rgb[0], background, with_depth)
+        rendered, truth = rendering.rgb[0], image.composite(background)
         if self.exposures is not None:
             self.exposures.begin(step, self._wanted(step), self._drawn_with_depth(background))
-            rendered = self.exposures.applied((index, step), picture, rendering, background)
-        terms = {"picture": l1_ssim_loss(rendered, truth, config.train.ssim_weight, picture.mask)}
-        if self.alpha.weight > 0 and picture.alpha is not None:
-            error = (rendering.alpha[0] - picture.alpha).abs()
-            if self.robust is not None and picture.mask is not None:
-                error = error * picture.mask
+            rendered = self.exposures.applied((index, step), image, rendering, background)
+        terms = {"image": l1_ssim_loss(rendered, truth, config.train.ssim_weight, image.mask)}
+        if self.alpha.weight > 0 and image.alpha is not None:
+            error = (rendering.alpha[0] - image.alpha).abs()
+            if self.robust is not None and image.mask is not None:
+                error = error * image.mask
             terms["alpha"] = self.alpha.weight * error.mean()
         terms |= moment.penalties | ({} if self.exposures is None else self.exposures.penalties(index))
         first, last = self.training.window(step)
         view = StepView(index, lambda time: first <= time <= last, options)
-        terms |= self.priors.terms(scene, picture, rendering, view, self.generator)
+        terms |= self.priors.terms(scene, image, rendering, view, self.generator)
         terms |= self.densifier.regularizers(scene.gaussians) | self.colours.penalties(scene.gaussians)
         check = StepCheck(terms, moment.gaussians if scene.num_moving else None, self.device)
         sum(terms.values(), torch.zeros((), device=self.device)).backward()
-        loss = check.loss(step, picture, self.training.moves_by)
+        loss = check.loss(step, image, self.training.moves_by)
         if probe is not None and probe.grad is not None:
-            size = (picture.cameras.width, picture.cameras.height)
-            # Fewer Gaussians suit small pictures: a gradient counts for less there.
+            size = (image.cameras.width, image.cameras.height)
+            # Fewer Gaussians suit small images: a gradient counts for less there.
             self.densifier.after_backward(step, probe.grad / divisor, rendering.radii, size)
         if self.exposures is not None:
             self.bad_gradients = self.bad_gradients + self.exposures.optimize(index, step)
         if self.refinement is not None:
-            self.bad_gradients = self.bad_gradients + self.refinement.optimize(step, index, picture.cameras)
-        return StepReport(step, loss, picture, rendered.detach(), truth)
+            self.bad_gradients = self.bad_gradients + self.refinement.optimize(step, index, image.cameras)
+        return StepReport(step, loss, image, rendered.detach(), truth)
 
     def holds_out(self, index: int, step: int) -> bool:
         """Return whether the view ``index`` is held out in ``step``."""
@@ -249,11 +249,11 @@ class Trainer:
         self.place(self.device)
 
     def place(self, device: torch.device) -> None:
-        """Go on on ``device``: with the scene, its optimizers and pictures, and the strategy.
+        """Go on on ``device``: with the scene, its optimizers and images, and the strategy.
 
-        What belongs to single pictures stays on the CPU: exposures, corrections of cameras, random numbers.
+        What belongs to single images stays on the CPU: exposures, corrections of cameras, random numbers.
         """
-        self.device = self.pictures.device = device
+        self.device = self.images.device = device
         if self.scene.gaussians.means.device == device:
             return
         self.optimizer = self.optimizer.to(device)
@@ -274,25 +274,25 @@ class Trainer:
         """
         batch, wanted = self.config.train.batch_size, self._wanted(step)
         drawn = [self.sampler.next(self.generator, wanted) for _ in range(batch)]
-        share = self.processes.share(batch)
+        fraction = self.processes.share(batch)
         if batch == 1:
             return [(drawn[0], None)]
         seeds = torch.randint(2**62, (batch,), generator=self.generator, device="cpu").tolist()
-        return [(drawn[i], seeds[i]) for i in share]
+        return [(drawn[i], seeds[i]) for i in fraction]
 
-    def _picture(self, index: int, step: int, divisor: int) -> Picture:
-        """Return the picture of view ``index`` for ``step``; those after it begin to be decoded."""
-        picture = self.pictures.shrunk(index, divisor)
-        if self.pictures.decoded_ahead:
-            batch, count = self.config.train.batch_size, self.pictures.decoded_ahead * self.processes.size
-            share, coming = self.processes.share(batch), self.sampler.coming(count, self._wanted(step))
-            self.pictures.expect([view for i, view in enumerate(coming) if i % batch in share])
+    def _image(self, index: int, step: int, divisor: int) -> Image:
+        """Return the image of view ``index`` for ``step``; those after it begin to be decoded."""
+        image = self.images.shrunk(index, divisor)
+        if self.images.decoded_ahead:
+            batch, count = self.config.train.batch_size, self.images.decoded_ahead * self.processes.size
+            fraction, coming = self.processes.share(batch), self.sampler.coming(count, self._wanted(step))
+            self.images.expect([view for i, view in enumerate(coming) if i % batch in fraction])
         if self.refinement is not None:
-            picture = replace(picture, cameras=watched(picture.cameras))
-        return picture
+            image = replace(image, cameras=watched(image.cameras))
+        return image
 
     def _options(self, step: int) -> RenderOptions:
-        """Return how pictures are drawn in ``step``."""
+        """Return how images are drawn in ``step``."""
         degree = active_sh_degree(self.config.train, step, self.scene.gaussians.sh_degree)
         return replace(self.options, sh_degree=degree)
 
@@ -348,16 +348,16 @@ class Trainer:
         colour = background_colour(self.background).to(self.device)
 
         def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
-            for picture in (self.pictures[i] for i in indices):
-                gaussians = self.training.moment(self.scene, picture, step).gaussians.detach()
-                yield MeasuredView(gaussians, picture.cameras, picture.composite(colour), picture.mask)
+            for image in (self.images[i] for i in indices):
+                gaussians = self.training.moment(self.scene, image, step).gaussians.detach()
+                yield MeasuredView(gaussians, image.cameras, image.composite(colour), image.mask)
 
-        may_train = [i for i, time in enumerate(self.pictures.times) if self.training.trains_on(time, step)]
+        may_train = [i for i, time in enumerate(self.images.times) if self.training.trains_on(time, step)]
         return TrainingLooks(may_train, views, self._options(step), colour)
 
     def _wanted(self, step: int) -> Callable[[int], bool]:
         """Return which views may be trained on in ``step``."""
-        times = self.pictures.times
+        times = self.images.times
 
         def may_train(index: int) -> bool:
             return self.training.trains_on(times[index], step)
@@ -365,7 +365,7 @@ class Trainer:
         def is_wanted(index: int) -> bool:
             return may_train(index) and not self.colours.holds_out(index, step) and not self.holds_out(index, step)
 
-        return is_wanted if any(is_wanted(i) for i in range(len(self.pictures))) else may_train
+        return is_wanted if any(is_wanted(i) for i in range(len(self.images))) else may_train
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A trial between two scenes that training may go on with: both are trained equally long, on the same pictures."""
+"""A trial between two scenes that training may go on with: both are trained equally long, on the same images."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from dyngs.scene import Scene, Variant
+from dyngs.gaussians.scene import Scene, Variant
 from dyngs.training.state import Checkpoint
 
 if TYPE_CHECKING:
     from dyngs.training.trainer import Trainer
 
 COUNTED = 0.5
-"""Share of the steps, the last ones, whose errors are compared: at first a changed scene settles."""
+"""Fraction of the steps, the last ones, whose errors are compared: at first a changed scene settles."""
 
 
 def decide(trainer: Trainer, variant: Variant[Scene]) -> str:
     """Let ``trainer`` go on, from where it is, with its scene or with ``variant``, whichever does better.
 
-    Both are trained for the variant's number of steps, with the same pictures in the same order, none of which has been
+    Both are trained for the variant's number of steps, with the same images in the same order, none of which has been
     seen since the last change of either; then the trainer goes back to where it was, with the scene whose squared error
     was smaller in the last half of them. A line says which. Without steps the variant is taken.
     """
@@ -32,7 +32,7 @@ def decide(trainer: Trainer, variant: Variant[Scene]) -> str:
     trainer.scene = variant.scene
     changed = _copied(trainer.checkpoint())
     before, after = (_mean_psnr(trainer, start, variant.steps) for start in (plain, changed))
-    wins = trainer.processes.agreed(after > before)  # each process has seen pictures of its own
+    wins = trainer.processes.agreed(after > before)  # each process has seen images of its own
     trainer.restore(changed if wins else plain)
     trainer.bad_gradients = bad_gradients
     verdict = "taken" if wins else "not taken"

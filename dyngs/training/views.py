@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 
 from dyngs.camera import Cameras
+from dyngs.capture.first_points import AROUND_ORIGIN
 from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry.intrinsics import scaled_intrinsics
-from dyngs.data.pictures.images import target_size
-from dyngs.data.prepare.first_points import AROUND_ORIGIN
+from dyngs.data.images.images import target_size
 from dyngs.static.init import Surroundings
 
 
@@ -27,14 +27,14 @@ def surroundings(capture: Capture) -> Surroundings:
 
 
 def resolved_background(config: Config, capture: Capture) -> str:
-    """Return "white", "black" or "random"; "auto" is white where pictures have alpha, as in 3DGS, else black."""
+    """Return "white", "black" or "random"; "auto" is white where images have alpha, as in 3DGS, else black."""
     if config.data.background == "auto":
         return "white" if capture.has_alpha else "black"
     return config.data.background
 
 
 def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras]:
-    """Return the cameras of ``views`` as pictures of their training size, one each; no picture is read."""
+    """Return the cameras of ``views`` as images of their training size, one each; no image is read."""
     cameras = []
     for view in views:
         width, height = target_size(view.width, view.height, options.downscale, options.longest_side)

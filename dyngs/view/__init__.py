@@ -1,1 +1,1 @@
-"""The viewer: a local page that shows scenes, drawn by dyngs and streamed as pictures."""
+"""The viewer: a local page that shows scenes, drawn by dyngs and streamed as images."""

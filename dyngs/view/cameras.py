@@ -50,7 +50,7 @@ def pose_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fitting_fov(camera: Cameras, aspect: float) -> float:
-    """Return the vertical field of view, rad, at which a window shows the whole picture of one camera.
+    """Return the vertical field of view, rad, at which a window shows the whole image of one camera.
 
     Args:
         camera: one camera.

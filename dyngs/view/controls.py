@@ -11,7 +11,7 @@ from dyngs.view.frusta import Frusta
 from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.path_controls import add_path_controls
 from dyngs.view.people import person_in
-from dyngs.view.people_controls import add_person_controls, add_picture_controls
+from dyngs.view.people_controls import add_image_controls, add_person_controls
 from dyngs.view.source import Source
 from dyngs.view.viewed import Viewed
 
@@ -76,7 +76,7 @@ class Controls:
         if self._source.network is not None:
             folders.append(gui.add_folder("Predict from"))
             with folders[-1]:
-                add_picture_controls(browsing, self._source.network, self._predicted)
+                add_image_controls(browsing, self._source.network, self._predicted)
         folders.append(gui.add_folder("Camera path", expand_by_default=False))
         with folders[-1]:
             add_path_controls(browsing)
@@ -134,11 +134,11 @@ class Controls:
 
     def _add_capture(self, gui: viser.GuiApi, viewed: Viewed) -> None:
         session = self._browsing.session
-        cameras = gui.add_checkbox("Cameras", False, hint="frusta with their pictures; click one to go there")
+        cameras = gui.add_checkbox("Cameras", False, hint="frusta with their images; click one to go there")
         cameras.on_update(lambda _: self._frusta.show(viewed) if cameras.value else self._frusta.remove())
         compare = gui.add_checkbox("Compare", session.look.comparing, hint="with the truth, on the right of the line")
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
-        view = gui.add_dropdown("Picture", (NEAREST, *viewed.footage.names))
+        view = gui.add_dropdown("Image", (NEAREST, *viewed.footage.names))
         session.change(view=None)
         compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
@@ -175,7 +175,7 @@ class Controls:
         browsing.session.ask(load, "scene")
 
     def _predicted(self, viewed: Viewed) -> None:
-        """Show the person as predicted from other pictures, from the same camera."""
+        """Show the person as predicted from other images, from the same camera."""
         browsing = self._browsing
         browsing.session.show(viewed)
         browsing.client.add_notification("Predicted", viewed.notes[-1], auto_close_seconds=8.0)
@@ -185,9 +185,9 @@ class Controls:
         browsing = self._browsing
         if browsing.session.eye is None:
             return
-        picture = draw(browsing.session.viewed, browsing.session.shot())
+        image = draw(browsing.session.viewed, browsing.session.shot())
         name = f"{browsing.session.viewed.name}_{browsing.session.time:.3f}.png"
-        browsing.client.send_file_download(name, png_of(picture), save_immediately=True)
+        browsing.client.send_file_download(name, png_of(image), save_immediately=True)
 
 
 def add_controls(browsing: Browsing, source: Source, serving: Serving) -> Controls:
@@ -195,10 +195,10 @@ def add_controls(browsing: Browsing, source: Source, serving: Serving) -> Contro
     return Controls(browsing, source, serving)
 
 
-def png_of(picture: np.ndarray) -> bytes:
-    """Return a picture (H, W, 3) uint8 as the bytes of a .png file."""
+def png_of(image: np.ndarray) -> bytes:
+    """Return an image (H, W, 3) uint8 as the bytes of a .png file."""
     from PIL import Image
 
     stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, "png")
+    Image.fromarray(image).save(stream, "png")
     return stream.getvalue()

@@ -1,4 +1,4 @@
-"""The cameras of a capture in the page, as frusta with their pictures."""
+"""The cameras of a capture in the page, as frusta with their images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dyngs.view.server import Browsing
 
 _COVERS = 1.5
-"""Distance, in depths of a frustum, within which its picture would cover what is behind."""
+"""Distance, in depths of a frustum, within which its image would cover what is behind."""
 MOST = 120
 """Frusta that are shown at most, spread evenly over the cameras."""
 _SIZE = 0.05
@@ -34,7 +34,7 @@ class Frusta:
         browsing.on_move = self.hide_what_covers
 
     def show(self, viewed: Viewed) -> None:
-        """Add the frusta, picture by picture, as the thread that draws finds time."""
+        """Add the frusta, image by image, as the thread that draws finds time."""
         self.remove()
         generation = self._generation
         places = distinct(viewed.footage.poses)
@@ -49,7 +49,7 @@ class Frusta:
             handle.remove()
 
     def hide_what_covers(self) -> None:
-        """Hide the frusta that the browser's camera stands in, and all where the picture is of another camera."""
+        """Hide the frusta that the browser's camera stands in, and all where the image is of another camera."""
         session = self._browsing.session
         eye, is_elsewhere = session.eye, session.shown_view is not None
         if eye is None:
@@ -85,7 +85,7 @@ class Frusta:
     def _go(self, index: int) -> None:
         time = self._browsing.session.viewed.footage.times[index]
         self._browsing.go_to(index)
-        if time is not None and not self._browsing.session.viewed.is_still:
+        if time is not None and not self._browsing.session.viewed.is_static:
             self._browsing.session.set_time(time)
             if self._browsing.time_slider is not None:
                 self._browsing.time_slider.value = round(time, 3)
@@ -97,7 +97,7 @@ def spread(count: int, most: int) -> list[int]:
 
 
 def distinct(poses: np.ndarray) -> list[int]:
-    """Return the indices of the first view from each pose of (V, 4, 4), ascending: a standing camera is shown once."""
+    """Return the indices of the first view from each pose of (V, 4, 4), ascending: a fixed camera is shown once."""
     _, first = np.unique(poses.round(6).reshape(len(poses), -1), axis=0, return_index=True)
     return sorted(first.tolist())
 
@@ -110,6 +110,6 @@ def frustum_size(poses: np.ndarray, extent: float) -> float:
 
 
 def thumbnail(viewed: Viewed, index: int) -> np.ndarray | None:
-    """Return the small picture (h, w, 3) uint8 of a view, None where there is none."""
+    """Return the small image (h, w, 3) uint8 of a view, None where there is none."""
     loader = viewed.footage.thumbnails
     return None if loader is None else to_uint8(loader[index].composite(viewed.background).clamp(0, 1).numpy())

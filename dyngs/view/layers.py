@@ -1,4 +1,4 @@
-"""Pictures of a scene for the viewer: colours, depth, opacity, motion, and the error against the truth."""
+"""Images of a scene for the viewer: colours, depth, opacity, motion, and the error against the truth."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch.nn import functional
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.files.write import to_uint8
+from dyngs.gaussians.rendering import Rendering
+from dyngs.gaussians.scene import Moment, Scene
 from dyngs.output.contact_sheet import color_map, depth_to_rgb
 from dyngs.output.render_job import resize_cameras
-from dyngs.rendering import Rendering
-from dyngs.scene import Moment, Scene
 from dyngs.view.viewed import Viewed
 
 Layer = Literal["colour", "depth", "alpha", "motion", "error"]
@@ -33,15 +33,15 @@ _LINE = (255, 200, 0)
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture to draw.
+    """One image to draw.
 
     Attributes:
-        camera: one camera, of the size of the picture.
+        camera: one camera, of the size of the image.
         time: of the scene; None: the first.
         layer: what is shown; "error" needs ``view``.
         part: which Gaussians are drawn.
         view: the view of the capture whose camera, time and truth are shown instead; None: no truth.
-        divide: share of the width that shows the render; the truth is on the right of it.
+        divide: fraction of the width that shows the render; the truth is on the right of it.
     """
 
     camera: Cameras
@@ -53,7 +53,7 @@ class Shot:
 
 
 def draw(viewed: Viewed, shot: Shot) -> np.ndarray:
-    """Return the picture (H, W, 3) uint8 of a shot."""
+    """Return the image (H, W, 3) uint8 of a shot."""
     camera, time = shot.camera, shot.time
     if shot.view is not None:
         camera = resize_cameras(viewed.footage.cameras[shot.view], camera.width, camera.height)
@@ -73,7 +73,7 @@ def draw(viewed: Viewed, shot: Shot) -> np.ndarray:
 
 
 def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the true picture of a view as large as it fits into a window, (H, W, 3), NaN beside it; None without one.
+    """Return the true image of a view as large as it fits into a window, (H, W, 3), NaN beside it; None without one.
 
     Args:
         viewed: with a capture.
@@ -81,15 +81,15 @@ def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndar
         size: width and height of the window, px.
     """
     footage = viewed.footage
-    if footage.pictures is None:
+    if footage.images is None:
         return None
-    picture = footage.pictures[view].composite(viewed.background).cpu()
-    high, wide = picture.shape[:2]
+    image = footage.images[view].composite(viewed.background).cpu()
+    high, wide = image.shape[:2]
     width, height = size
     scale = min(width / wide, height / high)
     own = max(1, round(scale * high)), max(1, round(scale * wide))
     shown = functional.interpolate(
-        picture.permute(2, 0, 1)[None], own, mode="bilinear", align_corners=False, antialias=scale < 1
+        image.permute(2, 0, 1)[None], own, mode="bilinear", align_corners=False, antialias=scale < 1
     )
     window = np.full((height, width, 3), np.nan, np.float32)
     top, left = (height - own[0]) // 2, (width - own[1]) // 2
@@ -140,13 +140,13 @@ def _part(viewed: Viewed, part: Part) -> Scene:
 
 
 def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> np.ndarray:
-    """Return the picture of the motion (H, W, 3) uint8, on black."""
+    """Return the image of the motion (H, W, 3) uint8, on black."""
     scene, colours = viewed.scene.unmasked(), motion_colours(viewed)
     gaussians = scene.at(time)
     coloured = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None].to(gaussians.means))
     if part != "all":
         moves = torch.zeros(len(scene), dtype=torch.bool, device=gaussians.means.device)
-        if not scene.is_still:
+        if not scene.is_static:
             moves[scene.rows] = True
         coloured = coloured.select(moves if part == "moving" else ~moves)
     plain = replace(scene, colour=None, background=None)
@@ -156,7 +156,7 @@ def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> 
 
 def _motion_colours(scene: Scene) -> Tensor:
     far = torch.zeros(len(scene), device=scene.gaussians.means.device)
-    if not scene.is_still:
+    if not scene.is_static:
         whole = scene.unmasked()
         times = np.linspace(0, 1, _MOTION_TIMES).tolist()
         low = high = whole.at(times[0]).means
@@ -171,7 +171,7 @@ def _motion_colours(scene: Scene) -> Tensor:
 
 
 def _error(rgb: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the mean absolute error as colours (H, W, 3) uint8, black beside the true picture."""
+    """Return the mean absolute error as colours (H, W, 3) uint8, black beside the true image."""
     difference = np.abs(rgb.astype(np.float32) / 255.0 - truth).mean(axis=2)
     return color_map(np.nan_to_num(ERROR_GAIN * difference), "magma")
 

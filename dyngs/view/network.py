@@ -1,4 +1,4 @@
-"""A network of people in the viewer: the people that it may predict, and from which of their pictures."""
+"""A network of people in the viewer: the people that it may predict, and from which of their images."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from dyngs.runs.checkpoint import load_run
 from dyngs.training.prediction import captures_in
 from dyngs.view.viewed import Viewed, viewed_run
 
-MOST_PICTURES = 5
-"""Pictures that can be picked."""
+MOST_IMAGES = 5
+"""Images that can be picked."""
 
 
 @dataclass(frozen=True)
@@ -25,39 +25,39 @@ class PeopleNetwork:
     Attributes:
         run: run folder of the network.
         people: by name.
-        num_pictures: that it was trained to predict from.
+        num_images: that it was trained to predict from.
     """
 
     run: Path
     people: dict[str, DataConfig]
-    num_pictures: int
-    _pictures: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    num_images: int
+    _images: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def pictures_of(self, person: str) -> tuple[str, ...]:
-        """Return the names of the pictures of a person that can be predicted from.
+    def images_of(self, person: str) -> tuple[str, ...]:
+        """Return the names of the images of a person that can be predicted from.
 
         Raises:
             DyngsError: the capture cannot be read.
         """
-        if person not in self._pictures:
+        if person not in self._images:
             views = read_capture(self.people[person]).splits["train"]
-            self._pictures[person] = tuple(view.name for view in views)
-        return self._pictures[person]
+            self._images[person] = tuple(view.name for view in views)
+        return self._images[person]
 
-    def predict(self, person: str, pictures: tuple[str, ...] = (), up: str | None = None) -> Viewed:
+    def predict(self, person: str, images: tuple[str, ...] = (), up: str | None = None) -> Viewed:
         """Return a person as the network predicts it.
 
         Args:
             person: name.
-            pictures: to predict from; without any, as many as in training, chosen to see much of the person.
+            images: to predict from; without any, as many as in training, chosen to see much of the person.
             up: up axis; None: that of the capture.
 
         Raises:
-            DyngsError: not a capture of a person, or unknown pictures.
+            DyngsError: not a capture of a person, or unknown images.
         """
         with tempfile.TemporaryDirectory(prefix="dyngs_view_") as folder:
             out = Path(folder) / "run"
-            made = predict_person(self.run, self.people[person].root, out, pictures or self.num_pictures)
+            made = predict_person(self.run, self.people[person].root, out, images or self.num_images)
             viewed = viewed_run(person, load_run(out), up)
         said = f"predicted from {', '.join(made.views)} in {made.seconds_maps + made.seconds_network:.1f} s"
         return viewed.noted(said)

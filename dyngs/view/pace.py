@@ -1,4 +1,4 @@
-"""How large pictures are drawn: small while something moves, so that they come often; whole when all is still."""
+"""How large images are drawn: small while something moves, so that they come often; whole when all is still."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from dataclasses import dataclass
 FIRST_AREA = 320 * 240
 SMALLEST_AREA = 160 * 120
 STILL_AFTER = 0.2
-"""Seconds without change after which the picture is refined."""
+"""Seconds without change after which the image is refined."""
 _REFINES_BY = 6.0
 """Factor of the number of pixels from one refinement to the next."""
-_PIXELS_SHARE = 0.5
-"""Seconds for pixels relative to those for the Gaussians, where the latter alone exceed the target: a smaller picture
+_PIXELS_FRACTION = 0.5
+"""Seconds for pixels relative to those for the Gaussians, where the latter alone exceed the target: a smaller image
 would hardly come sooner."""
 _MEMORY = 0.7
 _TELLING = 3.0
-"""Ratio of the pixels of two pictures from which their times tell how much a pixel takes."""
-_LEAST_SHARE = 0.5
-"""Share of the seconds that is taken to be for pixels, where nothing tells."""
+"""Ratio of the pixels of two images from which their times tell how much a pixel takes."""
+_LEAST_FRACTION = 0.5
+"""Fraction of the seconds that is taken to be for pixels, where nothing tells."""
 
 
 @dataclass
 class _Mean:
-    """Running means of the pixels and the seconds of pictures."""
+    """Running means of the pixels and the seconds of images."""
 
     pixels: float = 0.0
     seconds: float = 0.0
@@ -37,13 +37,13 @@ class _Mean:
 
 
 class Pace:
-    """Number of pixels that can be drawn within ``target`` seconds, by how long the last pictures took.
+    """Number of pixels that can be drawn within ``target`` seconds, by how long the last images took.
 
-    Seconds are taken to be a + b * pixels: a is for the Gaussians, whatever the size of the picture.
+    Seconds are taken to be a + b * pixels: a is for the Gaussians, whatever the size of the image.
 
     Args:
-        target: seconds that drawing and sending a picture may take while something moves.
-        longest: seconds that any picture may take.
+        target: seconds that drawing and sending an image may take while something moves.
+        longest: seconds that any image may take.
     """
 
     def __init__(self, target: float, longest: float = math.inf) -> None:
@@ -53,18 +53,18 @@ class Pace:
 
     @property
     def area(self) -> float:
-        """Pixels of a picture while something moves."""
+        """Pixels of an image while something moves."""
         return self._area
 
     @property
     def largest(self) -> float:
-        """Most pixels of a refined picture."""
+        """Most pixels of a refined image."""
         if not self._moving.count or math.isinf(self._longest):
             return math.inf
         return max(self._area_within(self._longest), self._area)
 
     def observe(self, pixels: float, seconds: float, *, is_refined: bool) -> None:
-        """Note how long a picture took: a small one while something moves, or a refined one."""
+        """Note how long an image took: a small one while something moves, or a refined one."""
         (self._refined if is_refined else self._moving).add(pixels, seconds)
         if not self._moving.count:
             return
@@ -75,14 +75,14 @@ class Pace:
         """Return the pixels that can be drawn within ``seconds``."""
         per_pixel = self._seconds_per_pixel()
         fixed = max(self._moving.seconds - per_pixel * self._moving.pixels, 0.0)
-        return max(seconds - fixed, _PIXELS_SHARE * fixed) / per_pixel
+        return max(seconds - fixed, _PIXELS_FRACTION * fixed) / per_pixel
 
     def _seconds_per_pixel(self) -> float:
         small, large = self._moving, self._refined
-        slope, least = 0.0, _LEAST_SHARE
-        if large.pixels > _TELLING * small.pixels:  # times of pictures of like sizes differ by chance
+        slope, least = 0.0, _LEAST_FRACTION
+        if large.pixels > _TELLING * small.pixels:  # times of images of like sizes differ by chance
             slope = (large.seconds - small.seconds) / (large.pixels - small.pixels)
-            least = 0.1 * _LEAST_SHARE
+            least = 0.1 * _LEAST_FRACTION
         return max(slope, least * small.seconds / small.pixels, 1e-12)
 
     def next_area(self, full: int, drawn: float | None) -> float:
@@ -90,7 +90,7 @@ class Pace:
 
         Args:
             full: pixels of the window.
-            drawn: of the picture that is shown, if nothing has changed since; None: something moves.
+            drawn: of the image that is shown, if nothing has changed since; None: something moves.
         """
         return min(float(full), self._area if drawn is None else max(_REFINES_BY * drawn, self._area))
 

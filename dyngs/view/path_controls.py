@@ -27,7 +27,7 @@ def add_path_controls(browsing: Browsing) -> None:
 
     def add(_: Any) -> None:
         if session.eye is not None:
-            time = None if session.viewed.is_still else session.time
+            time = None if session.viewed.is_static else session.time
             record(recorded[0].added(Keyframe(session.eye.camera(), time, float(seconds.value))))
 
     def save(_: Any) -> None:

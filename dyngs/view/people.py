@@ -92,8 +92,8 @@ def joint_row(name: str, count: int) -> int:
 
 
 def _elsewhere(viewed: Viewed) -> Viewed:
-    """Return the same without the pictures, which show the person in another pose."""
-    return replace(viewed, footage=replace(viewed.footage, pictures=None))
+    """Return the same without the images, which show the person in another pose."""
+    return replace(viewed, footage=replace(viewed.footage, images=None))
 
 
 def _composed(rest: torch.Tensor, degrees: tuple[float, float, float]) -> torch.Tensor:

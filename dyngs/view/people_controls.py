@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dyngs.view.network import MOST_PICTURES, PeopleNetwork
+from dyngs.view.network import MOST_IMAGES, PeopleNetwork
 from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
     gui.add_button("All joints at rest").on_click(reset)
 
 
-def add_picture_controls(browsing: Browsing, network: PeopleNetwork, show: Callable[[Viewed], None]) -> None:
-    """Add the choice of the pictures that a network predicts the person from.
+def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callable[[Viewed], None]) -> None:
+    """Add the choice of the images that a network predicts the person from.
 
     Args:
         browsing: the browser, which has loaded a person of the network.
@@ -70,17 +70,17 @@ def add_picture_controls(browsing: Browsing, network: PeopleNetwork, show: Calla
         show: is given what was predicted.
     """
     gui, session, person = browsing.client.gui, browsing.session, browsing.loaded.name
-    names = (_NONE, *network.pictures_of(person))
-    hint = f"none: {network.num_pictures} that see much of the person"
-    chosen = [gui.add_dropdown(f"Picture {i + 1}", names, hint=hint) for i in range(MOST_PICTURES)]
+    names = (_NONE, *network.images_of(person))
+    hint = f"none: {network.num_images} that see much of the person"
+    chosen = [gui.add_dropdown(f"Image {i + 1}", names, hint=hint) for i in range(MOST_IMAGES)]
 
     def predict(_: Any) -> None:
-        pictures = tuple(dict.fromkeys(str(one.value) for one in chosen if one.value != _NONE))
+        images = tuple(dict.fromkeys(str(one.value) for one in chosen if one.value != _NONE))
         note = browsing.client.add_notification("Predicting", person, loading=True)
 
         def work() -> None:
             try:
-                viewed = network.predict(person, pictures)
+                viewed = network.predict(person, images)
             finally:
                 note.remove()
             browsing.loaded = viewed

@@ -65,7 +65,7 @@ class Recording:
         """Return the path as JSON, in the coordinates of the capture's files.
 
         Args:
-            size: width and height of the pictures, px; focal lengths follow the height.
+            size: width and height of the images, px; focal lengths follow the height.
             fps: frames per second.
             world_offset: (3,) as ``Capture.world_offset``.
         """

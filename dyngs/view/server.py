@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from dyngs.errors import DyngsError
 from dyngs.view.cameras import fitting_fov, look_point, pose_of
-from dyngs.view.drawer import Drawer
 from dyngs.view.gate import free_port, gate_for, guarded, is_loopback
 from dyngs.view.pace import Pace
+from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Eye, Sent, Session
 from dyngs.view.source import Source
 from dyngs.view.viewed import Viewed
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MOVING_QUALITY, STILL_QUALITY = 75, 95
 """JPEG qualities."""
 _STATUS_EVERY = 0.5
-"""Seconds between two changes of the line about the pictures, and of the time slider while it plays."""
+"""Seconds between two changes of the line about the images, and of the time slider while it plays."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Serving:
         host: address to listen on.
         port: that is asked for; None: 8080 or the next that is free.
         motions: motion files for people, by name.
-        target: seconds that a picture may take while something moves.
-        longest: seconds that any picture may take.
-        in_thread: pictures are drawn in a thread of the server; else by whoever calls ``drawer.draw_one``.
+        target: seconds that an image may take while something moves.
+        longest: seconds that any image may take.
+        in_thread: images are drawn in a thread of the server; else by whoever calls ``drawer.draw_one``.
     """
 
     host: str = "127.0.0.1"
@@ -51,12 +51,12 @@ class Serving:
 
 
 class Browsing:
-    """One browser: its connection, its session, and the pictures that went to it.
+    """One browser: its connection, its session, and the images that went to it.
 
     Args:
         client: viser's handle of it.
         viewed: what it looks at first.
-        pace: how large its pictures are.
+        pace: how large its images are.
     """
 
     def __init__(self, client: viser.ClientHandle, viewed: Viewed, pace: Pace) -> None:
@@ -70,9 +70,9 @@ class Browsing:
         self._told_at, self._since_told = 0.0, 0
 
     def send(self, sent: Sent) -> None:
-        """Pass a picture to the browser."""
+        """Pass an image to the browser."""
         quality = STILL_QUALITY if sent.is_refined else MOVING_QUALITY
-        self.client.scene.set_background_image(sent.picture, format="jpeg", jpeg_quality=quality)
+        self.client.scene.set_background_image(sent.image, format="jpeg", jpeg_quality=quality)
         self.num_sent += 1
         self._since_told += 1
         now = time.monotonic()
@@ -100,9 +100,9 @@ class Browsing:
         self.camera_moved()
 
     def _tell(self, sent: Sent, now: float) -> None:
-        height, width = sent.picture.shape[:2]
+        height, width = sent.image.shape[:2]
         rate = self._since_told / max(now - self._told_at, 1e-6)
-        shown = "still" if sent.is_refined else f"{rate:.0f} pictures/s"
+        shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
         view = self.session.shown_view
         truth = "" if view is None else f", truth: {self.session.viewed.footage.names[view]}"
         if self.status is not None:
@@ -185,7 +185,7 @@ class Viewer:
         for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
             server._websock_server.unregister_handler(kind)  # it would pass the page through a host of others
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
-        server.gui.main_panel.dock_right()  # beside the picture, not over it
+        server.gui.main_panel.dock_right()  # beside the image, not over it
         _, position = pose_of(first.start)
         server.scene.set_up_direction(tuple(first.up))
         camera = server.initial_camera

@@ -1,4 +1,4 @@
-"""What one browser looks at, and which picture it gets next. Knows neither viser nor threads of its own."""
+"""What one browser looks at, and which image it gets next. Knows neither viser nor threads of its own."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dyngs.view.timeline import Timeline
 from dyngs.view.viewed import Viewed
 
 _SHORTEST = 1 / 30
-"""Seconds between two pictures at least."""
+"""Seconds between two images at least."""
 _DEFAULT_LONGEST = 1600
 
 
@@ -34,7 +34,7 @@ class Eye:
     size: tuple[int, int]
 
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
-        """Return the camera for pictures of ``size``; None: that of the window."""
+        """Return the camera for images of ``size``; None: that of the window."""
         return camera_at(self.wxyz, self.position, self.fov, size or self.size)
 
 
@@ -46,8 +46,8 @@ class Look:
         layer, part: as in ``Shot``.
         comparing: show the truth beside the render.
         view: index of the view that is compared with; None: the nearest.
-        divide: share of the width that shows the render.
-        longest: most pixels of the longer side of a picture.
+        divide: fraction of the width that shows the render.
+        longest: most pixels of the longer side of an image.
     """
 
     layer: Layer = "colour"
@@ -60,9 +60,9 @@ class Look:
 
 @dataclass(frozen=True)
 class Sent:
-    """A picture for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that it took."""
+    """An image for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that it took."""
 
-    picture: np.ndarray
+    image: np.ndarray
     is_refined: bool
     seconds: float
 
@@ -74,8 +74,8 @@ class Session:
 
     Args:
         viewed: scene to look at.
-        send: passes a picture to the browser.
-        pace: how large pictures are; None: fourteen a second while something moves, whole when all is still.
+        send: passes an image to the browser.
+        pace: how large images are; None: fourteen a second while something moves, whole when all is still.
         clock: monotonic seconds.
     """
 
@@ -146,7 +146,7 @@ class Session:
         self._note_change()
 
     def take(self, viewed: Viewed, *, refreshes: bool) -> None:
-        """Look at another state of the same scene; a picture that is refined stays as large, and is drawn again.
+        """Look at another state of the same scene; an image that is refined stays as large, and is drawn again.
 
         Args:
             viewed: the newest state.
@@ -157,7 +157,7 @@ class Session:
             self._is_stale = self._is_stale or refreshes
 
     def ask(self, job: Callable[[], None], kind: str | None = None) -> None:
-        """Have ``job`` run by the thread that draws, before the next picture, instead of waiting ones of its kind."""
+        """Have ``job`` run by the thread that draws, before the next image, instead of waiting ones of its kind."""
         with self._lock:
             if kind is not None:
                 self._jobs = deque(entry for entry in self._jobs if entry[0] != kind)
@@ -184,7 +184,7 @@ class Session:
             return None
         if look.view is not None:
             return look.view
-        footage, time = viewed.footage, None if viewed.is_still else self.time
+        footage, time = viewed.footage, None if viewed.is_static else self.time
         return nearest_camera(eye.camera(), time, footage.poses, footage.times, viewed.extent)
 
     def due(self) -> float | None:
@@ -203,7 +203,7 @@ class Session:
             return None
 
     def draw_next(self) -> None:
-        """Do what is due: a job, or the next picture."""
+        """Do what is due: a job, or the next image."""
         with self._lock:
             job = self._jobs.popleft()[1] if self._jobs and not self.closed else None
         if job is not None:
@@ -221,10 +221,10 @@ class Session:
             self._is_stale = False
             self._drawn_area, self._is_refined = self._full_area, True  # if it fails, it is not tried again
         start = self._clock()
-        picture = draw(viewed, shot)
-        pixels = picture.shape[0] * picture.shape[1]
+        image = draw(viewed, shot)
+        pixels = image.shape[0] * image.shape[1]
         if not self.closed:
-            self._send(Sent(picture, not is_moving, self._clock() - start))
+            self._send(Sent(image, not is_moving, self._clock() - start))
         end = self._clock()
         with self._lock:
             self._pace.observe(pixels, end - start, is_refined=not is_moving)
@@ -233,7 +233,7 @@ class Session:
             self._end_of_play()
 
     def shot(self, size: tuple[int, int] | None = None) -> Shot:
-        """Return what is shown now as a picture of ``size``; None: that of the window."""
+        """Return what is shown now as an image of ``size``; None: that of the window."""
         with self._lock:
             if self.eye is None:
                 raise ValueError("there is no camera yet")
@@ -247,12 +247,12 @@ class Session:
             look, viewed = self.look, self.viewed
         layer = "colour" if look.layer == "error" and view is None else look.layer
         return Shot(
-            camera, None if viewed.is_still else time, layer, look.part, view, look.divide if look.comparing else 1.0
+            camera, None if viewed.is_static else time, layer, look.part, view, look.divide if look.comparing else 1.0
         )
 
     @property
     def _is_moving(self) -> bool:
-        is_playing = self.timeline.playing and not self.viewed.is_still
+        is_playing = self.timeline.playing and not self.viewed.is_static
         return is_playing or self._preview is not None
 
     @property
@@ -268,7 +268,7 @@ class Session:
 
     @property
     def _refined_area(self) -> float:
-        """Pixels of the picture that is shown when all is still."""
+        """Pixels of the image that is shown when all is still."""
         return min(self._full_area, self._pace.largest)
 
     def _end_of_play(self) -> None:

@@ -12,41 +12,43 @@ import torch
 from dyngs.config import Config
 from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 from dyngs.training.background import evaluation_background
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.drawer import Drawer
 from dyngs.view.gate import free_port
+from dyngs.view.render_thread import Drawer
 from dyngs.view.server import Serving, Viewer, require_viser
 from dyngs.view.source import Source
 from dyngs.view.viewed import Viewed, viewed_training
 
-SHARE = 0.2
-"""Most of the time of training that pictures for browsers may take."""
+FRACTION = 0.2
+"""Most of the time of training that images for browsers may take."""
 REFRESH_SECONDS = 1.0
-"""Seconds between two pictures of a browser in which nothing moves but the scene."""
+"""Seconds between two images of a browser in which nothing moves but the scene."""
 
 
 class DrawnBetweenSteps:
     """Draws for browsers in the thread that trains, between two steps, since steps change the scene in place.
 
-    Without browsers a step costs one look at an empty list. Pictures change nothing of the training: they are drawn
+    Without browsers a step costs one look at an empty list. Images change nothing of the training: they are drawn
     from a copy of the scene's shell, with caches of its own, and without gradients or random numbers.
 
     Args:
         drawer: of the browsers.
-        share: of the time that pictures may take.
+        share: of the time that images may take.
         clock: seconds.
     """
 
-    def __init__(self, drawer: Drawer, share: float = SHARE, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._drawer, self._share, self._clock = drawer, share, clock
+    def __init__(
+        self, drawer: Drawer, fraction: float = FRACTION, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        self._drawer, self._fraction, self._clock = drawer, fraction, clock
         self._not_before = 0.0
         self._refreshed_at = -1e9
 
     def after_step(self, scene: Scene) -> float:
-        """Draw one picture if one is due and time for it is left; return the seconds that it took.
+        """Draw one image if one is due and time for it is left; return the seconds that it took.
 
         Args:
             scene: that is trained.
@@ -65,10 +67,10 @@ class DrawnBetweenSteps:
             for session in sessions:
                 session.take(session.viewed.showing(shell), refreshes=refreshes)
             while self._drawer.draw_one():
-                if self._clock() - start > REFRESH_SECONDS * self._share:
+                if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
         took = self._clock() - start
-        self._not_before = start + took / self._share
+        self._not_before = start + took / self._fraction
         return took
 
 
@@ -140,4 +142,4 @@ def _first(trainer: Trainer) -> Viewed:
     choice = config.data.background if config.data.background != "auto" else trainer.background
     _, background = evaluation_background(choice, has_alpha=False)
     with torch.no_grad():
-        return viewed_training(config.run.name, config, replace(trainer.scene), trainer.pictures, background)
+        return viewed_training(config.run.name, config, replace(trainer.scene), trainer.images, background)

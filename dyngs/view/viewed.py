@@ -1,4 +1,4 @@
-"""Scenes to look at: from a run, a file, or a training that goes on, with the cameras and pictures of their capture."""
+"""Scenes to look at: from a run, a file, or a training that goes on, with the cameras and images of their capture."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from dyngs.api.load import load
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture, View
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split
 from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.export.avatar import read_avatar
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Moment, Scene, render_options
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction
 from dyngs.output.aim import look_at_point
 from dyngs.output.aim import up_direction as mean_up
 from dyngs.output.orbit import frame_orbit_for_points
 from dyngs.output.render_job import axis
-from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
-from dyngs.scene import Moment, Scene, render_options
 from dyngs.splats.formats import known_format, read_splats
 from dyngs.splats.splat_file import splat_options
 from dyngs.static.scene import StaticScene
@@ -40,24 +40,24 @@ _STILL_SECONDS = 4.0
 """Seconds from time 0 to 1 where nobody knows."""
 _SIZE = (960, 720)
 THUMBNAIL = 96
-"""Longest side of the small pictures, px."""
+"""Longest side of the small images, px."""
 
 
 @dataclass(frozen=True)
 class Footage:
-    """Cameras of a capture, and their pictures.
+    """Cameras of a capture, and their images.
 
     Attributes:
         views: V views.
         cameras: one camera each, of the size of training.
-        pictures: of the views, composited on demand; None where there are none to be read.
+        images: of the views, composited on demand; None where there are none to be read.
         thumbnails: the same, small.
     """
 
     views: tuple[View, ...] = ()
     cameras: tuple[Cameras, ...] = ()
-    pictures: PictureLoader | None = None
-    thumbnails: PictureLoader | None = None
+    images: ImageLoader | None = None
+    thumbnails: ImageLoader | None = None
 
     def __len__(self) -> int:
         return len(self.views)
@@ -148,12 +148,12 @@ class Viewed:
     def has_timeline(self) -> bool:
         """Whether there are times to choose from, now or later."""
         may_move = self.in_training and len(self.scene.times) > 1
-        return may_move or not self.is_still or avatar_of(self.scene) is not None
+        return may_move or not self.is_static or avatar_of(self.scene) is not None
 
     @property
-    def is_still(self) -> bool:
+    def is_static(self) -> bool:
         """Whether it looks the same at all times."""
-        return self.scene.is_still
+        return self.scene.is_static
 
 
 def load_viewed(path: Path, up: str | None = None) -> Viewed:
@@ -220,10 +220,10 @@ def viewed_scene(name: str, scene: Scene, up: str | None = None) -> Viewed:
     )
 
 
-def viewed_training(name: str, config: Config, scene: Scene, pictures: PictureLoader, background: Tensor) -> Viewed:
+def viewed_training(name: str, config: Config, scene: Scene, images: ImageLoader, background: Tensor) -> Viewed:
     """Return a scene that is being trained, with the views that it is trained on."""
-    cameras = training_cameras(pictures.views, config.data)
-    footage = Footage(pictures.views, tuple(cameras), pictures, _thumbnails(pictures.views, config.data))
+    cameras = training_cameras(images.views, config.data)
+    footage = Footage(images.views, tuple(cameras), images, _thumbnails(images.views, config.data))
     return Viewed(
         name=name,
         scene=scene,
@@ -247,12 +247,12 @@ def _footage_of(capture: Capture, run: LoadedRun) -> Footage:
     by_name = {view.name: view for view in views}
     shown = tuple(by_name[name] for name in chosen)
     data = run.config.data
-    return Footage(shown, tuple(training_cameras(shown, data)), PictureLoader(shown, data), _thumbnails(shown, data))
+    return Footage(shown, tuple(training_cameras(shown, data)), ImageLoader(shown, data), _thumbnails(shown, data))
 
 
-def _thumbnails(views: Sequence[View], data: DataConfig) -> PictureLoader:
+def _thumbnails(views: Sequence[View], data: DataConfig) -> ImageLoader:
     small = data.model_copy(update={"downscale": 1.0, "longest_side": THUMBNAIL, "cache_mb": 256.0})
-    return PictureLoader(views, small)
+    return ImageLoader(views, small)
 
 
 def _without_capture(name: str, run: LoadedRun, up: str | None) -> Viewed:
@@ -303,4 +303,4 @@ def _seconds(scene: Scene, known: float | None) -> float:
     if known:
         return known
     person = avatar_of(scene)
-    return _STILL_SECONDS if person is None or scene.is_still else max(len(scene.times) - 1, 1) / 30
+    return _STILL_SECONDS if person is None or scene.is_static else max(len(scene.times) - 1, 1) / 30

@@ -1,4 +1,4 @@
-"""Exposures are tried where pictures ask for them, and taken where held-out views gain after the same fit."""
+"""Exposures are tried where images ask for them, and taken where held-out views gain after the same fit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dyngs.api.small_runs import trained
 from dyngs.api.still_choices import decided
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.data.pictures.images import read_picture
+from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.files.write import write_image
 from dyngs.training.trainer import Trainer
@@ -27,11 +27,11 @@ STEPS = 60
 
 @pytest.fixture(scope="module")
 def disturbed(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The still capture, every second picture half as bright."""
+    """The still capture, every second image half as bright."""
     folder = tmp_path_factory.mktemp("capture") / "disturbed"
     shutil.copytree(still, folder)
     for view in read_capture(folder).splits["train"][::2]:
-        pixels = read_picture(view.image_path).numpy().astype(np.float32)
+        pixels = read_image(view.image_path).numpy().astype(np.float32)
         pixels[..., :3] *= 0.5
         write_image(view.image_path, pixels.round().astype(np.uint8))
     return folder
@@ -45,7 +45,7 @@ def small(root: Path, choice: str) -> Trainer:
     return trained(preset(root, f"train.exposure={choice}", "init.num_random=100"), 4, STEPS)
 
 
-def test_pictures_that_differ_ask_for_it_and_gain(disturbed: Path) -> None:
+def test_images_that_differ_ask_for_it_and_gain(disturbed: Path) -> None:
     plain = small(disturbed, "never")
     found = evidence(plain)
     assert found.is_worth
@@ -55,8 +55,8 @@ def test_pictures_that_differ_ask_for_it_and_gain(disturbed: Path) -> None:
     assert result.scores[0][1] > result.scores[0][0]
 
 
-def test_nothing_is_lost_as_pictures_are(disturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same scores after a fit, but one model is further from the pictures as they are."""
+def test_nothing_is_lost_as_images_are(disturbed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same scores after a fit, but one model is further from the images as they are."""
     plain = small(disturbed, "never")
     scores = {"one": (20.0, 25.0), "other": (18.0, 26.0)}
     monkeypatch.setattr(exposure_choice, "_scored", lambda trainer, _: scores[trainer.name])
@@ -67,7 +67,7 @@ def test_nothing_is_lost_as_pictures_are(disturbed: Path, monkeypatch: pytest.Mo
     assert not compared(one, one).objection
 
 
-def test_where_pictures_agree_there_is_no_second_run(
+def test_where_images_agree_there_is_no_second_run(
     still: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(still_choices, "FEWEST_VIEWS", 3)

@@ -87,9 +87,9 @@ def test_two_processes_end_with_the_bytes_of_one(moving: Path, still: Path, smal
     assert len(counts) > 3, "the set of Gaussians changes"
 
 
-def test_two_processes_with_a_card_each_do_so_too(still: Path, tmp_path: Path) -> None:
-    """On pretended cards: whatever is exchanged or compared lies where it has to."""
-    codes, said = run_in(2, do.trained_on_card, tmp_path, [_still(still, tmp_path / "two", batch_size=2)])
+def test_two_processes_with_a_gpu_each_do_so_too(still: Path, tmp_path: Path) -> None:
+    """On pretended GPUs: whatever is exchanged or compared lies where it has to."""
+    codes, said = run_in(2, do.trained_on_gpu, tmp_path, [_still(still, tmp_path / "two", batch_size=2)])
     assert codes == [0, 0], said
     train(_still(still, tmp_path / "one", batch_size=2))
     _require_same_bytes(tmp_path / "one", tmp_path / "two")
@@ -134,7 +134,7 @@ def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("fails", "line"),
     [
-        ("step", "dyngs: error: picture 3 is damaged"),
+        ("step", "dyngs: error: image 3 is damaged"),
         ("weights", "after step 5: process 1 has come to other Gaussians than process 0"),
         ("death", "has lost the others: one has ended without a word"),
     ],
@@ -151,7 +151,7 @@ def test_what_needs_one_process_says_so(still: Path, tmp_path: Path) -> None:
     two = Processes(0, 2)
     with pytest.raises(DyngsError, match="minutes=1: is measured with one process; leave it out, or start without"):
         train(_still(still, tmp_path / "run", minutes=1), processes=two)
-    with pytest.raises(DyngsError, match=r"batch_size=2: train[.]robust=always follows one picture per step"):
+    with pytest.raises(DyngsError, match=r"batch_size=2: train[.]robust=always follows one image per step"):
         train(_still(still, tmp_path / "run", robust="always"), processes=two)
     with pytest.raises(DyngsError, match="batch_size=5 views cannot be shared evenly among 2"):
         train(_still(still, tmp_path / "run", batch_size=5), processes=two)

@@ -1,4 +1,4 @@
-"""Every file that dyngs writes is loaded as a scene that draws the same pictures."""
+"""Every file that dyngs writes is loaded as a scene that draws the same images."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_an_avatar_is_a_scene(person: Path, tmp_path: Path) -> None:
     run = dyngs.train(dyngs.load_config("human", [*words, f"run.dir={out}"]))
     scene = load(write_avatar(load_run(run), tmp_path / "a.safetensors"))
     assert len(scene) == len(load(run))
-    assert scene.is_still
+    assert scene.is_static
 
 
 @pytest.mark.parametrize("name", ["nothing", "words.txt", "b.safetensors"])

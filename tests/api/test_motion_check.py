@@ -23,7 +23,7 @@ def config_of(root: Path) -> Config:
 
 
 def with_times(root: Path) -> Path:
-    """Give the pictures of a still Blender capture times, in the order of the files."""
+    """Give the images of a still Blender capture times, in the order of the files."""
     for path in root.glob("transforms_*.json"):
         content = json.loads(path.read_text())
         for i, frame in enumerate(content["frames"]):
@@ -62,15 +62,15 @@ def test_too_few_views_of_a_moving_camera_do_not_tell(still_with_times: Path, mo
     assert motion_evidence(config_of(still_with_times)).verdict is Verdict.OPEN
 
 
-def test_standing_cameras_show_motion_or_none(tmp_path: Path) -> None:
-    """The same pictures again and again are still; in those of the room something passes."""
+def test_fixed_cameras_show_motion_or_none(tmp_path: Path) -> None:
+    """The same images again and again are still; in those of the room something passes."""
     room = tmp_path / "room"
     write_dynamic_capture("room", room, DynamicOptions(size=32, num_times=6, num_test=1, samples=1))
     assert motion_evidence(config_of(room)).verdict is Verdict.MOVES
-    for camera in {picture.parent for picture in room.rglob("*.png")}:
-        pictures = sorted(camera.glob("*.png"))
-        for picture in pictures[1:]:
-            shutil.copyfile(pictures[0], picture)
+    for camera in {image.parent for image in room.rglob("*.png")}:
+        images = sorted(camera.glob("*.png"))
+        for image in images[1:]:
+            shutil.copyfile(images[0], image)
     assert motion_evidence(config_of(room)).verdict is Verdict.STILL
 
 

@@ -1,4 +1,4 @@
-"""Pilot runs: what wins is taken, what was asked for stays, and a still model may win."""
+"""Pilot runs: what wins is taken, what was asked for stays, and a static model may win."""
 
 from __future__ import annotations
 

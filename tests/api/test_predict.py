@@ -39,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
-    """Which is drawn, measured on both splits, and knows its pictures."""
+    """Which is drawn, measured on both splits, and knows its images."""
     run = load_run(made.prediction.run_dir)
     assert isinstance(run.scene, HumanScene)
     assert (run.config.model.kind, run.step, run.config.data.root) == ("human", 0, made.capture)
@@ -52,7 +52,7 @@ def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
         assert 6 < report.psnr_person < report.psnr, "32 pixels and a network of two steps"
 
 
-def test_the_same_pictures_give_the_same_bytes(made: Made, tmp_path: Path) -> None:
+def test_the_same_images_give_the_same_bytes(made: Made, tmp_path: Path) -> None:
     again = predict_person(made.network, made.capture, tmp_path / "again", tuple(made.prediction.views), steps=1)
     assert again.views == made.prediction.views
     first, second = (load_run(run.run_dir).scene.gaussians.tensors().values() for run in (made.prediction, again))

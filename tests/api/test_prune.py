@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from moving_scene import write_moving_run
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.prune import file_of, prune_run, prune_within
@@ -22,7 +22,7 @@ from dyngs.prune.stage import quality_of
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoint, load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-ASKED = ("prune.share=0.5", "prune.steps=6", "prune.mask_times=3", "run.threads=1")
+ASKED = ("prune.fraction=0.5", "prune.steps=6", "prune.mask_times=3", "run.threads=1")
 BRIEFLY = ("prune.steps=4", "run.threads=1")
 
 
@@ -39,7 +39,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -> None:
     small = prune_run(run_dir, tmp_path / "small", ASKED)
     config = busy_config(load_resolved(run_dir).data.root, tmp_path / "whole", "control_nodes")
-    stage = PruneConfig(share=0.5, steps=6, mask_times=3)
+    stage = PruneConfig(fraction=0.5, steps=6, mask_times=3)
     whole = train(config.model_copy(update={"prune": stage}))
     assert checkpoint_paths(small)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
     assert load_run(run_dir).step == 24, "the first run is as it was"
@@ -49,7 +49,7 @@ def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -
 
 def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     once = prune_run(run_dir, tmp_path / "once", ASKED)
-    twice = prune_run(once, tmp_path / "twice", ("prune.share=0.5", "prune.steps=2"))
+    twice = prune_run(once, tmp_path / "twice", ("prune.fraction=0.5", "prune.steps=2"))
     thrice = prune_within(twice, tmp_path / "thrice", 50.0, BRIEFLY, silent).folder
     sizes = [len(load_run(folder).scene) for folder in (run_dir, once, twice, thrice)]
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
@@ -57,15 +57,15 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     assert load_run(thrice).step == 36
 
 
-def test_on_a_card_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_gpu_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The search, its file, and the comparison with the run before."""
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
     here = compared([run_dir, file_of(expected.folder)], 1)
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
-    with pretend_card():
+    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    with pretend_gpu():
         found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
-        there = compared([run_dir, file_of(found.folder)], 1, CARD)
+        there = compared([run_dir, file_of(found.folder)], 1, GPU)
     assert replace(found, folder=expected.folder) == expected
     files = [file_of(x.folder) / SCENE_FILE for x in (found, expected)]
     assert files[0].read_bytes() == files[1].read_bytes()
@@ -83,7 +83,7 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     config = load_resolved(first.folder)
     trainer = assemble(config, restored=True)
     trainer.restore(latest_checkpoint(first.folder))
-    shown = [trainer.pictures[i] for i in evenly_held_out(len(trainer.pictures))]
+    shown = [trainer.images[i] for i in evenly_held_out(len(trainer.images))]
     assert quality_of(trainer, load_run(file_of(first.folder)).scene, shown) == pytest.approx(first.after, abs=1e-4)
     before, after = compared([run_dir, file_of(first.folder)], 1)
     assert after.num_gaussians < before.num_gaussians
@@ -133,22 +133,22 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     taken.mkdir()
     (taken / "file").write_text("mine")
     for out, overrides, message in (
-        (taken, ["prune.share=0.5"], "exists already; give another --out"),
-        (taken / "file", ["prune.share=0.5"], "exists already"),
-        (run_dir, ["prune.share=0.5"], "exists already"),
-        (tmp_path / "new", ["prune.share=1"], "prune.share"),
-        (tmp_path / "new", ["prune.share=-0.1"], "prune.share"),
-        (tmp_path / "new", ["prune.share=0"], "nothing to do"),
+        (taken, ["prune.fraction=0.5"], "exists already; give another --out"),
+        (taken / "file", ["prune.fraction=0.5"], "exists already"),
+        (run_dir, ["prune.fraction=0.5"], "exists already"),
+        (tmp_path / "new", ["prune.fraction=1"], "prune.fraction"),
+        (tmp_path / "new", ["prune.fraction=-0.1"], "prune.fraction"),
+        (tmp_path / "new", ["prune.fraction=0"], "nothing to do"),
         (tmp_path / "new", ["prune.score=beauty"], "prune.score"),
-        (tmp_path / "new", ["prune.share=0.5", "prune.max_loss=1"], "dyngs prune RUN --out RUN2 --max-loss"),
+        (tmp_path / "new", ["prune.fraction=0.5", "prune.max_loss=1"], "dyngs prune RUN --out RUN2 --max-loss"),
     ):
         with pytest.raises(DyngsError, match=message):
             prune_run(run_dir, out, overrides)
     with pytest.raises(DyngsError, match="no checkpoints there"):
-        prune_run(tmp_path / "nowhere", tmp_path / "new", ["prune.share=0.5"])
+        prune_run(tmp_path / "nowhere", tmp_path / "new", ["prune.fraction=0.5"])
     for out, overrides, message in (
         (taken, [], "exists already; give another --out"),
-        (tmp_path / "new", ["prune.share=0.5"], "are chosen with --prune R"),
+        (tmp_path / "new", ["prune.fraction=0.5"], "are chosen with --prune R"),
         (tmp_path / "new", ["model.alpha_min=0.1"], "losses are counted from RUN as it is"),
     ):
         with pytest.raises(DyngsError, match=message):

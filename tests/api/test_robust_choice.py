@@ -25,7 +25,7 @@ def test_moving_scenes_are_left_alone(moving: Path) -> None:
 
 
 def test_pixels_that_no_model_foresees_do_not_count() -> None:
-    """A passer-by in the held-out picture; one model errs a little on the left, the other much on the right."""
+    """A passer-by in the held-out image; one model errs a little on the left, the other much on the right."""
     truth = torch.full((10, 10, 3), 0.5)
     one, other = truth.clone(), truth.clone()
     one[:, 0] += 0.05

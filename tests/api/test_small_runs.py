@@ -35,5 +35,5 @@ def test_a_small_run_has_no_limits_and_never_trains_on_what_is_held_out(moving: 
     assert small.total_steps == small.train.steps == 7
     trainer = assemble(small)
     assert trainer.held_out
-    drawn = [trainer.step().picture.name for _ in range(7)]
-    assert not {trainer.pictures.views[i].name for i in trainer.held_out} & set(drawn)
+    drawn = [trainer.step().image.name for _ in range(7)]
+    assert not {trainer.images.views[i].name for i in trainer.held_out} & set(drawn)

@@ -1,4 +1,4 @@
-"""Runs of moving scenes that are compared with a still model: which one stays, and that nothing of the other does."""
+"""Runs of moving scenes that are compared with a static model: which one stays, and that nothing of the other does."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def config(moving: Path, tmp_path: Path) -> Config:
 
 
 def say(monkeypatch: pytest.MonkeyPatch, verdict: Verdict, *, pays: bool = True, fails: float = 1.0) -> None:
-    """Fix what the pictures say, whether motion is better, and how often the still model fails."""
+    """Fix what the images say, whether motion is better, and how often the static model fails."""
     monkeypatch.setattr(still_first, "motion_evidence", lambda _: Evidence(verdict, "made up"))
     monkeypatch.setattr(still_first, "is_gain", lambda _: pays)
     monkeypatch.setattr(still_first, "_small_still_model", lambda _: (fails, [20.0]))
@@ -63,7 +63,7 @@ def test_a_still_scene_is_trained_like_a_static_one(
     still = as_still(config)
     static = train(still.model_copy(update={"run": config.run.model_copy(update={"dir": tmp_path / "static"})}))
     assert final_bytes(folder) == final_bytes(static)
-    assert load_run(folder).scene.is_still
+    assert load_run(folder).scene.is_static
 
 
 def test_a_still_model_that_is_better_takes_the_place(
@@ -75,7 +75,7 @@ def test_a_still_model_that_is_better_takes_the_place(
     assert final_bytes(folder) == final_bytes(static)
     assert [path.name for path in checkpoint_paths(folder)] == [path.name for path in checkpoint_paths(static)]
     assert not (folder / STILL_FOLDER).exists()
-    assert "a still model is trained instead" in "".join(capsys.readouterr())
+    assert "a static model is trained instead" in "".join(capsys.readouterr())
 
 
 def test_motion_that_is_better_stays(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,14 +92,14 @@ def test_where_a_still_model_explains_all_nothing_moves(config: Config, monkeypa
     say(monkeypatch, Verdict.OPEN, fails=0.0)
     folder = train(config)
     assert load_run(folder).step == config.train.steps
-    assert load_run(folder).scene.is_still
+    assert load_run(folder).scene.is_static
 
 
 @pytest.mark.parametrize("stop_at", [3, 30])
 def test_an_interrupted_run_ends_with_the_same_bytes(
     stop_at: int, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the still model, or after it."""
+    """In the static model, or after it."""
     say(monkeypatch, Verdict.MOVES)
     whole = train(config.model_copy(update={"run": config.run.model_copy(update={"dir": tmp_path / "whole"})}))
     counted, real = [0], Trainer.step

@@ -243,7 +243,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(
 
     monkeypatch.setattr(trainer, "l1_ssim_loss", failing)
     config = _config(capture, tmp_path / "run", train=TrainConfig(steps=14, save_every=4))
-    with pytest.raises(DyngsError, match=r"step 6, view .*'picture' is nan.*step_0000004"):
+    with pytest.raises(DyngsError, match=r"step 6, view .*'image' is nan.*step_0000004"):
         train(config)
     assert load_run(tmp_path / "run").step == 4
 
@@ -278,7 +278,7 @@ def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
     log = _log(whole_run)
     moving = [record["num_moving"] / record["num_gaussians"] for record in log]
     assert moving[:7] == [0.0] * 7
-    assert all(0 < share < 1 for share in moving[7:]), "a part of them must move, or the tests below show little"
+    assert all(0 < fraction < 1 for fraction in moving[7:]), "a part of them must move, or the tests below show little"
     assert log[7]["num_moving"] > 12, "not only the random Gaussians"
     assert log[-1]["num_moving"] != log[13]["num_moving"], "some must have been frozen since"
     assert len({record["num_gaussians"] for record in log}) > 3
@@ -286,7 +286,7 @@ def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
     assert losses[-4:].mean() < losses[:4].mean()
     assert log[-1]["bad_gradients"] == 0
     scene = load_run(whole_run).scene
-    assert scene.moving_share == moving[-1]
+    assert scene.moving_fraction == moving[-1]
     assert len(scene.times) == 16
 
 
@@ -317,10 +317,10 @@ def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path
     save_config(config, tmp_path / RESOLVED_NAME)
     save_checkpoint(tmp_path, trainer.checkpoint(), 1.0)
     scene = load_run(tmp_path).scene
-    assert scene.is_still == (steps == 2)
+    assert scene.is_static == (steps == 2)
     for time in (0.0, 0.37, 1.0):
-        picture = replace(trainer.pictures[0], time=time)
-        drawn = trainer.training.moment(trainer.scene, picture, steps + 1).gaussians
+        image = replace(trainer.images[0], time=time)
+        drawn = trainer.training.moment(trainer.scene, image, steps + 1).gaussians
         for name, x in scene.at(time).tensors().items():
             torch.testing.assert_close(x, drawn.tensors()[name].detach(), rtol=1e-6, atol=1e-7)
 
@@ -331,7 +331,7 @@ def test_where_nothing_moves_no_field_is_kept(tmp_path: Path, kind: str) -> None
     capture = write_timed_capture(tmp_path / "capture")
     run = train(busy_config(capture, tmp_path / "run", kind, freeze_below_px=1e6))
     assert [record["num_moving"] > 0 for record in _log(run)] == [8 <= step <= 14 for step in range(1, 25)]
-    assert load_run(run).scene.is_still
+    assert load_run(run).scene.is_static
     tensors = load_checkpoint(checkpoint_paths(run)[-1]).part("model")
     assert tensors.keys() == {"times"}
 

@@ -31,10 +31,12 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny_capture(tmp_path_factory.mktemp("capture") / "moving")
 
 
-def _load(capture: Path, kind: str, moving_share: float) -> DeformLoad:
+def _load(capture: Path, kind: str, moving_fraction: float) -> DeformLoad:
     """Sixty random Gaussians."""
     config = busy_config(capture, capture, kind)
-    return DeformLoad(config.model_copy(update={"model": DynamicModel(deform=tiny_options(kind))}), None, moving_share)
+    return DeformLoad(
+        config.model_copy(update={"model": DynamicModel(deform=tiny_options(kind))}), None, moving_fraction
+    )
 
 
 def _check(report: DeformReport, num_gaussians: int, num_moving: int) -> None:
@@ -44,7 +46,7 @@ def _check(report: DeformReport, num_gaussians: int, num_moving: int) -> None:
     assert tuple(report.stages) == FIELD_STAGES
     assert all(ms > 0 for ms in report.steps.values())
     assert all(ms >= 0 for ms in report.stages.values())
-    assert 0 <= report.field_share < 1
+    assert 0 <= report.field_fraction < 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -57,13 +59,13 @@ def test_the_report_is_whole(capture: Path, tmp_path: Path, kind: str) -> None:
     write_report(report, tmp_path / "bench.json")
     written = json.loads((tmp_path / "bench.json").read_text())
     assert set(written["steps"]) == set(VARIANTS)
-    assert written["field_share"] == report.field_share
+    assert written["field_fraction"] == report.field_fraction
 
 
-@pytest.mark.parametrize(("share", "num_moving"), [(1.0, 60), (0.001, 0)])
-def test_all_or_none_may_move(capture: Path, share: float, num_moving: int) -> None:
+@pytest.mark.parametrize(("fraction", "num_moving"), [(1.0, 60), (0.001, 0)])
+def test_all_or_none_may_move(capture: Path, fraction: float, num_moving: int) -> None:
     for kind in KINDS:
-        _check(bench_deform(_load(capture, kind, share), threads=1, rounds=1), 60, num_moving)
+        _check(bench_deform(_load(capture, kind, fraction), threads=1, rounds=1), 60, num_moving)
 
 
 def test_a_run_is_measured_with_what_moves_in_it(capture: Path, tmp_path: Path) -> None:
@@ -79,19 +81,19 @@ def test_the_synthetic_load_is_as_asked_for(tmp_path: Path) -> None:
     assert isinstance(load.config.model, DynamicModel)
     assert load.config.model.deform.kind == "mlp"
     assert isinstance(load.config.init, RandomInit)
-    assert (load.config.init.num_random, load.moving_share, load.run_dir) == (1234, 0.2, None)
+    assert (load.config.init.num_random, load.moving_fraction, load.run_dir) == (1234, 0.2, None)
 
 
 def test_shares_are_within_bounds() -> None:
     """Noise may make a step in which something moves the faster one."""
     stages = dict.fromkeys(FIELD_STAGES, 1.0)
 
-    def share(still: float, moving: float) -> float:
+    def fraction(still: float, moving: float) -> float:
         steps = dict(zip(VARIANTS, (still, moving, 9.0), strict=True))
-        return DeformReport("v3", 1, "mlp", 10, 1, steps, stages).field_share
+        return DeformReport("v3", 1, "mlp", 10, 1, steps, stages).field_fraction
 
-    assert share(6.0, 8.0) == pytest.approx(0.25)
-    assert share(8.0, 6.0) == 0.0
+    assert fraction(6.0, 8.0) == pytest.approx(0.25)
+    assert fraction(8.0, 6.0) == 0.0
 
 
 @pytest.mark.parametrize(

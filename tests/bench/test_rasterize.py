@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 
 from dyngs.bench.rasterize import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
 from dyngs.cli import main
@@ -86,16 +86,16 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_a_workload_elsewhere_is_measured_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "a card")
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "a GPU")
     expected = bench_rasterize(random_workload(50), [1], repeats=1)
-    with pretend_card():
-        found = bench_rasterize(random_workload(50).to(CARD), [1], repeats=1)
-    assert (found.entries, found.pairs, found.device) == (expected.entries, expected.pairs, "a card")
-    assert format_report(found).splitlines()[0].endswith("; a card")
+    with pretend_gpu():
+        found = bench_rasterize(random_workload(50).to(GPU), [1], repeats=1)
+    assert (found.entries, found.pairs, found.device) == (expected.entries, expected.pairs, "a GPU")
+    assert format_report(found).splitlines()[0].endswith("; a GPU")
 
 
-def test_a_card_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gpu_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     if torch.cuda.is_available():
-        pytest.skip("there is a card")
+        pytest.skip("there is a GPU")
     assert main(["bench", "rasterize", "--device", "cuda"]) == 2
     assert capsys.readouterr().err.startswith("dyngs: error: device cuda: ")

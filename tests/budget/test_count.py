@@ -54,7 +54,7 @@ def config_of(kind: str, captures: dict[str, Path], run_dir: Path, budget: Budge
     )
     if kind != "human":
         return config
-    model = HumanModel(resolution=24, scaffold_heights=(0.0, 0.02), min_silhouette_share=0.0, sh_degree=0)
+    model = HumanModel(resolution=24, scaffold_heights=(0.0, 0.02), min_silhouette_fraction=0.0, sh_degree=0)
     return config.model_copy(update={"data": DataConfig(root=captures["person"]), "model": model})
 
 
@@ -88,7 +88,7 @@ def test_room_in_a_file_is_a_limit(
     folder = train(config)
     assert len(load_run(folder).scene) == 1000 // (16 + 0.35 * 9)
     assert "budget.max_mb: asked for at most 52 Gaussians, got 52; 150 before" in capsys.readouterr().out
-    compact = PruneConfig(share=0.7, steps=3)
+    compact = PruneConfig(fraction=0.7, steps=3)
     other = config.model_copy(update={"prune": compact, "run": RunConfig(dir=tmp_path / "other", threads=1)})
     assert len(load_run(train(other)).scene) <= 45
     assert "removed" not in capsys.readouterr().out.split("asked for at most 52")[1]

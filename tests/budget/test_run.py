@@ -19,9 +19,9 @@ from dyngs.training.events import Event, Message, TopologyChanged
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))
 
 
-@given(steps=st.integers(1, 10**4), tuning=st.integers(0, 10**3), share=st.floats(0, 2))
-def test_stages_only_come_and_the_last_is_the_end(steps: int, tuning: int, share: float) -> None:
-    compact = PruneConfig(share=0.5, steps=tuning) if tuning else PruneConfig()
+@given(steps=st.integers(1, 10**4), tuning=st.integers(0, 10**3), fraction=st.floats(0, 2))
+def test_stages_only_come_and_the_last_is_the_end(steps: int, tuning: int, fraction: float) -> None:
+    compact = PruneConfig(fraction=0.5, steps=tuning) if tuning else PruneConfig()
     config = PLAIN.model_copy(update={"train": TrainConfig(steps=steps), "prune": compact})
     total = config.total_steps
     around = sorted({min(max(x, 0), total) for x in (0, steps // 2, steps - 1, steps, steps + 1, total - 1, total)})
@@ -29,9 +29,9 @@ def test_stages_only_come_and_the_last_is_the_end(steps: int, tuning: int, share
     assert found == sorted(found)
     assert found[0] == 0 < found[-1]
     assert total == 1 or found[-2] < found[-1] or around[-2] == total
-    timed = stage(config, steps - 1, share)
+    timed = stage(config, steps - 1, fraction)
     assert timed >= stage(config, steps - 1)
-    assert tuning or timed >= sum(share >= x for x in STAGES)
+    assert tuning or timed >= sum(fraction >= x for x in STAGES)
 
 
 def test_the_stage_of_a_run_follows_its_steps_and_its_time(still: Path) -> None:

@@ -54,17 +54,17 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
     usual = write_within(trainer, tmp_path / "usual", 5.0)
     assert (usual.coarser, usual.num_kept) == (1, 500)
     assert usual.after > usual.before - 0.1, "0.025 dB were meant to be lost"
-    for share in (0.8, 0.4, 0.15):
-        asked = share * usual.megabytes
-        report = write_within(trainer, tmp_path / str(share), asked)
-        file = tmp_path / str(share) / EXPORT_FOLDER / SCENE_FILE
+    for fraction in (0.8, 0.4, 0.15):
+        asked = fraction * usual.megabytes
+        report = write_within(trainer, tmp_path / str(fraction), asked)
+        file = tmp_path / str(fraction) / EXPORT_FOLDER / SCENE_FILE
         assert file.stat().st_size == round(1e6 * report.megabytes) <= 1e6 * asked
         assert report.coarser > 1 or report.num_kept < 500
         assert report.before == usual.before
         assert f"asked {asked:g}" in str(report)
         scene = load_run(file.parent).scene
         assert len(scene) == report.num_kept
-        drawn = quality_of(trainer, scene, [trainer.pictures[i] for i in range(4)])
+        drawn = quality_of(trainer, scene, [trainer.images[i] for i in range(4)])
         assert drawn == pytest.approx(report.after), "what is said is what the file shows"
     after = trainer.checkpoint().tensors
     assert {name.partition(".")[0] for name in before.keys() - after.keys()} <= {"strategy"}

@@ -41,8 +41,8 @@ from dyngs.config import (
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
+from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.scene import Scene
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 
@@ -55,7 +55,7 @@ BASE, EACH = 1e-3, 1e-5
 
 def simulated(scene: Scene) -> float:
     """Seconds of a drawing on the simulated machine."""
-    return BASE + EACH * (len(scene) + (0 if scene.is_still else len(scene.rows)))
+    return BASE + EACH * (len(scene) + (0 if scene.is_static else len(scene.rows)))
 
 
 def fps_of(count: int) -> float:
@@ -95,7 +95,7 @@ def human_config(capture: Path, run_dir: Path) -> Config:
     return Config(
         data=DataConfig(root=capture),
         model=HumanModel(
-            resolution=24, scaffold_heights=(0.0, 0.02), min_silhouette_share=0.0, refine_from=0.2, sh_degree=0
+            resolution=24, scaffold_heights=(0.0, 0.02), min_silhouette_fraction=0.0, refine_from=0.2, sh_degree=0
         ),
         strategy=DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11),
         train=TrainConfig(steps=10, log_every=1),
@@ -162,7 +162,7 @@ def test_too_many_are_removed_and_resuming_is_exact(
 
 @pytest.mark.usefixtures("machine")
 def test_a_last_stage_is_fast_enough_too(moving: Path, tmp_path: Path) -> None:
-    stage = PruneConfig(share=0.3, steps=6, mask_times=3)
+    stage = PruneConfig(fraction=0.3, steps=6, mask_times=3)
     config = busy_config(moving, tmp_path / "run", "trajectory").model_copy(update={"prune": stage})
     assert len(load_run(train(config)).scene) > 40
     config = config.model_copy(update={"run": RunConfig(dir=tmp_path / "fast", threads=1)})
@@ -257,16 +257,16 @@ def test_a_drawing_takes_the_median_of_what_views_take_undisturbed(
 ) -> None:
     """A clock that only drawing advances: four views take 1, 2, 3 and 4 s, and each is disturbed all times but one."""
     trainer, clock, drawn = assemble(still_config(still, tmp_path)), [0.0], [0]
-    scene, size = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.pictures[0].cameras
+    scene, size = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.images[0].cameras
 
-    def picture(drawing: Drawing, cameras: object, moment: float | None) -> torch.Tensor:
+    def image(drawing: Drawing, cameras: object, moment: float | None) -> torch.Tensor:
         turn = drawn[0] - 1  # the first is the warm-up
         view, around = turn % 4, turn // 4
         clock[0] += 1 + view + (0 if around == view % ROUNDS else 10)
         drawn[0] += 1
         return torch.zeros(size.height, size.width, 3)
 
-    monkeypatch.setattr(Drawing, "picture", picture)
+    monkeypatch.setattr(Drawing, "image", image)
     monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
     assert drawing_seconds(trainer, scene) == 2.5
     assert drawn[0] == 1 + 4 * ROUNDS

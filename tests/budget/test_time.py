@@ -65,8 +65,8 @@ def test_a_settled_run_goes_on_as_it_was() -> None:
     assert fitting_steps(PLAIN, 6000, 0.5, 100, 7000) == 6200
 
 
-def test_sharper_pictures_take_longer() -> None:
-    """From a quarter of the sides on, a pixel's share of a step is 16 times as much."""
+def test_sharper_images_take_longer() -> None:
+    """From a quarter of the sides on, a pixel's fraction of a step is 16 times as much."""
     assert seconds_left(SHRUNK, 6000, 7000, 0.5) == pytest.approx(500)
     small = seconds_left(SHRUNK, 10, 7000, 0.1)
     assert small > 1.5 * seconds_left(PLAIN, 10, 7000, 0.1)

@@ -169,9 +169,9 @@ def test_the_scene_is_listed() -> None:
 def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> None:
     root = tmp_path / "capture"
     assert main(["data", "synth", "still", str(root), "--size", "8", "--views", "4"]) == 0
-    picture = next((root / "train").iterdir())
-    picture.rename(tmp_path / "own.png")
-    picture.symlink_to(tmp_path / "own.png")
+    image = next((root / "train").iterdir())
+    image.rename(tmp_path / "own.png")
+    image.symlink_to(tmp_path / "own.png")
     capsys.readouterr()
     assert "set data.follow_links=true" in error_line(capsys, "data", "inspect", str(root))
     assert main(["data", "inspect", str(root), "--deep", "data.follow_links=true"]) == 0

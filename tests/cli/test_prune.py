@@ -28,9 +28,9 @@ def test_a_smaller_run_its_file_and_a_table(tmp_path: Path, capsys: pytest.Captu
         for word in told:
             assert word in text
         assert (out / "export" / SCENE_FILE).is_file()
-    assert load_resolved(tmp_path / "half").prune.share == 0.5
+    assert load_resolved(tmp_path / "half").prune.fraction == 0.5
     assert "exists already" in error_line(capsys, *words, str(tmp_path / "half"))
-    assert "prune.share" in error_line(capsys, *words, str(tmp_path / "x"), "--prune", "1.5")
+    assert "prune.fraction" in error_line(capsys, *words, str(tmp_path / "x"), "--prune", "1.5")
     assert "leave out --prune" in error_line(capsys, *words, str(tmp_path / "x"), "--prune", "0.5", "--max-loss", "1")
     assert "--max-loss" in error_line(capsys, *words, str(tmp_path / "x"), "--max-loss", "-1")
     assert "--out" in error_line(capsys, "prune", str(run))

@@ -11,7 +11,7 @@ from dyngs.config import Config
 
 
 def test_the_captures_of_a_network_are_left_as_they_are(tmp_path: Path) -> None:
-    """The folder of captures is itself no capture, and holds many pictures below."""
+    """The folder of captures is itself no capture, and holds many images below."""
     root = people(tmp_path, (1,))
     config = Config.model_validate({"data": {"root": root}, "model": NET})
     assert _with_poses(config) == config

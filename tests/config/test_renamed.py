@@ -19,7 +19,7 @@ MORE = {
     "dynamic_hexplane": (
         "model.deform.kind=hexplane",
         "colour.kind=network",
-        "prune.share=0.7",
+        "prune.fraction=0.7",
         "prune.mask_times=6",
         "prune.mask_below=0.5",
         "budget.max_mb=5",
@@ -56,7 +56,7 @@ def with_choices(config: Config) -> Config:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_runs_of_before_are_what_their_presets_still_say(preset: str, tmp_path: Path) -> None:
-    """But for what the preset of moving scenes asks for since: silhouettes where needed, a still model beside it;
+    """But for what the preset of moving scenes asks for since: silhouettes where needed, a static model beside it;
     and that of people: one scaffold, more steps."""
     config, asked = load_resolved(FORMER / f"{preset}.yaml"), ADDED.get(preset, ())
     assert with_choices(config) == now(preset, *asked)
@@ -123,7 +123,7 @@ def test_an_override_with_a_former_key_is_told_the_new_one(former: str) -> None:
         ("model:\n  kind: dynamic\n  seeds: 5\n", (":3: model.seeds is called model.num_random_moving now",)),
         (
             "compact:\n  max_loss: 5\n",
-            (":2: compact.max_loss can no longer be chosen; the stage removes just prune.share",),
+            (":2: compact.max_loss can no longer be chosen; the stage removes just prune.fraction",),
         ),
         ("colour:\n  kind: dcac\n", (":2: colour.kind=dcac is called network now",)),
         ("compact:\n", (":1: compact is called prune now",)),

@@ -27,15 +27,15 @@ def camera(azimuth_deg: float, height: float = 1.0) -> np.ndarray:
 
 
 def corner(pose: np.ndarray, time: float) -> np.ndarray:
-    """Return the (H, W, 3) uint8 picture of two walls and a floor, with a disc that faces the camera at ``time``."""
+    """Return the (H, W, 3) uint8 image of two walls and a floor, with a disc that faces the camera at ``time``."""
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     disc = pose[:3, :3] @ (
         np.array([0.6 * np.cos(2 * time), 0.5 * np.sin(3.1 * time), 0.5 + 0.25 * np.sin(4.7 * time)])
     )
     disc += pose[:3, 3]
     across = np.hypot(columns - WIDTH / 2 - FOCAL * disc[0] / disc[2], rows - HEIGHT / 2 - FOCAL * disc[1] / disc[2])
-    picture = np.where(across < 0.22 * FOCAL / disc[2], 245.0, _scenery(pose.tobytes()))
-    return np.repeat(picture[..., None], 3, axis=2).astype(np.uint8)
+    image = np.where(across < 0.22 * FOCAL / disc[2], 245.0, _scenery(pose.tobytes()))
+    return np.repeat(image[..., None], 3, axis=2).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)
@@ -45,15 +45,15 @@ def _scenery(pose_bytes: bytes) -> np.ndarray:
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     local = np.stack([(columns - WIDTH / 2) / FOCAL, (rows - HEIGHT / 2) / FOCAL, np.ones_like(rows)], axis=-1)
     rays, center = local @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
-    nearest, picture = np.full(rows.shape, np.inf), np.zeros((HEIGHT, WIDTH))
+    nearest, image = np.full(rows.shape, np.inf), np.zeros((HEIGHT, WIDTH))
     for axis, place in ((0, -1.0), (1, -1.0), (2, 0.0)):
         depth = (place - center[axis]) / rays[..., axis]
         hit = center + depth[..., None] * rays
         others = [i for i in range(3) if i != axis]
         closer = (depth > 0) & (depth < nearest)
         nearest = np.where(closer, depth, nearest)
-        picture = np.where(closer, _spots(hit[..., others[0]], hit[..., others[1]], axis), picture)
-    return picture
+        image = np.where(closer, _spots(hit[..., others[0]], hit[..., others[1]], axis), image)
+    return image
 
 
 def write_videos(folder: Path, azimuths: dict[str, float], starts: dict[str, float], rate: float, count: int) -> None:

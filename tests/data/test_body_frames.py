@@ -153,7 +153,7 @@ def view_of(frame: int | None) -> View:
 def test_views_find_their_rows_by_frame() -> None:
     body = replace(random_body(0), frames=(2, 5, 9))
     assert rows_of(FILE, body, [view_of(9), view_of(2), view_of(9)]).tolist() == [2, 0, 2]
-    with pytest.raises(DyngsError, match=r"2 frames that have pictures \(3, 4\).* 3 frames from 2 to 9"):
+    with pytest.raises(DyngsError, match=r"2 frames that have images \(3, 4\).* 3 frames from 2 to 9"):
         rows_of(FILE, body, [view_of(2), view_of(4), view_of(3), view_of(4)])
     with pytest.raises(DyngsError, match=r"None\.png has no frame number"):
         rows_of(FILE, body, [view_of(None)])

@@ -1,4 +1,4 @@
-"""Decoded pictures, and their copies on other devices."""
+"""Decoded images, and their copies on other devices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The file of seconds beside pictures."""
+"""The file of seconds beside images."""
 
 from __future__ import annotations
 

@@ -9,12 +9,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pretend_card import CARD, pretend_card
-from tiny_captures import random_pixels, write_picture
+from pretend_gpu import GPU, pretend_gpu
+from tiny_captures import random_pixels, write_image
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Lens, Silhouette, View
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError
 
 
@@ -24,28 +24,28 @@ def views_of(root: Path, count: int = 3, channels: int = 4, size: tuple[int, int
     views = []
     for i in range(count):
         path = root / f"{i}.png"
-        write_picture(path, random_pixels(height, width, channels, seed=i))
+        write_image(path, random_pixels(height, width, channels, seed=i))
         views.append(View(str(i), path, np.eye(4), intrinsics, width, height))
     return tuple(views)
 
 
-def loader(views: tuple[View, ...], **options: float) -> PictureLoader:
-    return PictureLoader(views, DataConfig.model_validate({"root": ".", **options}))
+def loader(views: tuple[View, ...], **options: float) -> ImageLoader:
+    return ImageLoader(views, DataConfig.model_validate({"root": ".", **options}))
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.2, 0.7, 0.4)])
 def test_compositing_is_the_float_formula(tmp_path: Path, background: tuple[float, ...]) -> None:
-    picture = loader(views_of(tmp_path))[1]
+    image = loader(views_of(tmp_path))[1]
     pixels = random_pixels(8, 12, 4, seed=1) / 255
     wanted = pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:]) * background
-    np.testing.assert_allclose(picture.composite(torch.tensor(background)).numpy(), wanted, atol=1e-6)
+    np.testing.assert_allclose(image.composite(torch.tensor(background)).numpy(), wanted, atol=1e-6)
 
 
-def test_pictures_without_alpha_are_opaque(tmp_path: Path) -> None:
-    picture = loader(views_of(tmp_path, channels=3))[0]
-    assert picture.alpha is None
-    assert picture.mask is None
-    np.testing.assert_allclose(picture.composite(torch.ones(3)), random_pixels(8, 12, 3) / 255, atol=1e-6)
+def test_images_without_alpha_are_opaque(tmp_path: Path) -> None:
+    image = loader(views_of(tmp_path, channels=3))[0]
+    assert image.alpha is None
+    assert image.mask is None
+    np.testing.assert_allclose(image.composite(torch.ones(3)), random_pixels(8, 12, 3) / 255, atol=1e-6)
 
 
 @settings(max_examples=15, deadline=None)
@@ -53,7 +53,7 @@ def test_pictures_without_alpha_are_opaque(tmp_path: Path) -> None:
 def test_downscaled_compositing_and_intrinsics(
     tmp_path_factory: pytest.TempPathFactory, downscale: float, longest: int | None
 ) -> None:
-    """Downscaling and compositing commute to 1/255; a ray through the picture's corner stays the same ray."""
+    """Downscaling and compositing commute to 1/255; a ray through the image's corner stays the same ray."""
     root = tmp_path_factory.mktemp("views")
     view = views_of(root, 1)[0]
     options = {"downscale": downscale} | ({} if longest is None else {"longest_side": longest})
@@ -70,41 +70,41 @@ def test_downscaled_compositing_and_intrinsics(
     np.testing.assert_allclose(ray.numpy(), wanted_ray, rtol=1e-5)
 
 
-def test_a_shrunk_picture_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
+def test_a_shrunk_image_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
     """And its camera sees the same; what is masked anywhere in a pixel does not count."""
-    picture = loader(views_of(tmp_path))[0]
+    image = loader(views_of(tmp_path))[0]
     mask = torch.ones(8, 12)
     mask[5, 3] = 0
-    small = replace(picture, mask=mask).shrunk(4)
+    small = replace(image, mask=mask).shrunk(4)
     assert (small.cameras.width, small.cameras.height) == (3, 2)
-    assert picture.alpha is not None
+    assert image.alpha is not None
     assert small.alpha is not None
     assert small.mask is not None
-    torch.testing.assert_close(small.alpha, picture.alpha.reshape(2, 4, 3, 4).mean((1, 3)))
-    torch.testing.assert_close(small.rgb_premultiplied, picture.rgb_premultiplied.reshape(2, 4, 3, 4, 3).mean((1, 3)))
+    torch.testing.assert_close(small.alpha, image.alpha.reshape(2, 4, 3, 4).mean((1, 3)))
+    torch.testing.assert_close(small.rgb_premultiplied, image.rgb_premultiplied.reshape(2, 4, 3, 4, 3).mean((1, 3)))
     assert small.mask.tolist() == [[1, 1, 1], [0, 1, 1]]
     torch.testing.assert_close(
         small.cameras.intrinsics[0], torch.tensor([[5.0, 0, 1.625], [0, 5.25, 0.875], [0, 0, 1]])
     )
-    assert picture.shrunk(1) is picture
-    assert picture.shrunk(100).rgb_premultiplied.shape == (1, 1, 3)
+    assert image.shrunk(1) is image
+    assert image.shrunk(100).rgb_premultiplied.shape == (1, 1, 3)
 
 
 @pytest.mark.parametrize("cache_mb", [0, 1e-3, 1])
-def test_shrunk_pictures_are_the_same_cached_or_not(cache_mb: float, tmp_path: Path) -> None:
+def test_shrunk_images_are_the_same_cached_or_not(cache_mb: float, tmp_path: Path) -> None:
     """Within the limit, whatever the factors."""
-    pictures = loader(views_of(tmp_path, 4), cache_mb=cache_mb)
+    images = loader(views_of(tmp_path, 4), cache_mb=cache_mb)
     for factor in (4, 2, 1, 2):
         for i in (0, 1, 0, 3, -1):
-            wanted, found = pictures[i].shrunk(factor), pictures.shrunk(i, factor)
+            wanted, found = images[i].shrunk(factor), images.shrunk(i, factor)
             assert found.name == wanted.name
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
             assert torch.equal(found.cameras.intrinsics, wanted.cameras.intrinsics)
-            assert pictures.cached_bytes <= cache_mb * 1e6
+            assert images.cached_bytes <= cache_mb * 1e6
     for i in range(4):
         (tmp_path / f"{i}.png").unlink()
     if cache_mb == 1:
-        assert torch.equal(pictures.shrunk(0, 2).rgb_premultiplied, pictures[0].shrunk(2).rgb_premultiplied)
+        assert torch.equal(images.shrunk(0, 2).rgb_premultiplied, images[0].shrunk(2).rgb_premultiplied)
 
 
 def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
@@ -113,31 +113,31 @@ def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
     cached, uncached = loader(views, downscale=1.5), loader(views, downscale=1.5, cache_mb=0)
     assert uncached.cached_bytes == 0
     with ThreadPoolExecutor(4) as pool:
-        pictures = list(pool.map(lambda i: cached[i % 4], range(16)))
-    for i, picture in enumerate(pictures):
-        torch.testing.assert_close(picture.rgb_premultiplied, uncached[i % 4].rgb_premultiplied, rtol=0, atol=0)
+        images = list(pool.map(lambda i: cached[i % 4], range(16)))
+    for i, image in enumerate(images):
+        torch.testing.assert_close(image.rgb_premultiplied, uncached[i % 4].rgb_premultiplied, rtol=0, atol=0)
     assert uncached.cached_bytes == 0
 
 
 def test_cache_keeps_to_its_limit_and_what_is_in_it(tmp_path: Path) -> None:
     one = 8 * 12 * 4
-    pictures = loader(views_of(tmp_path, 4), cache_mb=2.5 * one / 1e6)
+    images = loader(views_of(tmp_path, 4), cache_mb=2.5 * one / 1e6)
     for i in (0, 1, 0, 2):
-        pictures[i]
-        assert pictures.cached_bytes <= 2.5 * one
+        images[i]
+        assert images.cached_bytes <= 2.5 * one
     for i in range(4):
         (tmp_path / f"{i}.png").unlink()
-    pictures[0], pictures[1]
+    images[0], images[1]
     with pytest.raises(DyngsError, match=r"2\.png"):
-        pictures[2]
+        images[2]
 
 
 @pytest.mark.parametrize("cache_mb", [1e-3, 1])
-def test_pictures_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> None:
+def test_images_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> None:
     """In any order, also one that was not foretold, and within the limit."""
     views = views_of(tmp_path, 6)
     options = DataConfig(root=Path(), cache_mb=cache_mb)
-    ahead, plain = PictureLoader(views, options, decoding_threads=2), loader(views, cache_mb=0)
+    ahead, plain = ImageLoader(views, options, decoding_threads=2), loader(views, cache_mb=0)
     for factor, order in ((2, (3, 1, 4, 0, 2, 5)), (1, (5, 0, 1, 2, 4, 3)), (1, (0, 1, 2, 3, 4, 5))):
         for position, index in enumerate(order):
             found, wanted = ahead.shrunk(index, factor), plain.shrunk(index, factor)
@@ -150,85 +150,85 @@ def test_pictures_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) ->
 @pytest.mark.parametrize("free", [None, 4 * 2.5 * 8 * 12 * 4, 0])
 @pytest.mark.parametrize("cache_mb", [1e-3, 1])
 @pytest.mark.parametrize("threads", [0, 2])
-def test_pictures_given_out_on_a_card_are_the_same(
+def test_images_given_out_on_a_gpu_are_the_same(
     free: float | None, cache_mb: float, threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whether they are kept there, on the CPU, or nowhere; within both limits."""
     views = views_of(tmp_path, 6)
     monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: None if free is None else (free, 0))
     options = DataConfig(root=Path(), cache_mb=cache_mb)
-    there, plain = PictureLoader(views, options, decoding_threads=threads), loader(views, cache_mb=0)
-    with pretend_card():
-        there.device = CARD
+    there, plain = ImageLoader(views, options, decoding_threads=threads), loader(views, cache_mb=0)
+    with pretend_gpu():
+        there.device = GPU
         for factor, order in ((2, (3, 1, 4, 0, 2, 5)), (1, (5, 0, 1, 2, 4, 3)), (1, (0, 1, 2, 3, 4, 5))):
             for position, index in enumerate(order):
                 found, wanted = there.shrunk(index, factor), plain.shrunk(index, factor)
-                assert found.rgb_premultiplied.device == found.cameras.intrinsics.device == CARD
+                assert found.rgb_premultiplied.device == found.cameras.intrinsics.device == GPU
                 assert torch.equal(found.rgb_premultiplied.cpu(), wanted.rgb_premultiplied)
                 there.expect((*order[position + 1 : position + 4], 0))
                 assert there.cached_bytes <= cache_mb * 1e6
                 assert there._taken <= there._room
         assert there.decoded_ahead == (0 if free is None else 2 * threads)
-        assert there.bytes_on_card == {None: 6 * 8 * 12 * 3, 0: 0}.get(free, int(2.5 * 8 * 12 * 4))
+        assert there.bytes_on_gpu == {None: 6 * 8 * 12 * 3, 0: 0}.get(free, int(2.5 * 8 * 12 * 4))
 
 
-def test_pictures_that_a_card_keeps_are_sent_once(tmp_path: Path) -> None:
-    pictures = loader(views_of(tmp_path, 3), cache_mb=1)
-    pictures[0]
-    assert pictures.cached_bytes > 0
-    with pretend_card() as card:
-        pictures.device = CARD
+def test_images_that_a_gpu_keeps_are_sent_once(tmp_path: Path) -> None:
+    images = loader(views_of(tmp_path, 3), cache_mb=1)
+    images[0]
+    assert images.cached_bytes > 0
+    with pretend_gpu() as gpu:
+        images.device = GPU
         for _ in range(2):
             for i in range(3):
-                pictures[i]
+                images[i]
         cameras = 2 * 6
-        assert card.waits == {"queued to the card": 3 + cameras}
-    assert pictures.cached_bytes == 0, "they are not kept twice"
+        assert gpu.waits == {"queued to the GPU": 3 + cameras}
+    assert images.cached_bytes == 0, "they are not kept twice"
 
 
-def test_a_damaged_picture_is_reported_when_its_turn_comes(tmp_path: Path) -> None:
+def test_a_damaged_image_is_reported_when_its_turn_comes(tmp_path: Path) -> None:
     views = views_of(tmp_path, 3)
-    pictures = PictureLoader(views, DataConfig(root=Path()), decoding_threads=1)
+    images = ImageLoader(views, DataConfig(root=Path()), decoding_threads=1)
     views[2].image_path.unlink()
-    pictures.expect([1, 2])
-    assert pictures[1].name == "1"
+    images.expect([1, 2])
+    assert images[1].name == "1"
     with pytest.raises(DyngsError, match=r"2\.png"):
-        pictures[2]
+        images[2]
 
 
 def test_length_iteration_and_last(tmp_path: Path) -> None:
-    pictures = loader(views_of(tmp_path))
-    assert len(pictures) == 3
-    assert [picture.name for picture in pictures] == ["0", "1", "2"]  # type: ignore[attr-defined]
-    assert pictures[-1].name == "2"
+    images = loader(views_of(tmp_path))
+    assert len(images) == 3
+    assert [image.name for image in images] == ["0", "1", "2"]  # type: ignore[attr-defined]
+    assert images[-1].name == "2"
 
 
 def test_camera_and_time_are_the_view_s(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = 1, 2, 3
-    picture = loader((replace(views_of(tmp_path, 1)[0], cam_from_world=pose, time=0.25),))[0]
-    assert picture.time == 0.25
-    assert picture.cameras.cam_from_world.dtype == torch.float32
-    assert picture.cameras.centers.tolist() == [[-1, -2, -3]]
+    image = loader((replace(views_of(tmp_path, 1)[0], cam_from_world=pose, time=0.25),))[0]
+    assert image.time == 0.25
+    assert image.cameras.cam_from_world.dtype == torch.float32
+    assert image.cameras.centers.tolist() == [[-1, -2, -3]]
 
 
 def test_times_are_known_without_decoding(tmp_path: Path) -> None:
     """In the order of the views; None where a view has none."""
     times = (0.75, None, 0.0)
     views = tuple(replace(view, time=time) for view, time in zip(views_of(tmp_path), times, strict=True))
-    pictures = loader(views)
+    images = loader(views)
     for view in views:
         view.image_path.unlink()
-    assert pictures.times == times
-    assert pictures.cached_bytes == 0
+    assert images.times == times
+    assert images.cached_bytes == 0
     assert loader(()).times == ()
 
 
-def test_mask_follows_the_picture(tmp_path: Path) -> None:
+def test_mask_follows_the_image(tmp_path: Path) -> None:
     """A small pixel counts only if all that it covers counts."""
     keep = np.full((8, 12, 1), 255, np.uint8)
     keep[2, 5] = 0
-    write_picture(tmp_path / "mask.png", keep)
+    write_image(tmp_path / "mask.png", keep)
     view = replace(views_of(tmp_path, 1)[0], mask_path=tmp_path / "mask.png")
     mask = loader((view,))[0].mask
     assert mask is not None
@@ -239,7 +239,7 @@ def test_mask_follows_the_picture(tmp_path: Path) -> None:
     assert set(small.unique().tolist()) == {0.0, 1.0}
 
 
-def test_undistorted_picture_ignores_what_the_lens_did_not_see(tmp_path: Path) -> None:
+def test_undistorted_image_ignores_what_the_lens_did_not_see(tmp_path: Path) -> None:
     view = replace(views_of(tmp_path, 1, 3)[0], lens=Lens("opencv", (3.0, 0.0, 0.0, 0.0)))
     mask = loader((view,))[0].mask
     assert mask is not None
@@ -248,11 +248,11 @@ def test_undistorted_picture_ignores_what_the_lens_did_not_see(tmp_path: Path) -
     assert loader((gentle,))[0].mask is None
 
 
-def test_missing_pictures_are_counted_at_once(tmp_path: Path) -> None:
+def test_missing_images_are_counted_at_once(tmp_path: Path) -> None:
     views = views_of(tmp_path, 5)
     for i in (1, 3):
         (tmp_path / f"{i}.png").unlink()
-    with pytest.raises(DyngsError, match=r"2 of 5 pictures are missing, the first is .*1\.png"):
+    with pytest.raises(DyngsError, match=r"2 of 5 images are missing, the first is .*1\.png"):
         loader(views)
 
 
@@ -262,27 +262,27 @@ def test_missing_mask_counts_as_missing(tmp_path: Path) -> None:
         loader((view,))
 
 
-def test_truncated_picture_is_found_before_training(tmp_path: Path) -> None:
+def test_truncated_image_is_found_before_training(tmp_path: Path) -> None:
     views = views_of(tmp_path, 3, size=(64, 48))
     path = tmp_path / "2.png"
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(DyngsError, match=r"2\.png: the picture is truncated"):
+    with pytest.raises(DyngsError, match=r"2\.png: the image is truncated"):
         loader(views)
 
 
 def test_sizes_that_disagree(tmp_path: Path) -> None:
     views = views_of(tmp_path, 1)
-    with pytest.raises(DyngsError, match=r"0\.png: the picture is 12x8, but 12x9"):
+    with pytest.raises(DyngsError, match=r"0\.png: the image is 12x8, but 12x9"):
         loader((replace(views[0], height=9),))
-    write_picture(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
+    write_image(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
     with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):
-        loader((replace(views[0], mask_path=tmp_path / "mask.png"),))  # before a picture is asked for
+        loader((replace(views[0], mask_path=tmp_path / "mask.png"),))  # before an image is asked for
 
 
 def test_silhouettes_become_alpha(tmp_path: Path) -> None:
     person = np.zeros((8, 12, 1), np.uint8)
     person[2:4, 3:6] = 7
-    write_picture(tmp_path / "person.png", person)
+    write_image(tmp_path / "person.png", person)
     views = [
         replace(v, silhouette=Silhouette(tmp_path / "person.png", "nonzero")) for v in views_of(tmp_path, channels=3)
     ]
@@ -290,15 +290,15 @@ def test_silhouettes_become_alpha(tmp_path: Path) -> None:
     assert alpha is not None
     assert torch.equal(alpha, torch.from_numpy(person[..., 0] > 0).float())
     (tmp_path / "person.png").unlink()
-    with pytest.raises(DyngsError, match=r"3 of 6 pictures are missing, the first is .*person\.png"):
+    with pytest.raises(DyngsError, match=r"3 of 6 images are missing, the first is .*person\.png"):
         loader(tuple(views))
 
 
-def test_a_picture_on_another_device(tmp_path: Path) -> None:
+def test_a_image_on_another_device(tmp_path: Path) -> None:
     """The device "meta" holds no numbers; it only shows that nothing is left behind."""
     view = views_of(tmp_path)[0]
-    write_picture(tmp_path / "mask.png", random_pixels(8, 12, 1))
-    moved = PictureLoader([replace(view, mask_path=tmp_path / "mask.png")])[0].to("meta").shrunk(2)
+    write_image(tmp_path / "mask.png", random_pixels(8, 12, 1))
+    moved = ImageLoader([replace(view, mask_path=tmp_path / "mask.png")])[0].to("meta").shrunk(2)
     cameras, background = moved.cameras, torch.zeros(3, device="meta")
     tensors = (cameras.cam_from_world, cameras.intrinsics, moved.rgb_premultiplied, moved.composite(background))
     assert moved.alpha is not None
@@ -306,8 +306,8 @@ def test_a_picture_on_another_device(tmp_path: Path) -> None:
     assert {x.device.type for x in (*tensors, moved.alpha, moved.mask)} == {"meta"}
 
 
-def test_pictures_beyond_the_limit_are_refused_at_the_beginning(blender_root: Path) -> None:
+def test_images_beyond_the_limit_are_refused_at_the_beginning(blender_root: Path) -> None:
     views = views_of(blender_root)
     with pytest.raises(DyngsError, match=r"12x8 pixels are 9\.6e-05 megapixels, but data\.max_megapixels is 9e-05"):
-        PictureLoader(views, DataConfig(root=blender_root, max_megapixels=9e-5))
-    assert len(PictureLoader(views, DataConfig(root=blender_root, max_megapixels=1e-4))[0].rgb_premultiplied) == 8
+        ImageLoader(views, DataConfig(root=blender_root, max_megapixels=9e-5))
+    assert len(ImageLoader(views, DataConfig(root=blender_root, max_megapixels=1e-4))[0].rgb_premultiplied) == 8

@@ -1,4 +1,4 @@
-"""Times by names of pictures."""
+"""Times by names of images."""
 
 from __future__ import annotations
 

@@ -5,26 +5,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_captures import edit_json, write_picture
+from tiny_captures import edit_json, write_image
 from tiny_priors import with_priors
 
+from dyngs.capture.inspection.report import format_report, inspect_capture
 from dyngs.config import DataConfig
-from dyngs.data.inspection.report import format_report, inspect_capture
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 
 
-def loaded(root: Path, **options: object) -> PictureLoader:
+def loaded(root: Path, **options: object) -> ImageLoader:
     config = DataConfig.model_validate({"root": root, "test_every": 0, **options})
-    return PictureLoader(read_capture(config).splits["train"], config, with_maps=True)
+    return ImageLoader(read_capture(config).splits["train"], config, with_maps=True)
 
 
-def test_maps_come_with_the_picture(tmp_path: Path) -> None:
-    """Flow in the pixels of the smaller picture; depth of its own size; the next view is that of the next time."""
-    pictures = loaded(with_priors(tmp_path), downscale=2)
-    assert [view.flow_to for view in pictures.views] == [None, "a", "b"]
-    first, second = pictures[0], pictures[1]
+def test_maps_come_with_the_image(tmp_path: Path) -> None:
+    """Flow in the pixels of the smaller image; depth of its own size; the next view is that of the next time."""
+    images = loaded(with_priors(tmp_path), downscale=2)
+    assert [view.flow_to for view in images.views] == [None, "a", "b"]
+    first, second = images[0], images[1]
     assert first.moves is not None
     assert first.depth is not None
     assert second.moves is not None
@@ -42,9 +42,9 @@ def test_maps_come_with_the_picture(tmp_path: Path) -> None:
 def test_who_does_not_ask_for_maps_does_not_pay_for_them(tmp_path: Path) -> None:
     views = read_capture(with_priors(tmp_path)).splits["train"]
     (tmp_path / "a_depth.npy").write_bytes(b"")
-    picture = PictureLoader(views)[0]
-    assert picture.depth is None
-    assert picture.flow is None
+    image = ImageLoader(views)[0]
+    assert image.depth is None
+    assert image.flow is None
 
 
 def test_missing_priors_are_done_without(tmp_path: Path) -> None:
@@ -75,13 +75,13 @@ def test_priors_outside_the_capture_are_refused(tmp_path: Path, key: str) -> Non
 
 def test_maps_of_another_size_are_refused(tmp_path: Path) -> None:
     np.save(with_priors(tmp_path) / "b_flow.npy", np.zeros((4, 6, 2)))
-    with pytest.raises(DyngsError, match=r"b_flow\.npy: the flow field is 6x4 but its picture is 12x8"):
+    with pytest.raises(DyngsError, match=r"b_flow\.npy: the flow field is 6x4 but its image is 12x8"):
         loaded(tmp_path)[1]
 
 
 def test_instance_masks_mean_that_everything_labelled_moves(tmp_path: Path) -> None:
     with_priors(tmp_path)
-    write_picture(tmp_path / "labels.png", np.arange(96, dtype=np.uint16).reshape(8, 12, 1))
+    write_image(tmp_path / "labels.png", np.arange(96, dtype=np.uint16).reshape(8, 12, 1))
     edit_json(
         tmp_path / "transforms_train.json",
         lambda c: c["frames"][0].pop("motion_mask_path") and c["frames"][0].update(instance_mask_path="labels.png"),

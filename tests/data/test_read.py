@@ -16,12 +16,12 @@ from tiny_captures import (
 )
 
 import dyngs
+from dyngs.capture.inspection.report import report_on
 from dyngs.config import DataConfig
 from dyngs.data import readers
 from dyngs.data.capture import Capture
 from dyngs.data.geometry.poses import camera_center
-from dyngs.data.inspection.report import report_on
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import FORMATS, read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
@@ -141,15 +141,15 @@ def test_empty_test_file_is_a_warning(blender_root: Path) -> None:
     assert "lists no frames" in capture.warnings[0]
 
 
-def test_missing_pictures_are_a_warning_and_then_an_error_of_the_loader(colmap_root: Path) -> None:
+def test_missing_images_are_a_warning_and_then_an_error_of_the_loader(colmap_root: Path) -> None:
     (colmap_root / "images/left/03.jpg").unlink()
     capture = read(colmap_root)
-    assert "1 of 9 pictures are missing" in capture.warnings[0]
+    assert "1 of 9 images are missing" in capture.warnings[0]
     with pytest.raises(DyngsError, match=r"left/03\.jpg"):
-        PictureLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
+        ImageLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
 
 
-def test_two_pictures_of_one_name(nerfstudio_root: Path) -> None:
+def test_two_images_of_one_name(nerfstudio_root: Path) -> None:
     edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][1].update(file_path="images/00.png"))
     with pytest.raises(DyngsError, match=r"00\.(png|jpg) share the name images/00"):
         read(nerfstudio_root)
@@ -157,7 +157,7 @@ def test_two_pictures_of_one_name(nerfstudio_root: Path) -> None:
 
 def test_training_on_the_test_set_is_a_warning(blender_root: Path) -> None:
     edit_json(blender_root / "transforms_test.json", lambda c: c["frames"][0].update(file_path="train/r_1"))
-    assert read(blender_root).warnings == ("1 test pictures are also training pictures, first train/r_1",)
+    assert read(blender_root).warnings == ("1 test images are also training images, first train/r_1",)
 
 
 def set_times(root: Path, split: str, times: list[float]) -> None:
@@ -221,10 +221,10 @@ def test_one_time_for_all_is_a_still_scene(blender_root: Path) -> None:
     set_times(blender_root, "test", [0.5] * 2)
     capture = read(blender_root)
     assert {view.time for view in capture.splits["train"]} == {None}
-    assert capture.warnings == ("all pictures have time 0.5: treated as a still scene",)
+    assert capture.warnings == ("all images have time 0.5: treated as a static scene",)
 
 
-def test_seconds_of_numbered_pictures(tmp_path: Path) -> None:
+def test_seconds_of_numbered_images(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     ordered = DataConfig(root=tmp_path, times="order", frames_per_second=10)
     capture = read_capture(ordered)
@@ -290,7 +290,7 @@ def test_dynamic_formats_are_recognised_and_load(tmp_path: Path, form: str) -> N
     for options in ({}, {"format": form}):
         capture = read(tmp_path, **options)
         assert capture.format == form
-        loader = PictureLoader(capture.splits["train"], DataConfig(root=tmp_path, downscale=2))
+        loader = ImageLoader(capture.splits["train"], DataConfig(root=tmp_path, downscale=2))
         assert loader[0].rgb_premultiplied.shape == (6, 8, 3)
         assert loader[0].time == capture.splits["train"][0].time
     with pytest.raises(DyngsError, match=f"no colmap capture.*but there is a {form} capture"):
@@ -348,7 +348,7 @@ def test_real_captures(shared: Path, name: str, form: str, counts: tuple, alpha:
     assert len({view.time for view in capture.splits["train"] if view.time is not None}) == times
     for views in capture.splits.values():
         assert [view.name for view in views] == sorted(view.name for view in views)
-        PictureLoader(views, DataConfig.model_validate({"root": shared / name}))
+        ImageLoader(views, DataConfig.model_validate({"root": shared / name}))
 
 
 def test_part_of_a_real_sequence(shared: Path) -> None:
@@ -395,7 +395,7 @@ def test_a_fisheye_is_undistorted_to_the_pinhole_that_is_asked_for(tmp_path: Pat
     said = [dict(report_on(capture).facts)["lens"] for capture in (same, wide)]
     assert "data.undistort=wide keeps more" in said[0]
     assert "of the focal length, which keeps 9" in said[1]
-    masks = [PictureLoader(capture.splits["train"], DataConfig(root=root))[0].mask for capture in (same, wide)]
+    masks = [ImageLoader(capture.splits["train"], DataConfig(root=root))[0].mask for capture in (same, wide)]
     assert masks[0] is None
     assert masks[1] is not None
     assert 0.5 < float(masks[1].mean()) < 1

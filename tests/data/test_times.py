@@ -39,7 +39,7 @@ def test_no_number(time: object) -> None:
 
 
 def test_missing_in_some() -> None:
-    with pytest.raises(DyngsError, match="b has no time although other pictures have"):
+    with pytest.raises(DyngsError, match="b has no time although other images have"):
         unit_times(ROOT, train(view("a", 0.0), view("b", None)))
 
 
@@ -107,23 +107,23 @@ def test_constant_times_are_a_still_scene(time: float) -> None:
     assert notes == []
     still, notes = still_if_constant(splits)
     assert times_of(still) == [None, None]
-    assert notes == [f"all pictures have time {time:g}: treated as a still scene"]
+    assert notes == [f"all images have time {time:g}: treated as a static scene"]
 
 
 @pytest.mark.parametrize(("time", "kept"), [(0.25, 0.25), (1.0, 1.0), (7.0, 0.0)])
-def test_a_single_picture_is_fine(time: float, kept: float) -> None:
+def test_a_single_image_is_fine(time: float, kept: float) -> None:
     splits, notes = unit_times(ROOT, train(view("a", time)))
     splits, more = still_if_constant(splits)
     assert (times_of(splits), notes, more) == ([kept], [], [])
 
 
-def test_pictures_that_differ_by_chance() -> None:
+def test_images_that_differ_by_chance() -> None:
     views = [view("a", 0.0), view("b", 0.5), view("c", 0.5), view("d", 1.0)]
     (warning,) = sequence_warnings({"train": tuple(views[:2]), "test": tuple(views[2:])})
-    assert "2 pictures share camera, pose and time with another one, first b and c at time 0.5" in warning
+    assert "2 images share camera, pose and time with another one, first b and c at time 0.5" in warning
 
 
-def test_pictures_that_may_share_a_time() -> None:
+def test_images_that_may_share_a_time() -> None:
     """Other cameras, other poses of one camera, and the same file listed twice are no repetitions."""
     poses = [opengl_pose(angle) for angle in (0.0, 1.0)]
     moving = [view("a", 0.0, pose=poses[0]), view("b", 0.0, pose=poses[1]), view("c", 1.0, pose=poses[1])]
@@ -152,7 +152,7 @@ def test_different_numbers_of_frames() -> None:
     assert "(3 more cameras differ)" in warning
 
 
-def test_videos_are_those_of_standing_cameras_or_of_the_one_that_moves() -> None:
+def test_videos_are_those_of_fixed_cameras_or_of_the_one_that_moves() -> None:
     standing = [view(f"{camera}{time}", time, camera) for time in (1.0, 0.0, 0.5) for camera in (0, 1)]
     assert videos(standing) == [[2, 4, 0], [3, 5, 1]]
     walk = [view(f"{i}", (7 * i % 10) / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)]

@@ -12,7 +12,7 @@ import numpy as np
 from dyngs.data.capture import View
 
 
-def write_picture(path: Path, pixels: np.ndarray) -> None:
+def write_image(path: Path, pixels: np.ndarray) -> None:
     """Writes (H, W, D) pixels, straight alpha, in the array's own type."""
     import OpenImageIO as oiio
 
@@ -59,7 +59,7 @@ def edit_json(path: Path, change: Callable[[dict], object]) -> None:
 def write_colmap(
     root: Path, extension: str = "bin", model: str = "PINHOLE", params: Sequence[float] = (10, 11, 6, 4), count: int = 9
 ) -> Path:
-    """A COLMAP model with ``count`` pictures of 12x8 in two subfolders and five points that all of them see."""
+    """A COLMAP model with ``count`` images of 12x8 in two subfolders and five points that all of them see."""
     import pycolmap
 
     scene = pycolmap.Reconstruction()
@@ -70,7 +70,7 @@ def write_colmap(
         )
     for i in range(count):
         name = f"{'left' if i % 2 else 'right'}/{i:02d}.jpg"
-        write_picture(root / "images" / name, random_pixels(8, 12, 3, seed=i))
+        write_image(root / "images" / name, random_pixels(8, 12, 3, seed=i))
         world_from_cam = opengl_pose(0.3 * i) @ np.diag([1.0, -1.0, -1.0, 1.0])
         pose = pycolmap.Rigid3d(np.linalg.inv(world_from_cam)[:3])
         points = [pycolmap.Point2D(np.array([float(k), 1.0])) for k in range(5)]
@@ -87,9 +87,9 @@ def write_colmap(
 
 FOCAL, WIDTH, HEIGHT = 20.0, 16, 12
 SIDE_POSE = np.array([[0.0, 0, 1, 4], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""OpenGL camera-to-world: at (4, 0, 0), looking at the origin, z up. World y runs to the right in its picture."""
+"""OpenGL camera-to-world: at (4, 0, 0), looking at the origin, z up. World y runs to the right in its image."""
 SIDE_PIXELS = (((0, 0, 0), (8.0, 6.0)), ((0, 1, 0), (13.0, 6.0)), ((0, 0, 1), (8.0, 1.0)), ((2, 0.4, 0), (12.0, 6.0)))
-"""World points and where they appear (x, y) in the 16x12 picture of that camera with focal length 20 px."""
+"""World points and where they appear (x, y) in the 16x12 image of that camera with focal length 20 px."""
 
 
 def side_poses(count: int) -> list[np.ndarray]:
@@ -98,7 +98,7 @@ def side_poses(count: int) -> list[np.ndarray]:
 
 
 def pixel_of(view: View, point: Sequence[float]) -> list[float]:
-    """Where a world point appears in the picture of a view, without its lens."""
+    """Where a world point appears in the image of a view, without its lens."""
     x, y, z = view.intrinsics @ (view.cam_from_world @ [*point, 1.0])[:3]
     return [x / z, y / z]
 
@@ -124,7 +124,7 @@ def cached() -> list[Path]:
 
 
 def packet_places(video: Path) -> list[tuple[int, int]]:
-    """Where the data of each picture lies in the file, in order of decoding: first byte and number of bytes."""
+    """Where the data of each image lies in the file, in order of decoding: first byte and number of bytes."""
     import av
 
     with av.open(str(video)) as container:
@@ -134,7 +134,7 @@ def packet_places(video: Path) -> list[tuple[int, int]]:
 
 
 def truncate_video(video: Path, packet: int) -> None:
-    """Cuts the file off in the middle of a picture; the index, which comes first, still promises all of them."""
+    """Cuts the file off in the middle of an image; the index, which comes first, still promises all of them."""
     place, size = packet_places(video)[packet]
     video.write_bytes(video.read_bytes()[: place + size // 2])
 
@@ -144,9 +144,9 @@ def level_of(frame: int) -> int:
 
 
 def write_folder(folder: Path, numbers: Sequence[int], prefix: str = "frame_", suffix: str = ".png") -> None:
-    """A folder of 16x12 pictures, one per frame number."""
+    """A folder of 16x12 images, one per frame number."""
     for number in numbers:
-        write_picture(folder / f"{prefix}{number:04d}{suffix}", random_pixels(HEIGHT, WIDTH, 3, seed=number))
+        write_image(folder / f"{prefix}{number:04d}{suffix}", random_pixels(HEIGHT, WIDTH, 3, seed=number))
 
 
 def write_cameras_json(root: Path, names: Sequence[str], **fields: object) -> None:
@@ -159,7 +159,7 @@ def write_cameras_json(root: Path, names: Sequence[str], **fields: object) -> No
 
 
 def write_poses_bounds(root: Path, count: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    """LLFF's file for cameras at ``side_poses``, with the focal length for pictures of ``size``."""
+    """LLFF's file for cameras at ``side_poses``, with the focal length for images of ``size``."""
     rows = []
     for pose in side_poses(count):
         right, up, back, position = pose[:3].T
@@ -170,7 +170,7 @@ def write_poses_bounds(root: Path, count: int, size: tuple[int, int] = (WIDTH, H
 
 
 def write_nerfies(root: Path, count: int = 6, factor: int = 1) -> Path:
-    """A Nerfies capture at ``side_poses``: even ids train, pictures are ``factor`` times smaller than cameras say."""
+    """A Nerfies capture at ``side_poses``: even ids train, images are ``factor`` times smaller than cameras say."""
     names = [f"{i:06d}" for i in range(count)]
     center, scale = np.array([1.0, -2.0, 0.5]), 0.25
     for i, (name, pose) in enumerate(zip(names, side_poses(count), strict=True)):
@@ -188,7 +188,7 @@ def write_nerfies(root: Path, count: int = 6, factor: int = 1) -> Path:
         }
         (root / "camera").mkdir(parents=True, exist_ok=True)
         (root / "camera" / f"{name}.json").write_text(json.dumps(camera))
-        write_picture(root / f"rgb/{factor}x/{name}.png", random_pixels(HEIGHT, WIDTH, 3, seed=i))
+        write_image(root / f"rgb/{factor}x/{name}.png", random_pixels(HEIGHT, WIDTH, 3, seed=i))
     dataset = {"count": count, "num_exemplars": len(names[::2]), "ids": names, "train_ids": names[::2]}
     (root / "dataset.json").write_text(json.dumps({**dataset, "val_ids": names[1::2]}))
     ids = {name: {"warp_id": i, "appearance_id": i, "camera_id": i % 2} for i, name in enumerate(names)}

@@ -31,7 +31,7 @@ def test_a_known_shift_is_found(x: int, y: int, seed: int) -> None:
     assert bool((found.shifts[inside][trusted] == wanted[trusted]).all())
 
 
-def test_equal_pictures_stay() -> None:
+def test_equal_images_stay() -> None:
     found = matched(texture(), texture())
     assert not found.shifts.any()
     assert bool((found.trusted == 1).all())

@@ -1,4 +1,4 @@
-"""Registration by block matching in training: which pictures it looks at, and that runs keep their bytes."""
+"""Registration by block matching in training: which images it looks at, and that runs keep their bytes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def scene_and_views(trainer: Trainer) -> tuple[DynamicScene, ComparedViews]:
     return cast(DynamicScene, trainer.scene), views
 
 
-def test_errors_are_those_of_pictures_that_are_trained_on(moving: Path, tmp_path: Path) -> None:
+def test_errors_are_those_of_images_that_are_trained_on(moving: Path, tmp_path: Path) -> None:
     """Within the times asked for."""
     trainer = trained(config_of(moving, tmp_path), 12)
     scene, views = scene_and_views(trainer)
@@ -51,15 +51,15 @@ def test_errors_are_those_of_pictures_that_are_trained_on(moving: Path, tmp_path
 
     error = views.error(at, (0.2, 0.7))
     shown = [
-        i for i, time in enumerate(trainer.pictures.times) if 0.2 <= (time or 0.0) <= 0.7 and i not in trainer.held_out
+        i for i, time in enumerate(trainer.images.times) if 0.2 <= (time or 0.0) <= 0.7 and i not in trainer.held_out
     ]
-    assert asked == [trainer.pictures.times[i] for i in shown]
-    assert set(shown) < set(range(len(trainer.pictures))) - trainer.held_out
+    assert asked == [trainer.images.times[i] for i in shown]
+    assert set(shown) < set(range(len(trainer.images))) - trainer.held_out
     wanted = []
-    for picture in (trainer.pictures[i] for i in shown):
+    for image in (trainer.images[i] for i in shown):
         with torch.no_grad():
-            drawn = scene.render(picture.cameras, picture.time, options=views.options, background=views.background)
-        wanted.append((drawn.rgb[0] - picture.composite(views.background)).square().mean())
+            drawn = scene.render(image.cameras, image.time, options=views.options, background=views.background)
+        wanted.append((drawn.rgb[0] - image.composite(views.background)).square().mean())
     assert error == pytest.approx(float(torch.stack(wanted).mean()), rel=1e-5)
     assert views.error(at, (0.501, 0.502)) == 0.0
 

@@ -15,8 +15,8 @@ from dyngs.deform.spline_fit import spline_basis
 def played(curves: Curves, time: float) -> dict[str, torch.Tensor]:
     """The drivers' offsets at a time, by attribute."""
     points = curves.heads["means"].shape[1]
-    shares = spline_basis(torch.tensor([time]), points - 3)[0].float()
-    return {name: torch.einsum("p,spd->sd", shares, x) for name, x in curves.heads.items()}
+    fractions = spline_basis(torch.tensor([time]), points - 3)[0].float()
+    return {name: torch.einsum("p,spd->sd", fractions, x) for name, x in curves.heads.items()}
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "control_nodes"])
@@ -38,10 +38,10 @@ def test_nodes_are_exact() -> None:
     curves = curves_of(field, means, 40, 1e-3)
     assert curves.pivots is not None
     assert curves.followed is not None
-    assert curves.shares is not None
+    assert curves.fractions is not None
     assert curves.error == 0
-    assert curves.followed.shape == curves.shares.shape == (len(means), 4)
-    torch.testing.assert_close(curves.shares.sum(1), torch.ones(len(means)))
+    assert curves.followed.shape == curves.fractions.shape == (len(means), 4)
+    torch.testing.assert_close(curves.fractions.sum(1), torch.ones(len(means)))
     nodes: Nodes = field.nodes_for(means)  # type: ignore[attr-defined]
     for time in (0.0, 0.31, 1.0):
         heads = played(curves, time)

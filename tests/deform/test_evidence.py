@@ -1,4 +1,4 @@
-"""Evidence of motion: known answers on made-up errors and pictures."""
+"""Evidence of motion: known answers on made-up errors and images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.deform.evidence import Verdict, agreement_over_time, differing_share
+from dyngs.deform.evidence import Verdict, agreement_over_time, differing_fraction
 
 VIEWS, GAUSSIANS = 60, 40
 
@@ -33,12 +33,12 @@ def test_errors_that_depend_on_the_viewpoint_are_no_motion(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("share", [0.1, 1.0])
-def test_errors_that_depend_on_time_are_motion(seed: int, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.1, 1.0])
+def test_errors_that_depend_on_time_are_motion(seed: int, fraction: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     phases = torch.rand(GAUSSIANS, 3, generator=generator) * 2 * math.pi
     times = torch.linspace(0, 4 * math.pi, VIEWS)[:, None, None]
-    moves = (torch.arange(GAUSSIANS) < share * GAUSSIANS)[:, None]
+    moves = (torch.arange(GAUSSIANS) < fraction * GAUSSIANS)[:, None]
     noise = 0.05 * torch.randn(VIEWS, GAUSSIANS, 3, generator=generator)
     assert verdict_of(0.2 * moves * torch.sin(times + phases) + noise, directions(generator)) is Verdict.MOVES
 
@@ -50,13 +50,13 @@ def test_views_that_see_nothing_say_nothing() -> None:
 
 
 def test_a_ball_that_passes_differs_from_the_median() -> None:
-    pictures = [torch.full((20, 20, 3), 0.5) for _ in range(5)]
-    pictures[2][4:8, 6:10] = 1.0
-    assert differing_share([pictures]) == pytest.approx(16 / 2000)
+    images = [torch.full((20, 20, 3), 0.5) for _ in range(5)]
+    images[2][4:8, 6:10] = 1.0
+    assert differing_fraction([images]) == pytest.approx(16 / 2000)
 
 
 def test_exposure_and_noise_do_not_differ_from_the_median() -> None:
     generator = torch.Generator().manual_seed(0)
     base = torch.rand(20, 20, 3, generator=generator) * 0.5
-    pictures = [base + 0.05 * i + 0.01 * torch.randn(20, 20, 3, generator=generator) for i in range(5)]
-    assert differing_share([pictures]) == 0
+    images = [base + 0.05 * i + 0.01 * torch.randn(20, 20, 3, generator=generator) for i in range(5)]
+    assert differing_fraction([images]) == 0

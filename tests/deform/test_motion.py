@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.deform.field import NetworkField, Offsets, deformed
 from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion
-from dyngs.parameters import Parameters
+from dyngs.gaussians.parameters import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))
 

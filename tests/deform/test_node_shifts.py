@@ -8,17 +8,17 @@ from hypothesis import strategies as st
 from tiny_fields import TIMES, cloud
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.deform.node_shifts import LONGEST_SIDE, SeenShift, matching_factor, seen_shift, spline_changes
 from dyngs.deform.nodes import nodes_at
 from dyngs.deform.spline_fit import spline_basis
-from dyngs.rendering import render
+from dyngs.gaussians.rendering import render
 
 PIECES = 3
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1))
-def test_a_shift_that_all_pictures_see_moves_the_splines_by_it(x: float, y: float, z: float) -> None:
+def test_a_shift_that_all_images_see_moves_the_splines_by_it(x: float, y: float, z: float) -> None:
     """What follows no seen Gaussian does not move."""
     positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [100, 0, 0], [101, 0, 0], [102, 0, 0], [103, 0, 0]])
     means = torch.tensor([[0.1, 0, 0], [0.4, 0, 0], [0.9, 0, 0]])
@@ -37,7 +37,7 @@ def test_what_is_not_seen_does_not_move() -> None:
     assert not spline_changes(nodes, nodes.weights(means), seen, PIECES).any()
 
 
-def test_shifts_in_the_picture_are_shifts_in_the_world() -> None:
+def test_shifts_in_the_image_are_shifts_in_the_world() -> None:
     """Gaussians that belong one pixel to the right and two down are told so, at their depth, in a turned camera."""
     gaussians = cloud(60).replace(logit_opacities=torch.full((60,), 3.0))
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2))).Q
@@ -48,8 +48,8 @@ def test_shifts_in_the_picture_are_shifts_in_the_world() -> None:
     cameras = Cameras(pose[None], lens[None], 48, 48)
     drawn = render(gaussians, cameras).rgb[0].detach()
     truth = drawn.roll((2, 1), (0, 1))
-    picture = Picture("a", cameras, truth, None, None, 0.5)
-    found = seen_shift(gaussians, torch.arange(60), picture, drawn, truth)
+    image = Image("a", cameras, truth, None, None, 0.5)
+    found = seen_shift(gaussians, torch.arange(60), image, drawn, truth)
     covers = found.weights > 3
     assert int(covers.sum()) >= 8
     depths = gaussians.means @ turn[2] + 8.0
@@ -59,7 +59,7 @@ def test_shifts_in_the_picture_are_shifts_in_the_world() -> None:
     assert float(error.median()) < 0.25
 
 
-def test_pictures_are_made_small() -> None:
+def test_images_are_made_small() -> None:
     assert matching_factor(LONGEST_SIDE, 10) == 1
     assert matching_factor(854, 480) == 7
     assert matching_factor(400, 401) == 4

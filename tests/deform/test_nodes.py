@@ -55,9 +55,9 @@ def test_a_rigid_motion_of_the_nodes_moves_all_followers_rigidly(count: int, num
 def test_shares_add_up_to_one_and_favour_the_near() -> None:
     means = points(50)
     nodes = place_nodes(means, 12)
-    shares = nodes.weights(means)
-    assert shares.shape == nodes.followed.shape == (50, FOLLOWED)
-    torch.testing.assert_close(shares.sum(1), torch.ones(50, dtype=torch.float64))
+    fractions = nodes.weights(means)
+    assert fractions.shape == nodes.followed.shape == (50, FOLLOWED)
+    torch.testing.assert_close(fractions.sum(1), torch.ones(50, dtype=torch.float64))
     apart = (means[:, None] - nodes.positions[nodes.followed]).norm(dim=-1)
     assert (apart.diff(dim=1) >= 0).all(), "nearest first"
     equal = Nodes(nodes.positions, torch.ones_like(nodes.radii), nodes.followed).weights(means)
@@ -65,11 +65,11 @@ def test_shares_add_up_to_one_and_favour_the_near() -> None:
 
 
 def test_a_gaussian_far_from_all_nodes_still_follows_them() -> None:
-    """Distances of 1e4 radii: shares of plain exponentials would all be zero."""
+    """Distances of 1e4 radii: fractions of plain exponentials would all be zero."""
     means = torch.cat([points(10), torch.tensor([[1e4, 0, 0]], dtype=torch.float64)]).float()
     nodes = place_nodes(means[:10], 5)
-    shares = Nodes(nodes.positions, nodes.radii, torch.arange(4).expand(11, 4)).weights(means)
-    torch.testing.assert_close(shares.sum(1), torch.ones(11))
+    fractions = Nodes(nodes.positions, nodes.radii, torch.arange(4).expand(11, 4)).weights(means)
+    torch.testing.assert_close(fractions.sum(1), torch.ones(11))
 
 
 def test_without_rotations_nodes_only_shift() -> None:

@@ -27,8 +27,8 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.time_window import FRONTIER_VIEWS, TimeWindow
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.rendering import render
 from dyngs.ops.planes import PlaneLevel, hexplane_features
-from dyngs.rendering import render
 from dyngs.state import tensors_of
 from dyngs.static.scene import StaticScene
 from dyngs.training.trainer import Trainer
@@ -114,7 +114,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     automatic = {"hexplane": {"time_resolution": 0}, "control_nodes": {"pieces": 0}}.get(kind, {})
     model = config.model.model_copy(update={"deform": config.model.deform.model_copy(update=automatic)})
     trainer = assemble(config.model_copy(update={"model": model}))
-    seen = {trainer.step().picture.time for _ in range(12)}
+    seen = {trainer.step().image.time for _ in range(12)}
     assert seen == {0.0, 1.0}
     assert isinstance(trainer.scene, DynamicScene)
     field = trainer.scene.field
@@ -263,7 +263,7 @@ def test_gaussians_far_outside_the_box(distance: float) -> None:
 # --- rotations --------------------------------------------------------------------------------------------------------
 
 
-def picture_of(gaussians: Gaussians) -> Tensor:
+def image_of(gaussians: Gaussians) -> Tensor:
     intrinsics = torch.tensor([[40.0, 0, 16], [0, 40, 16], [0, 0, 1]])
     return render(gaussians, Cameras(look_around(1, torch.float32), intrinsics[None], 32, 32)).rgb
 
@@ -272,7 +272,7 @@ def test_a_zero_quaternion_cannot_be_turned() -> None:
     """It stays the identity, which is what the rasterizer takes it for."""
     gaussians = cloud().replace(quats=torch.zeros(9, 4))
     turned = deformed(gaussians, Offsets(torch.zeros(9, 3), torch.randn(9, 4)))
-    assert torch.equal(picture_of(turned), picture_of(gaussians))
+    assert torch.equal(image_of(turned), image_of(gaussians))
 
 
 def test_an_offset_that_cancels_the_identity_is_no_rotation() -> None:
@@ -282,8 +282,8 @@ def test_an_offset_that_cancels_the_identity_is_no_rotation() -> None:
     quats.requires_grad_()
     turned = deformed(cloud(), Offsets(torch.zeros(9, 3), quats))
     identity = cloud().replace(quats=torch.tensor([[1.0, 0, 0, 0]]).expand(9, 4))
-    assert torch.equal(picture_of(turned), picture_of(identity))
-    (slope,) = torch.autograd.grad(picture_of(turned).sum(), [quats])
+    assert torch.equal(image_of(turned), image_of(identity))
+    (slope,) = torch.autograd.grad(image_of(turned).sum(), [quats])
     assert slope.isfinite().all()
 
 
@@ -324,7 +324,7 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 # --- where motion begins ----------------------------------------------------------------------------------------------
 
 
-def test_a_picture_that_a_still_model_explains(capture: Path) -> None:
+def test_a_image_that_a_still_model_explains(capture: Path) -> None:
     """No error stands out: nothing moves, no random Gaussians, no field; the run goes on static."""
     trainer = fine_trainer(capture, "control_nodes", motion_threshold=10.0)
     assert isinstance(trainer.scene, DynamicScene)
@@ -364,6 +364,6 @@ def test_a_run_of_one_step(capture: Path, filtered: bool) -> None:
     trainer = assemble(config)
     trainer.step()
     scene = restored_scene(trainer.checkpoint(), config.model)
-    assert not scene.is_still
+    assert not scene.is_static
     assert len(scene) == 60 + 12
     assert torch.equal(scene.at(0.3).means, scene.gaussians.means)

@@ -48,9 +48,9 @@ def test_the_rigid_motion_of_points_is_found() -> None:
     shift = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
     moved = (points @ matrix.T + shift)[None].clone()
     moved[0, 6] = 99.0
-    shares = torch.ones(1, 7, dtype=torch.float64)
-    shares[0, 6] = 0.0
-    turns, shifts = rigid_motion(points, moved, shares)
+    fractions = torch.ones(1, 7, dtype=torch.float64)
+    fractions[0, 6] = 0.0
+    turns, shifts = rigid_motion(points, moved, fractions)
     torch.testing.assert_close(turns[0, 0], matrix, rtol=0, atol=1e-12)
     torch.testing.assert_close(shifts[0, 0], shift, rtol=0, atol=1e-12)
     mirrored, _ = rigid_motion(points, points[None] * torch.tensor([1.0, 1.0, -1.0]), torch.ones(1, 7).double())

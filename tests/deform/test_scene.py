@@ -15,10 +15,10 @@ from dyngs.deform.fields import field_state
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import tensors_of
 from dyngs.static.filters import fuse_filter
 from dyngs.static.scene import StaticScene
-from dyngs.visibility import VisibilityMasks
 
 ROWS = torch.tensor([1, 4, 5, 8])
 NOTHING = torch.zeros(0, dtype=torch.long)
@@ -78,8 +78,8 @@ def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) 
     moving, still = scene.part("moving"), scene.part("still")
     others = torch.tensor([0, 2, 3, 6, 7])
     assert (len(moving), len(still)) == (4, 5)
-    assert (moving.is_still, still.is_still) == (False, True)
-    assert (moving.moving_share, still.moving_share) == (1.0, 0.0)
+    assert (moving.is_static, still.is_static) == (False, True)
+    assert (moving.moving_fraction, still.moving_fraction) == (1.0, 0.0)
     assert moving.times == still.times == scene.times
     for time in (0.0, 0.37, 1.0):
         whole = scene.at(time)
@@ -100,11 +100,11 @@ def test_parts_of_extreme_scenes() -> None:
 def test_what_a_scene_says_of_itself() -> None:
     scene, field = some_scene("trajectory"), tiny_field("trajectory", 4)
     assert len(scene) == 9
-    assert scene.moving_share == pytest.approx(4 / 9)
+    assert scene.moving_fraction == pytest.approx(4 / 9)
     assert scene.num_motion_values == sum(x.numel() for x in field.parameters.values().values())
     for still in (scene_of(NOTHING), scene_of(NOTHING, field)):
-        assert still.is_still
-        assert (still.moving_share, still.num_motion_values) == (0.0, 0)
+        assert still.is_static
+        assert (still.moving_fraction, still.num_motion_values) == (0.0, 0)
         assert still.at(0.7) is still.gaussians
 
 
@@ -127,7 +127,7 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     scene = DynamicScene.restored(DynamicModel(deform=tiny_options(kind)), gaussians, state)
     assert scene.times == (0.0, 0.25, 1.0)
     assert torch.equal(scene.rows, torch.arange(9) if rows is None else rows)
-    assert scene.is_still == (num_moving == 0)
+    assert scene.is_static == (num_moving == 0)
     means = gaussians.means if rows is None else gaussians.means[rows]
     with torch.no_grad():
         moved = deformed(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
@@ -152,7 +152,7 @@ def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
 
 def test_a_state_without_field_is_a_still_scene() -> None:
     for scene in (StaticScene.restored(cloud(), {}), DynamicScene.restored(DynamicModel(), cloud(), {})):
-        assert scene.is_still
+        assert scene.is_static
         assert scene.times == ()
         assert same(scene.at(0.5), cloud())
 

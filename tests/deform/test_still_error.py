@@ -1,4 +1,4 @@
-"""How far pictures disagree with still Gaussians where they show, and the score that parts two groups of them."""
+"""How far images disagree with static Gaussians where they show, and the score that parts two groups of them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.deform.still_error import MIN_SAME, cameras_in_place, still_errors, two_group_threshold, views_to_compare
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions, render
+from dyngs.gaussians.rendering import RenderOptions, render
 
 SIZE = 24
 OPTIONS = RenderOptions(nonfinite="trust")
@@ -35,7 +35,7 @@ def camera(view: int = 0) -> Cameras:
 
 
 def balls(*places: tuple[float, float, float]) -> Gaussians:
-    """Grey, dense balls, far smaller than the picture."""
+    """Grey, dense balls, far smaller than the image."""
     means, count = torch.tensor(places), len(places)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
     return Gaussians(means, quats, torch.full((count, 3), -2.0), torch.full((count,), 4.0), torch.zeros(count, 1, 3))
@@ -45,8 +45,8 @@ def rendered(gaussians: Gaussians, background: Tensor = BLACK, view: int = 0) ->
     return render(gaussians, camera(view), OPTIONS, background=background).rgb[0].detach()
 
 
-def picture(rgb: Tensor, mask: Tensor | None = None, alpha: Tensor | None = None, view: int = 0) -> Picture:
-    return Picture("view", camera(view), rgb, alpha, mask, 0.5)
+def image(rgb: Tensor, mask: Tensor | None = None, alpha: Tensor | None = None, view: int = 0) -> Image:
+    return Image("view", camera(view), rgb, alpha, mask, 0.5)
 
 
 def sideways(x: float) -> tuple[float, float, float]:
@@ -62,9 +62,9 @@ def left_half() -> Tensor:
     return half
 
 
-def scores_of(gaussians: Gaussians, pictures: list[Picture], background: Tensor) -> Tensor:
+def scores_of(gaussians: Gaussians, images: list[Image], background: Tensor) -> Tensor:
     """(N,) of cameras that do not stay in place."""
-    found = still_errors(lambda _: gaussians, pictures, OPTIONS, background)
+    found = still_errors(lambda _: gaussians, images, OPTIONS, background)
     assert torch.equal(found.most, found.usual)
     return found.most
 
@@ -76,31 +76,31 @@ def test_colours_of_a_shader_are_expected() -> None:
     def red(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
         return torch.tensor([1.0, 0.0, 0.0]).expand(len(cameras), len(gaussians), 3)
 
-    shown = picture(render(gaussians, camera(), OPTIONS, background=BLACK, shader=red).rgb[0])
+    shown = image(render(gaussians, camera(), OPTIONS, background=BLACK, shader=red).rgb[0])
     assert (still_errors(lambda _: gaussians, [shown], OPTIONS, BLACK, lambda _: red).most < 1e-6).all()
     assert (scores_of(gaussians, [shown], BLACK) > 0.2).all(), "half of each channel, times the mean alpha"
 
 
-def test_what_the_pictures_show_has_no_error() -> None:
+def test_what_the_images_show_has_no_error() -> None:
     gaussians = cloud(12)
-    pictures = [picture(rendered(gaussians, view=view), view=view) for view in range(3)]
-    assert scores_of(gaussians, pictures, BLACK).max() < 1e-6
+    images = [image(rendered(gaussians, view=view), view=view) for view in range(3)]
+    assert scores_of(gaussians, images, BLACK).max() < 1e-6
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=3))
 def test_a_known_colour_is_the_error(colour: list[float]) -> None:
-    """Pictures that differ by a colour all over: its mean over the channels, for all that shows, however little."""
+    """Images that differ by a colour all over: its mean over the channels, for all that shows, however little."""
     ball = balls(sideways(0.0), sideways(0.5)).replace(logit_opacities=torch.tensor([4.0, -4.0]))
-    pictures = [picture(rendered(ball, view=view) + torch.tensor(colour), view=view) for view in range(3)]
+    images = [image(rendered(ball, view=view) + torch.tensor(colour), view=view) for view in range(3)]
     expected = sum(abs(x) for x in colour) / 3
-    assert scores_of(ball, pictures, BLACK).tolist() == pytest.approx([expected] * 2, rel=1e-3, abs=1e-6)
+    assert scores_of(ball, images, BLACK).tolist() == pytest.approx([expected] * 2, rel=1e-3, abs=1e-6)
 
 
 def test_errors_count_where_a_gaussian_shows() -> None:
     """The left half is wrong by 0.3: one ball is in it, one in the other half, one on the border."""
     scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
-    wrong = picture(rendered(scene) + 0.3 * left_half()[..., None])
+    wrong = image(rendered(scene) + 0.3 * left_half()[..., None])
     left, right, border = scores_of(scene, [wrong], BLACK).tolist()
     assert (left, right) == pytest.approx((0.3, 0.0), abs=0.01)
     assert 0.05 < border < 0.25
@@ -110,29 +110,29 @@ def test_masked_pixels_do_not_count() -> None:
     scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
     truth = rendered(scene) + 0.3 * left_half()[..., None]
     for mask, expected in ((left_half(), [0.3, 0.0, 0.3]), (1 - left_half(), [0.0, 0.0, 0.0])):
-        scores = scores_of(scene, [picture(truth, mask)], BLACK)
+        scores = scores_of(scene, [image(truth, mask)], BLACK)
         assert scores.tolist() == pytest.approx(expected, abs=0.01)
 
 
 def test_what_shows_nowhere_has_no_error() -> None:
-    """Behind the camera, beside the picture, behind three dense walls, transparent: exactly 0."""
+    """Behind the camera, beside the image, behind three dense walls, transparent: exactly 0."""
     center = camera().centers[0]
     behind = tuple((2 * center).tolist())
     places = [sideways(0.0), behind, sideways(40.0), tuple((-0.5 * center).tolist()), sideways(0.5)]
-    walls = [tuple((share * center).tolist()) for share in (0.4, 0.3, 0.2)]
+    walls = [tuple((fraction * center).tolist()) for fraction in (0.4, 0.3, 0.2)]
     scene = balls(*places, *walls)  # type: ignore[arg-type]
     logits, scales = scene.logit_opacities.clone(), scene.log_scales.clone()
     logits[4], logits[5:], scales[5:] = -20.0, 20.0, 3.0
     scene = scene.replace(logit_opacities=logits, log_scales=scales)
-    scores = scores_of(scene, [picture(torch.ones(SIZE, SIZE, 3))], BLACK)
+    scores = scores_of(scene, [image(torch.ones(SIZE, SIZE, 3))], BLACK)
     assert scores[:5].tolist() == [0.0] * 5
     assert scores[5] > 0.3
 
 
 def test_the_background_lies_behind_both() -> None:
-    """Where a picture is transparent, the truth is the background."""
+    """Where an image is transparent, the truth is the background."""
     scene, clear = balls(sideways(0.0)), torch.zeros(SIZE, SIZE)
-    empty = picture(torch.zeros(SIZE, SIZE, 3), alpha=clear)
+    empty = image(torch.zeros(SIZE, SIZE, 3), alpha=clear)
     errors = [float(scores_of(scene, [empty], colour)) for colour in (BLACK, WHITE)]
     assert errors[0] == pytest.approx(errors[1], rel=1e-3)  # grey is as far from black as from white
     assert 0.2 < errors[0] < 0.5
@@ -145,9 +145,9 @@ def test_detail_cancels_in_a_view_but_not_between_views() -> None:
     ball = balls(sideways(0.0)).replace(log_scales=torch.full((1, 3), -0.7))
     signs = torch.ones(SIZE)
     signs[1::2] = -1.0
-    stripes = picture(rendered(ball) + 0.3 * signs[None, :, None])
+    stripes = image(rendered(ball) + 0.3 * signs[None, :, None])
     assert float(scores_of(ball, [stripes], BLACK)) < 0.02
-    changes = [picture(rendered(ball, view=view) + 0.3 * (-1) ** view, view=view) for view in range(2)]
+    changes = [image(rendered(ball, view=view) + 0.3 * (-1) ** view, view=view) for view in range(2)]
     assert float(scores_of(ball, changes, BLACK)) == pytest.approx(0.3, rel=1e-3)
 
 
@@ -156,18 +156,18 @@ def test_it_is_the_weighted_mean() -> None:
     count, random = 12, torch.Generator().manual_seed(0)
     gaussians = cloud(count)
     masks = [None, (torch.rand(SIZE, SIZE, generator=random) > 0.3).float(), None]
-    pictures = [picture(torch.rand(SIZE, SIZE, 3, generator=random), masks[view], view=view) for view in range(3)]
+    images = [image(torch.rand(SIZE, SIZE, 3, generator=random), masks[view], view=view) for view in range(3)]
     error, weight = torch.zeros(count), torch.zeros(count)
-    for view, one in enumerate(pictures):
+    for view, one in enumerate(images):
         wrong = rendered(gaussians, WHITE, view) - one.rgb_premultiplied
         counts = torch.ones(SIZE, SIZE) if one.mask is None else one.mask
         for i in range(count):
             sh = torch.full((count, 1, 3), -0.5 / SH_CONSTANT)
             sh[i] = 0.5 / SH_CONSTANT
-            share = rendered(gaussians.replace(sh=sh), view=view)[..., 0] * counts
-            error[i] += (share[..., None] * wrong).sum((0, 1)).abs().mean()
-            weight[i] += share.sum()
-    scores = scores_of(gaussians, pictures, WHITE)
+            fraction = rendered(gaussians.replace(sh=sh), view=view)[..., 0] * counts
+            error[i] += (fraction[..., None] * wrong).sum((0, 1)).abs().mean()
+            weight[i] += fraction.sum()
+    scores = scores_of(gaussians, images, WHITE)
     assert (weight > 0.1).sum() > 5
     torch.testing.assert_close(scores, error / weight.clamp_min(1e-6), rtol=1e-3, atol=1e-5)
 
@@ -175,7 +175,7 @@ def test_it_is_the_weighted_mean() -> None:
 def test_nothing_is_left_behind() -> None:
     """Neither gradients nor changes; leaf tensors are taken too."""
     gaussians = Gaussians(**{name: x.clone().requires_grad_() for name, x in cloud(5).tensors().items()})
-    scores = scores_of(gaussians, [picture(torch.rand(SIZE, SIZE, 3))], BLACK)
+    scores = scores_of(gaussians, [image(torch.rand(SIZE, SIZE, 3))], BLACK)
     assert not scores.requires_grad
     for name, x in gaussians.tensors().items():
         assert x.grad is None
@@ -184,7 +184,7 @@ def test_nothing_is_left_behind() -> None:
 
 def test_no_gaussians() -> None:
     nobody = cloud(3).select(torch.zeros(0, dtype=torch.long))
-    scores = scores_of(nobody, [picture(torch.ones(SIZE, SIZE, 3))], BLACK)
+    scores = scores_of(nobody, [image(torch.ones(SIZE, SIZE, 3))], BLACK)
     assert scores.shape == (0,)
     assert two_group_threshold(scores) == float("inf")
 
@@ -192,14 +192,14 @@ def test_no_gaussians() -> None:
 # --- cameras that stay in place ---------------------------------------------------------------------------------------
 
 
-def in_place(*errors: float, view: int = 0) -> list[Picture]:
-    """What one camera shows while all of the picture is brighter by ``errors``, one after the other."""
+def in_place(*errors: float, view: int = 0) -> list[Image]:
+    """What one camera shows while all of the image is brighter by ``errors``, one after the other."""
     ball = balls(sideways(0.0))
-    return [picture(rendered(ball, view=view) + error, view=view) for error in errors]
+    return [image(rendered(ball, view=view) + error, view=view) for error in errors]
 
 
 def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
-    """Wrong by far, but in all pictures alike; with too few pictures to know, it may be motion."""
+    """Wrong by far, but in all images alike; with too few images to know, it may be motion."""
     ball = balls(sideways(0.0))
     found = still_errors(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
     assert (float(found.most), float(found.usual)) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -208,7 +208,7 @@ def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
 
 
 def test_what_is_hidden_at_times_does_not_move() -> None:
-    """Something passes in front in two of ten pictures: seen by ``most``, not by ``usual``."""
+    """Something passes in front in two of ten images: seen by ``most``, not by ``usual``."""
     found = still_errors(lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK)
     assert (float(found.most), float(found.usual)) == pytest.approx((0.3, 0.0), rel=1e-3, abs=1e-6)
 
@@ -219,17 +219,17 @@ def test_what_changes_again_and_again_moves() -> None:
     assert float(found.usual) == pytest.approx(0.1, rel=1e-3)
 
 
-def test_pictures_in_which_a_gaussian_does_not_show_do_not_count() -> None:
-    """Seen by one of two cameras, which sees it change in every second picture."""
+def test_images_in_which_a_gaussian_does_not_show_do_not_count() -> None:
+    """Seen by one of two cameras, which sees it change in every second image."""
     ball = balls(sideways(0.0))
-    beside = [picture(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), view=1)] * 10
+    beside = [image(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE), view=1)] * 10
     found = still_errors(lambda _: ball, in_place(*[0.0, 0.3] * 3) + beside, OPTIONS, BLACK)
     assert float(found.usual) == pytest.approx(0.3, rel=1e-3)
 
 
 def test_a_camera_that_stays_is_preferred_to_one_that_does_not() -> None:
-    pictures = in_place(0.0, 0.0, 0.0) + in_place(0.5, view=1)
-    found = still_errors(lambda _: balls(sideways(0.0)), pictures, OPTIONS, BLACK)
+    images = in_place(0.0, 0.0, 0.0) + in_place(0.5, view=1)
+    found = still_errors(lambda _: balls(sideways(0.0)), images, OPTIONS, BLACK)
     assert float(found.most) == pytest.approx(0.0, abs=1e-6)
 
 

@@ -10,15 +10,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 from scenes import look_around
-from standing_balls import Ball, filmed
+from static_balls import Ball, filmed
 from tiny_fields import KINDS, cloud, stir, tiny_options
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import ControlNodesField, DynamicModel, OptimConfig, TrajectoryField
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.deform.random_gaussians import box_of
@@ -26,8 +26,8 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors
 from dyngs.deform.training import DeformSchedule, DynamicTraining, TrainingViews
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.rendering import render
-from dyngs.scene import Moment
+from dyngs.gaussians.rendering import render
+from dyngs.gaussians.scene import Moment
 from dyngs.state import part_of, tensors_of
 from dyngs.static.optimizer import GaussianOptimizer
 from dyngs.static.rates import Rates
@@ -44,8 +44,8 @@ def camera() -> Cameras:
     return Cameras(look_around(1, torch.float32), intrinsics[None], 100, 100)
 
 
-def picture(time: float | None) -> Picture:
-    return Picture("view", camera(), torch.zeros(100, 100, 3), None, None, time)
+def image(time: float | None) -> Image:
+    return Image("view", camera(), torch.zeros(100, 100, 3), None, None, time)
 
 
 def flat_cloud(count: int = 9) -> Gaussians:
@@ -76,7 +76,7 @@ class Run:
     scene: DynamicScene
 
     def moment(self, time: float | None, step: int) -> Moment:
-        return self.training.moment(self.scene, picture(time), step)
+        return self.training.moment(self.scene, image(time), step)
 
     def drawn_at(self, time: float) -> Gaussians:
         """At the end of the run."""
@@ -175,7 +175,7 @@ def test_on_the_newest_views_only_the_motion_learns(step: int, tracks: bool) -> 
 # --- where motion begins ----------------------------------------------------------------------------------------------
 
 ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
-"""Of a still model; 1, 3 and 6 stand out."""
+"""Of a static model; 1, 3 and 6 stand out."""
 
 
 def test_what_a_still_model_cannot_explain_moves() -> None:
@@ -280,7 +280,7 @@ def test_the_field_learns_after_the_fine_phase(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_motion_is_learned_from_pictures(kind: str) -> None:
+def test_motion_is_learned_from_images(kind: str) -> None:
     """Balls before one camera go 0.3 units (10 px) to the right: the field finds out, by the gradients of rendering."""
     gaussians = flat_cloud()
     blobs = {"log_scales": torch.full((9, 3), -2.5), "logit_opacities": torch.full((9,), 2.0)}
@@ -296,8 +296,8 @@ def test_motion_is_learned_from_pictures(kind: str) -> None:
     for step, time in enumerate(times, start=1):
         truth = gaussians.detach().replace(means=gaussians.means.detach() + (time - 0.5) * shift)
         drawn = run.moment(time, step).gaussians
-        pictures = [render(x, camera()).rgb for x in (drawn, truth)]
-        (pictures[0] - pictures[1]).abs().mean().backward()
+        images = [render(x, camera()).rgb for x in (drawn, truth)]
+        (images[0] - images[1]).abs().mean().backward()
         run.after_step(step)
     for time in (0.1, 0.5, 0.9):
         found = run.drawn_at(time).means - gaussians.means.detach()
@@ -354,8 +354,8 @@ def test_time_jitter_shrinks_and_stays_in_the_clip() -> None:
 
 
 @pytest.mark.parametrize(("in_place", "kept"), [(True, [2, 3]), (False, [0, 2, 3])])
-def test_where_cameras_stay_nothing_moves_that_pictures_show_still(in_place: bool, kept: list[int]) -> None:
-    """Four move by far, the fourth least; the pictures say of two that they are like the median."""
+def test_where_cameras_stay_nothing_moves_that_images_show_still(in_place: bool, kept: list[int]) -> None:
+    """Four move by far, the fourth least; the images say of two that they are like the median."""
     still, moving = 0.2 * DynamicModel().motion_threshold, 0.3 * DynamicModel().motion_threshold
     errors = alike(torch.tensor([still, moving, moving, moving]))
     gaussians = flat_cloud(4)
@@ -533,11 +533,11 @@ def test_the_box_holds_what_is_solid() -> None:
     assert (bounded[1] < 1.5 * half_size).all()
 
 
-# --- standing cameras -------------------------------------------------------------------------------------------------
+# --- fixed cameras -------------------------------------------------------------------------------------------------
 
 
 def test_motion_begins_with_what_travels() -> None:
-    """Before standing cameras: no random Gaussians, all times from the start, and the same after a restart."""
+    """Before fixed cameras: no random Gaussians, all times from the start, and the same after a restart."""
     times = tuple(i / 7 for i in range(8))
     footage = filmed(lambda t: [Ball((0.0, 0.1, 1.6 * t - 0.8))], times)
     errors = alike(torch.tensor(ERRORS))
@@ -565,7 +565,7 @@ def test_motion_begins_with_what_travels() -> None:
     torch.testing.assert_close(scene.at(0.3).means, run.scene.at(0.3).means)
 
 
-def test_motion_begins_on_a_card_as_on_the_cpu() -> None:
+def test_motion_begins_on_a_gpu_as_on_the_cpu() -> None:
     """Tracks and seeds are found on the CPU whatever the scene lies on."""
     times = tuple(i / 7 for i in range(8))
     footage = filmed(lambda t: [Ball((0.0, 0.1, 1.6 * t - 0.8))], times)
@@ -582,8 +582,8 @@ def test_motion_begins_on_a_card_as_on_the_cpu() -> None:
         return grown[0].at(0.3).means.detach().cpu()
 
     expected = means_on(torch.device("cpu"))
-    with pretend_card():
-        assert torch.equal(means_on(CARD), expected)
+    with pretend_gpu():
+        assert torch.equal(means_on(GPU), expected)
 
 
 def test_where_nothing_travels_random_gaussians_are_added() -> None:

@@ -1,4 +1,4 @@
-"""Scores of people: known answers, and poses refined on the tested pictures beside those as given."""
+"""Scores of people: known answers, and poses refined on the tested images beside those as given."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ import torch
 import dyngs
 from dyngs.camera import Cameras
 from dyngs.cli import main
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.evaluate.people import person_box, person_scores
 from dyngs.evaluate.report import scene_of_split
+from dyngs.gaussians.rendering import Rendering
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, ssim
-from dyngs.rendering import Rendering
 from dyngs.runs.checkpoint import load_run
 
 NO_LPIPS = Lpips("alex", "no weights here")
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20, 6], [0, 0, 1]]]), 20, 12)
 
 
-def of_a_square(mask: torch.Tensor | None = None) -> tuple[Picture, Rendering]:
+def of_a_square(mask: torch.Tensor | None = None) -> tuple[Image, Rendering]:
     """A grey square of 4 x 5 px before nothing, and on white a render of it that is 0.1 too bright."""
     alpha = torch.zeros(12, 20)
     alpha[3:7, 8:13] = 1
-    picture = Picture("a", CAMERA, 0.5 * alpha[..., None].expand(-1, -1, 3).contiguous(), alpha, mask, None)
+    image = Image("a", CAMERA, 0.5 * alpha[..., None].expand(-1, -1, 3).contiguous(), alpha, mask, None)
     shown = (0.6 * alpha + 1 - alpha)[..., None].expand(-1, -1, 3)
-    return picture, Rendering(shown[None].contiguous(), (1 - alpha)[None], None, torch.zeros(1, 1, 2))
+    return image, Rendering(shown[None].contiguous(), (1 - alpha)[None], None, torch.zeros(1, 1, 2))
 
 
 def test_scores_in_the_box_and_on_black() -> None:
-    picture, rendering = of_a_square()
-    assert person_box(picture) == (slice(3, 7), slice(8, 13))
-    scores = person_scores(picture, rendering, torch.ones(3), NO_LPIPS)
+    image, rendering = of_a_square()
+    assert person_box(image) == (slice(3, 7), slice(8, 13))
+    scores = person_scores(image, rendering, torch.ones(3), NO_LPIPS)
     assert scores["psnr_person"] == pytest.approx(20, abs=1e-4)
     larger = 10 * math.log10(12 * 20 / 20)
     assert scores["psnr_black"] == pytest.approx(20 + larger, abs=1e-4)
-    black = rendering.rgb[0] * picture.alpha[..., None] if picture.alpha is not None else rendering.rgb[0]
-    assert scores["ssim_black"] == pytest.approx(ssim(black, picture.rgb_premultiplied), abs=1e-6)
+    black = rendering.rgb[0] * image.alpha[..., None] if image.alpha is not None else rendering.rgb[0]
+    assert scores["ssim_black"] == pytest.approx(ssim(black, image.rgb_premultiplied), abs=1e-6)
     assert scores["lpips_black"] is None
 
 
@@ -56,9 +56,9 @@ def test_masked_pixels_do_not_count() -> None:
 
 
 def test_nobody_is_to_be_seen() -> None:
-    picture, rendering = of_a_square()
+    image, rendering = of_a_square()
     for alpha in (None, torch.zeros(12, 20)):
-        empty = Picture("a", CAMERA, picture.rgb_premultiplied, alpha, None, None)
+        empty = Image("a", CAMERA, image.rgb_premultiplied, alpha, None, None)
         assert person_scores(empty, rendering, torch.ones(3), NO_LPIPS) == {}
 
 
@@ -95,7 +95,7 @@ def test_refined_poses_stand_beside_those_as_given(
     out = capsys.readouterr().out
     assert out.count("on black, poses refined") == out.count("on black, poses from silhouettes") == 2
     given, refined = stored["given"], stored["refined"]
-    changed = {key for key in given if given[key] != refined[key]} - {"fps", "deform_share", "per_view"}
+    changed = {key for key in given if given[key] != refined[key]} - {"fps", "deform_fraction", "per_view"}
     assert changed == {"psnr_own_poses", "own_poses", "silhouette_poses"}
     timed = {"render_seconds", "deform_seconds"}
     views = [
@@ -112,4 +112,4 @@ def test_refined_poses_stand_beside_those_as_given(
 
 def test_poses_that_were_trained_on_are_not_refined(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", str(run), "--split", "train", "--refine"]) == 2
-    assert "--refine is for pictures that were not trained on; name them with --split" in capsys.readouterr().err
+    assert "--refine is for images that were not trained on; name them with --split" in capsys.readouterr().err

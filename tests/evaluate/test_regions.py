@@ -1,4 +1,4 @@
-"""Regions of pictures against pictures whose moving pixels are known, and the PSNR inside them against closed forms."""
+"""Regions of images against images whose moving pixels are known, and the PSNR inside them against closed forms."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from moving_scene import camera
 
 from dyngs.data.capture import View
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.evaluate.regions import (
     NO_ALPHA,
     NO_MOTION_KNOWN,
@@ -28,51 +28,51 @@ SIDE = 24
 WHITE = torch.ones(3)
 
 
-def pictures_of_a_walk(count: int = 5) -> list[Picture]:
-    """A white square of 6x6 pixels walks over grey ground; a single pixel flashes in the third picture."""
+def images_of_a_walk(count: int = 5) -> list[Image]:
+    """A white square of 6x6 pixels walks over grey ground; a single pixel flashes in the third image."""
     shown = []
     for k in range(count):
         rgb = torch.full((SIDE, SIDE, 3), 0.4)
         rgb[9:15, 3 * k : 3 * k + 6] = 1.0
         if k == 2:
             rgb[20, 20] = 1.0
-        shown.append(Picture(f"v{k}", camera(SIDE, SIDE), rgb, None, None, k / (count - 1)))
+        shown.append(Image(f"v{k}", camera(SIDE, SIDE), rgb, None, None, k / (count - 1)))
     return shown
 
 
-def views_of(pictures: Sequence[Picture], *, standing: bool = True) -> list[View]:
-    poses = [np.eye(4) for _ in pictures]
+def views_of(images: Sequence[Image], *, standing: bool = True) -> list[View]:
+    poses = [np.eye(4) for _ in images]
     for k, pose in enumerate(poses):
         pose[0, 3] = 0.0 if standing else k
     return [
         View(p.name, Path(p.name), pose, np.eye(3), SIDE, SIDE, time=p.time)
-        for p, pose in zip(pictures, poses, strict=True)
+        for p, pose in zip(images, poses, strict=True)
     ]
 
 
-def regions_of(pictures: Sequence[Picture], *, standing: bool = True) -> Regions:
-    return Regions(views_of(pictures, standing=standing), cast(PictureLoader, pictures), WHITE)
+def regions_of(images: Sequence[Image], *, standing: bool = True) -> Regions:
+    return Regions(views_of(images, standing=standing), cast(ImageLoader, images), WHITE)
 
 
-def test_what_changes_before_a_standing_camera_moves() -> None:
-    pictures = pictures_of_a_walk()
-    regions = regions_of(pictures)
-    for k, picture in enumerate(pictures):
+def test_what_changes_before_a_fixed_camera_moves() -> None:
+    images = images_of_a_walk()
+    regions = regions_of(images)
+    for k, image in enumerate(images):
         expected = torch.zeros(SIDE, SIDE, dtype=torch.bool)
         expected[9:15, 3 * k : 3 * k + 6] = True
-        moving = regions.moving(picture)
+        moving = regions.moving(image)
         assert moving is not None
         assert torch.equal(moving, expected), "and the single pixel does not count"
     assert regions.moving_from == "change over time"
 
 
 def test_scores_are_those_of_the_pixels_of_each_region() -> None:
-    pictures = pictures_of_a_walk()
-    regions, picture = regions_of(pictures), pictures[1]
-    rendered = picture.rgb_premultiplied.clone()
+    images = images_of_a_walk()
+    regions, image = regions_of(images), images[1]
+    rendered = image.rgb_premultiplied.clone()
     rendered[9:15, 3:9] -= 0.1
     rendered[0, :, :] += 0.01
-    scores = regions.scores(picture, rendered, picture.rgb_premultiplied)
+    scores = regions.scores(image, rendered, image.rgb_premultiplied)
     assert scores.foreground is None
     assert scores.moving == pytest.approx(20.0, abs=1e-3)
     rest = SIDE * SIDE - 36
@@ -84,47 +84,47 @@ def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
     moves, alpha = torch.zeros(SIDE, SIDE), torch.zeros(SIDE, SIDE)
     moves[:, :12], alpha[:12] = 1.0, 1.0
     black = torch.zeros(SIDE, SIDE, 3)
-    picture = replace(pictures_of_a_walk()[0], alpha=alpha, rgb_premultiplied=black, moves=moves)
-    regions = regions_of([picture])
-    truth = picture.composite(WHITE)
+    image = replace(images_of_a_walk()[0], alpha=alpha, rgb_premultiplied=black, moves=moves)
+    regions = regions_of([image])
+    truth = image.composite(WHITE)
     rendered = truth.clone()
     rendered[:12, :12] += 0.1
     rendered[12:] -= 0.5
-    scores = regions.scores(picture, rendered, truth)
+    scores = regions.scores(image, rendered, truth)
     assert scores.moving == pytest.approx(20.0, abs=1e-3)
     assert scores.still == 100.0
     assert scores.foreground == pytest.approx(20.0 + 10 * np.log10(2), abs=1e-3)
     assert regions.moving_from == "motion masks"
 
 
-def test_a_mask_of_a_picture_holds_in_its_regions() -> None:
-    pictures = pictures_of_a_walk()
+def test_a_mask_of_a_image_holds_in_its_regions() -> None:
+    images = images_of_a_walk()
     mask = torch.ones(SIDE, SIDE)
     mask[12:] = 0
-    picture = replace(pictures[1], mask=mask)
-    rendered = picture.rgb_premultiplied.clone()
+    image = replace(images[1], mask=mask)
+    rendered = image.rgb_premultiplied.clone()
     rendered[12:] = 0
-    assert regions_of(pictures).scores(picture, rendered, picture.rgb_premultiplied).still == 100.0
-    hidden = replace(picture, mask=torch.zeros(SIDE, SIDE))
-    assert regions_of(pictures).scores(hidden, rendered, picture.rgb_premultiplied).still is None
+    assert regions_of(images).scores(image, rendered, image.rgb_premultiplied).still == 100.0
+    hidden = replace(image, mask=torch.zeros(SIDE, SIDE))
+    assert regions_of(images).scores(hidden, rendered, image.rgb_premultiplied).still is None
 
 
 def test_reasons_say_why_there_is_no_score() -> None:
-    pictures = pictures_of_a_walk()
-    moved = regions_of(pictures, standing=False)
-    assert moved.moving(pictures[0]) is None
+    images = images_of_a_walk()
+    moved = regions_of(images, standing=False)
+    assert moved.moving(images[0]) is None
     assert (moved.reason("moving"), moved.moving_from) == (NO_MOTION_KNOWN, None)
-    still = regions_of([replace(p, time=None) for p in pictures])
-    assert still.moving(pictures[0]) is None
+    still = regions_of([replace(p, time=None) for p in images])
+    assert still.moving(images[0]) is None
     assert still.reason("still") == NO_TIMES
-    same = [replace(p, rgb_premultiplied=torch.full((SIDE, SIDE, 3), 0.4)) for p in pictures]
+    same = [replace(p, rgb_premultiplied=torch.full((SIDE, SIDE, 3), 0.4)) for p in images]
     nothing = regions_of(same)
     scores = nothing.scores(same[0], same[0].rgb_premultiplied, same[0].rgb_premultiplied)
     assert (scores.moving, scores.still) == (None, 100.0)
     assert nothing.reason("moving") == TOO_SMALL
 
 
-def test_pictures_without_alpha_and_mask_have_neither_region() -> None:
-    picture = pictures_of_a_walk()[0]
-    assert foreground_of(picture) is None
-    assert given_motion(picture) is None
+def test_images_without_alpha_and_mask_have_neither_region() -> None:
+    image = images_of_a_walk()[0]
+    assert foreground_of(image) is None
+    assert given_motion(image) is None

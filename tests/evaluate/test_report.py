@@ -29,7 +29,7 @@ from dyngs.evaluate.report import (
 )
 from dyngs.files.write import write_image
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.static.scene import StaticScene
 
@@ -49,7 +49,7 @@ def as_scene(gaussians: Gaussians) -> StaticScene:
 
 
 def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> Path:
-    """A run folder with a 16x16 capture of 2 train and 3 test pictures beside it."""
+    """A run folder with a 16x16 capture of 2 train and 3 test images beside it."""
     root = write_still_capture(folder / "capture", StillOptions(size=16, num_train=2, num_test=3, samples=1))
     run_dir = folder / "run"
     data = DataConfig.model_validate({"root": root, "background": background})
@@ -67,11 +67,10 @@ def test_report_of_a_run(tmp_path) -> None:
     stored = json.loads((run_dir / "metrics.json").read_text())
     assert stored == json.loads(report.to_json())
     keys = "split num_views width height background psnr ssim flip lpips lpips_net num_gaussians model_mb fps"
-    over_time = (
-        "num_moving moving_share field_mb deform_share flicker flicker_error psnr_per_time psnr_person ssim_person"
-    )
-    parts = "psnr_foreground psnr_moving psnr_still moving_from track_error_px track_within_5px track_motion_px"
-    parts += " psnr_right psnr_right_fitted psnr_own_poses own_poses silhouette_poses psnr_black ssim_black lpips_black"
+    over_time = "num_moving moving_fraction field_mb deform_fraction flicker flicker_error psnr_per_time psnr_person"
+    parts = "ssim_person psnr_foreground psnr_moving psnr_static moving_from track_error_px track_within_5px"
+    parts += " track_motion_px psnr_right psnr_right_fitted psnr_own_poses own_poses"
+    parts += " silhouette_poses psnr_black ssim_black lpips_black"
     rest = {*parts.split(), "seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
     facts = {"split": "test", "num_views": 3, "width": 16, "height": 16, "background": "white", "lpips_net": "alex"}
@@ -80,12 +79,12 @@ def test_report_of_a_run(tmp_path) -> None:
     assert stored["model_mb"] == pytest.approx(12 * 4 * (3 + 4 + 3 + 1 + 12) / 1e6)
     assert stored["psnr"] == pytest.approx(sum(view["psnr"] for view in stored["per_view"]) / 3)
     assert stored["ssim"] == pytest.approx(sum(view["ssim"] for view in stored["per_view"]) / 3)
-    optional = ("psnr_foreground", "psnr_moving", "psnr_still", "track_error_px")
+    optional = ("psnr_foreground", "psnr_moving", "psnr_static", "track_error_px")
     for name in ("flip", "lpips", "flicker", "flicker_error", *optional):
         assert (stored[name] is None) == (name in stored["reasons"])
     assert stored["fps"] > 0
-    assert 0 <= stored["deform_share"] < 1
-    assert (stored["num_moving"], stored["moving_share"], stored["field_mb"]) == (0, 0, 0)
+    assert 0 <= stored["deform_fraction"] < 1
+    assert (stored["num_moving"], stored["moving_fraction"], stored["field_mb"]) == (0, 0, 0)
     assert stored["psnr_per_time"] == []
     assert {view["time"] for view in stored["per_view"]} == {None}
     assert len({view["name"] for view in stored["per_view"]}) == 3
@@ -159,7 +158,7 @@ def test_report_of_a_moving_run(tmp_path) -> None:
     run_dir = write_moving_run(tmp_path, standing=True)
     report = evaluate_run(run_dir)
     stored = json.loads((run_dir / "metrics.json").read_text())
-    assert (report.num_gaussians, report.num_moving, report.moving_share) == (5, 2, 0.4)
+    assert (report.num_gaussians, report.num_moving, report.moving_fraction) == (5, 2, 0.4)
     assert report.field_mb == pytest.approx(4e-6 * 2 * 3)
     assert report.model_mb == pytest.approx(4e-6 * (5 * 14 + 6))
     assert [view.time for view in report.per_view] == list(TEST_TIMES)
@@ -168,12 +167,12 @@ def test_report_of_a_moving_run(tmp_path) -> None:
     assert report.flicker is not None
     assert report.flicker_error is not None
     assert report.flicker_error > 0
-    assert 0 < report.deform_share < 1
+    assert 0 < report.deform_fraction < 1
     assert report.notes == ()
 
 
 def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
-    """With a mask for each test picture, and true tracks that the model follows exactly."""
+    """With a mask for each test image, and true tracks that the model follows exactly."""
     run_dir = write_moving_run(tmp_path)
     root = tmp_path / "capture"
     document = json.loads((root / "transforms_test.json").read_text())
@@ -192,7 +191,7 @@ def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
     assert report.psnr_foreground < report.psnr, "less white background"
     assert report.moving_from == "motion masks"
     assert report.psnr_moving is not None
-    assert report.psnr_still is not None
+    assert report.psnr_static is not None
     assert report.track_error_px is not None
     assert report.track_motion_px is not None
     assert 0 < report.track_error_px < report.track_motion_px

@@ -19,7 +19,7 @@ from moving_scene import (
 )
 
 from dyngs.config import DataConfig
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
@@ -32,7 +32,7 @@ from dyngs.evaluate.temporal import (
     flicker_of_split,
     psnr_per_time,
 )
-from dyngs.rendering import RenderOptions
+from dyngs.gaussians.rendering import RenderOptions
 
 
 def drawing(scene) -> Drawing:
@@ -48,7 +48,7 @@ def split(tmp_path):
     """Loader and views of a test split whose camera stands."""
     config = DataConfig.model_validate({"root": write_timed_capture(tmp_path / "capture", standing=True)})
     views = read_capture(config).splits["test"]
-    return PictureLoader(views, config), views
+    return ImageLoader(views, config), views
 
 
 def test_psnr_per_time_is_the_mean_of_the_views_of_each_time() -> None:
@@ -62,9 +62,9 @@ def test_a_still_scene_does_not_flicker() -> None:
 
 
 @pytest.mark.parametrize("count", [3, 5, 61, 100])
-def test_blinking_is_twice_the_difference_of_its_two_pictures(count: int) -> None:
+def test_blinking_is_twice_the_difference_of_its_two_images(count: int) -> None:
     scene = drawing(moving_scene(Blinking(0.5, num_times=count), times=even(count)))
-    dark, bright = scene.picture(camera(), 0.0), scene.picture(camera(), 1 / (count - 1))
+    dark, bright = scene.image(camera(), 0.0), scene.image(camera(), 1 / (count - 1))
     wanted = 2 * 255 * float((bright - dark).abs().double().mean())
     assert wanted > 1
     assert flicker(scene, camera(), even(count)).value == pytest.approx(wanted, rel=1e-5)
@@ -89,7 +89,7 @@ def test_a_linear_change_does_not_flicker_however_it_is_sampled() -> None:
     assert flicker(drawing(moving_scene(Brightening())), camera(), times).value == pytest.approx(0, abs=1e-3)
 
 
-def test_at_most_sixty_pictures_are_drawn() -> None:
+def test_at_most_sixty_images_are_drawn() -> None:
     motion = Sliding()
     flicker(drawing(moving_scene(motion)), camera(8, 6), even(200))
     assert motion.calls <= 60
@@ -107,7 +107,7 @@ def test_flicker_error_is_that_of_the_differences(split) -> None:
     assert [v.time for v in views] == list(TEST_TIMES)
     truth = [loader[i].composite(torch.zeros(3)) for i in range(3)]
     scene = drawing(moving_scene(Sliding()))
-    rendered = [scene.picture(loader[i].cameras, views[i].time) for i in range(3)]
+    rendered = [scene.image(loader[i].cameras, views[i].time) for i in range(3)]
     steps = [(rendered[i + 1] - rendered[i]) - (truth[i + 1] - truth[i]) for i in range(2)]
     wanted = 255 * float(torch.stack(steps).abs().double().mean())
     assert wanted > 0.1
@@ -126,8 +126,8 @@ def test_what_stands_where_the_truth_moves_is_wrong_by_the_truths_change(split) 
 def test_masks_leave_pixels_out_of_the_flicker_error(split) -> None:
     loader, views = split
 
-    class Masked(PictureLoader):
-        def __getitem__(self, index: int) -> Picture:
+    class Masked(ImageLoader):
+        def __getitem__(self, index: int) -> Image:
             mask = torch.ones(16, 16)
             mask[:, : 4 + 4 * index] = 0
             return replace(super().__getitem__(index), mask=mask)
@@ -152,7 +152,7 @@ def test_reasons_where_there_is_nothing_to_measure(split) -> None:
     scene = drawing(moving_scene(Sliding()))
     untimed = [replace(v, time=None) for v in views]
     for found in (flicker_error(scene, loader, untimed), flicker_of_split(scene, loader, untimed)):
-        assert (found.value, found.reason) == (None, "the pictures have no times")
+        assert (found.value, found.reason) == (None, "the images have no times")
     assert "stands still" in (flicker_error(scene, loader, views[:1]).reason or "")
 
 

@@ -22,9 +22,9 @@ from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.scenes import SceneName
 from dyngs.data.true_tracks import TrueTracks, read_true_tracks
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.training.views import training_cameras
-from dyngs.visibility import VisibilityMasks
 
 
 def imported(path: str) -> ModuleType:
@@ -84,7 +84,7 @@ def test_motion_that_is_too_slow_is_off_by_the_rest() -> None:
     slow = track_scores(only_movers(moving_scene(Sliding(speed=0.2))), sliding_truth(), split(), views())
     assert slow.error_px == pytest.approx(0.8 * (slow.motion_px or 0), rel=1e-4)
     fast = track_scores(only_movers(moving_scene(Sliding(speed=1000.0))), sliding_truth(), split(), views())
-    assert fast.error_px == pytest.approx(np.hypot(20, 14)), "no more than the diagonal of the picture"
+    assert fast.error_px == pytest.approx(np.hypot(20, 14)), "no more than the diagonal of the image"
     assert fast.within_5px == 0.0
 
 

@@ -40,7 +40,7 @@ def trained(capture: Path, folder: Path, **model: object) -> Path:
     return train(
         Config(
             data=DataConfig(root=capture),
-            model=HumanModel(resolution=16, min_silhouette_share=0.0, refine_from=0.0, sh_degree=0, **model),  # type: ignore[arg-type]
+            model=HumanModel(resolution=16, min_silhouette_fraction=0.0, refine_from=0.0, sh_degree=0, **model),  # type: ignore[arg-type]
             strategy=DefaultStrategy(grow=False),
             train=TrainConfig(steps=4),
             run=RunConfig(dir=folder, threads=1),
@@ -115,8 +115,8 @@ def refusal(path: Path) -> str:
 
 def test_files_that_are_missing_cut_altered_or_foreign(run_dir: Path, file: Path) -> None:
     whole = file.read_bytes()
-    for share in (0.0, 0.001, 0.5, 0.999):
-        file.write_bytes(whole[: int(share * len(whole))])
+    for fraction in (0.0, 0.001, 0.5, 0.999):
+        file.write_bytes(whole[: int(fraction * len(whole))])
         assert "cannot be read as an avatar" in refusal(file)
     for where in (0.3, 0.99):
         at = int(where * len(whole))

@@ -12,10 +12,10 @@ from moving_scene import write_moving_run
 
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.runs.checkpoint import latest_checkpoint, load_run, save_checkpoint
 from dyngs.state import prefixed, tensors_of
 from dyngs.storage.precision import Precision
-from dyngs.visibility import VisibilityMasks
 
 
 @pytest.mark.parametrize("moves", [True, False])
@@ -27,7 +27,7 @@ def test_a_prune_run_moves_as_before(tmp_path: Path, moves: bool) -> None:
     assert written.precision.change <= 0.5
     before, after = load_run(run_dir), load_run(tmp_path / "small")
     assert (after.config, after.info) == (before.config, before.info)
-    assert after.scene.is_still is not moves
+    assert after.scene.is_static is not moves
     for time in (0.0, 0.6):
         places = [run.scene.at(time).means[:, 0].sort().values for run in (before, after)]
         torch.testing.assert_close(places[0], places[1], atol=0.1, rtol=0)  # a pixel is 0.2 wide
@@ -68,7 +68,7 @@ def test_an_outlier_does_not_spoil_the_others(tmp_path: Path, values: dict[str, 
 
 
 @pytest.mark.parametrize("into_run", [True, False])
-def test_a_file_that_changes_pictures_more_than_allowed_is_not_written(
+def test_a_file_that_changes_images_more_than_allowed_is_not_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, into_run: bool
 ) -> None:
     run_dir = write_moving_run(tmp_path)

@@ -1,4 +1,4 @@
-"""The border of a capture: links, absolute paths and ``..`` that leave it, in every reader; and sizes of pictures."""
+"""The border of a capture: links, absolute paths and ``..`` that leave it, in every reader; and sizes of images."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from tiny_captures import (
     write_colmap,
     write_folder,
     write_frames,
+    write_image,
     write_nerfies,
-    write_picture,
     write_poses_bounds,
     write_video,
 )
 
+from dyngs.capture.inspection.report import inspect_capture
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
-from dyngs.data.inspection.report import inspect_capture
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.files.containment import check_size, inside, leaving_links, pictures_up_to, staying_within
+from dyngs.files.containment import check_size, images_up_to, inside, leaving_links, staying_within
 
 PLY = (
     "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"
@@ -41,8 +41,8 @@ def read(root: Path, **options: object) -> Capture:
 def write_nerfstudio(root: Path) -> None:
     names = [f"images/{i}.png" for i in range(3)]
     for i, name in enumerate(names):
-        write_picture(root / name, random_pixels(8, 12, 3, seed=i))
-        write_picture(root / "masks" / f"{i}.png", random_pixels(8, 12, 1, seed=i))
+        write_image(root / name, random_pixels(8, 12, 3, seed=i))
+        write_image(root / "masks" / f"{i}.png", random_pixels(8, 12, 1, seed=i))
     write_frames(root / "transforms.json", names, {"w": 12, "h": 8, "fl_x": 10.0, "ply_file_path": "points.ply"})
     (root / "points.ply").write_text(PLY)
     edit_json(root / "transforms.json", lambda content: content["frames"][0].update(mask_path="masks/0.png"))
@@ -101,7 +101,7 @@ def test_no_reader_opens_what_lies_outside(kind: str, name: str, tmp_path: Path)
 def test_paths_that_leave_the_capture(key: str, written: str, tmp_path: Path) -> None:
     root = tmp_path / "capture"
     write_nerfstudio(root)
-    write_picture(tmp_path / "own.png", random_pixels(8, 12, 3))
+    write_image(tmp_path / "own.png", random_pixels(8, 12, 3))
     name = written.format(tmp=tmp_path)
     edit_json(root / "transforms.json", lambda content: content["frames"][1].update({key: name}))
     with pytest.raises(DyngsError, match=r"own(\.png)?: lies outside the capture"):
@@ -119,7 +119,7 @@ def test_paths_that_name_no_file(written: str, follow: bool, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("kind", ["nerfstudio", "nerfies", "colmap"])
-def test_a_huge_picture_is_refused_when_a_capture_is_read(kind: str, tmp_path: Path) -> None:
+def test_a_huge_image_is_refused_when_a_capture_is_read(kind: str, tmp_path: Path) -> None:
     """Before the training, also where it is held out."""
     WRITERS[kind](tmp_path)
     read(tmp_path)
@@ -129,7 +129,7 @@ def test_a_huge_picture_is_refused_when_a_capture_is_read(kind: str, tmp_path: P
 
 @pytest.mark.parametrize("written", ["\ud800", "\udce9.png", "x" * 5000])
 def test_names_that_no_file_can_have(written: str, tmp_path: Path) -> None:
-    """As a missing picture or in one line."""
+    """As a missing image or in one line."""
     write_nerfstudio(tmp_path)
     edit_json(tmp_path / "transforms.json", lambda content: content["frames"][1].update(file_path=written))
     report = inspect_capture(tmp_path)
@@ -178,12 +178,12 @@ def test_sizes() -> None:
         check_size(Path("a.png"), 20_000, 20_000)
     with pytest.raises(DyngsError, match=r"of 1000 channels are 250 megapixels"):
         check_size(Path("a.exr"), 1000, 1000, 1000)
-    with pictures_up_to(400):
+    with images_up_to(400):
         check_size(Path("a.png"), 20_000, 20_000)
 
 
 def test_a_folder_of_masks_that_is_a_link_is_not_searched(colmap_root: Path) -> None:
-    """It would be looked through for pictures, however large."""
+    """It would be looked through for images, however large."""
     (colmap_root / "masks").symlink_to("/")
     with pytest.raises(DyngsError, match=r"masks: leads to /, which lies outside the capture"):
         read(colmap_root)

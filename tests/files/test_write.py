@@ -1,4 +1,4 @@
-"""Files appear whole or not at all; pictures keep their values."""
+"""Files appear whole or not at all; images keep their values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from dyngs.data.pictures.images import read_picture
+from dyngs.data.images.images import read_image
 from dyngs.errors import DyngsError
 from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
 
@@ -16,7 +16,7 @@ from dyngs.files.write import atomic_file, to_uint8, write_image, write_text
 def test_png_keeps_straight_alpha_exactly(tmp_path: Path) -> None:
     rgba = np.random.default_rng(0).integers(0, 256, (5, 7, 4), dtype=np.uint8)
     write_image(tmp_path / "new" / "a.png", rgba)
-    assert np.array_equal(read_picture(tmp_path / "new" / "a.png").numpy(), rgba)
+    assert np.array_equal(read_image(tmp_path / "new" / "a.png").numpy(), rgba)
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.png"]
 
 

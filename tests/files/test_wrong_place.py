@@ -50,7 +50,7 @@ def test_the_command_for_a_path(path: str, command: str | None) -> None:
         ("eval clip.mp4", "dyngs train static data.root=clip.mp4"),
         ("eval static", "dyngs train static data.root=FOLDER"),
         ("render photos", "dyngs train static data.root=photos"),
-        ("render clip.mp4 --out pictures", "dyngs train static data.root=clip.mp4"),
+        ("render clip.mp4 --out images", "dyngs train static data.root=clip.mp4"),
         ("export rig", "dyngs train dynamic data.root=rig"),
         ("view rig", "dyngs train dynamic data.root=rig"),
         ("view clip.mp4", "dyngs train static data.root=clip.mp4"),

@@ -74,17 +74,17 @@ def test_column_rates_equal_one_optimizer_per_column(shape: tuple[int, ...]) -> 
         assert torch.equal(moved[:, column], alone[:, column])
 
 
-@example(shape=(130, 16, 3), share=0.5, step=1287, seed=0)  # one value one unit off
+@example(shape=(130, 16, 3), fraction=0.5, step=1287, seed=0)  # one value one unit off
 @given(
     shape=st.sampled_from(SHAPES),
-    share=st.floats(0, 1),
+    fraction=st.floats(0, 1),
     step=st.integers(1, 30000),
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=25, deadline=None)
-def test_only_the_rows_asked_for_change(shape: tuple[int, ...], share: float, step: int, seed: int) -> None:
+def test_only_the_rows_asked_for_change(shape: tuple[int, ...], fraction: float, step: int, seed: int) -> None:
     param, grad, exp_avg, exp_avg_sq = make_state(shape, seed=seed)
-    rows = torch.rand(shape[0], generator=torch.Generator().manual_seed(seed)) < share
+    rows = torch.rand(shape[0], generator=torch.Generator().manual_seed(seed)) < fraction
     before = [param, exp_avg, exp_avg_sq]
     everywhere, chosen = ([x.clone() for x in before] for _ in range(2))
     adam_step_(everywhere[0], grad, *everywhere[1:], lr=0.1, step=step)

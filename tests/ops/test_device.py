@@ -1,4 +1,4 @@
-"""What computes: the choice, and for a card that cannot be used one line with the reason and what to do."""
+"""What computes: the choice, and for a GPU that cannot be used one line with the reason and what to do."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import torch
 
 from dyngs.errors import DyngsError
 from dyngs.ops import device
-from dyngs.ops.device import deterministic, device_for, findings, why_no_card, why_on_cpu
+from dyngs.ops.device import deterministic, device_for, findings, why_no_gpu, why_on_cpu
 
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """One with a usable card, of which a test takes away something."""
-    why_no_card.cache_clear()
+    """One with a usable GPU, of which a test takes away something."""
+    why_no_gpu.cache_clear()
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "Card")
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "GPU")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (10**9, 8 * 10**9))
     monkeypatch.setattr(device, "has_cuda_core", lambda: True)
@@ -30,7 +30,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     core = SimpleNamespace(runtime_version=lambda: 13000, driver_version=lambda: 13020)
     monkeypatch.setattr(device, "cuda_core", lambda: core)
     yield monkeypatch
-    why_no_card.cache_clear()
+    why_no_gpu.cache_clear()
 
 
 def refused() -> str:
@@ -42,22 +42,22 @@ def refused() -> str:
     return line
 
 
-def test_a_card_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
+def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
     assert device_for("auto") == device_for("cuda") == torch.device("cuda:0")
     assert device_for("cpu") == torch.device("cpu")
     assert why_on_cpu("auto") is None
     assert findings() == {
         "torch for": "CUDA 13.0",
-        "kernels for cards": "built with CUDA 13.0",
+        "kernels for GPUs": "built with CUDA 13.0",
         "driver": "knows CUDA 13.2",
-        "card": "Card, compute capability 9.0, 8 GB",
+        "GPU": "GPU, compute capability 9.0, 8 GB",
     }
 
 
 def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.version, "cuda", None)
     assert re.search(r"device cuda: this torch \(.*\) is built without CUDA: install a torch for CUDA", refused())
-    assert findings()["card"] == "none"
+    assert findings()["GPU"] == "none"
 
 
 @pytest.mark.parametrize(
@@ -65,13 +65,13 @@ def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     [
         (
             "The NVIDIA driver on your system is too old (found version 11040). Please update your GPU driver",
-            r"too old \(found version 11040\): update the driver of the card, or install a torch for an older CUDA",
+            r"too old \(found version 11040\): update the driver of the GPU, or install a torch for an older CUDA",
         ),
         ("Found no NVIDIA driver on your system. Please check that you have one", r"no driver of NVIDIA is there"),
-        ("something else\nand more", r"torch finds no card \(something else\): see `nvidia-smi`"),
+        ("something else\nand more", r"torch finds no GPU \(something else\): see `nvidia-smi`"),
     ],
 )
-def test_a_torch_that_finds_no_card(machine: pytest.MonkeyPatch, said: str, line: str) -> None:
+def test_a_torch_that_finds_no_gpu(machine: pytest.MonkeyPatch, said: str, line: str) -> None:
     def fail() -> None:
         raise RuntimeError(said)
 
@@ -80,7 +80,7 @@ def test_a_torch_that_finds_no_card(machine: pytest.MonkeyPatch, said: str, line
     assert re.search(line, refused())
 
 
-def test_no_card_though_cuda_starts(machine: pytest.MonkeyPatch) -> None:
+def test_no_gpu_though_cuda_starts(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.cuda, "is_available", lambda: False)
     machine.setattr(torch.cuda, "init", lambda: None)
     assert "CUDA_VISIBLE_DEVICES" in refused()
@@ -88,17 +88,17 @@ def test_no_card_though_cuda_starts(machine: pytest.MonkeyPatch) -> None:
 
 def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
-    assert "built without its kernels for cards: install dyngs with `pip install . -C cmake.define" in refused()
-    assert findings()["kernels for cards"] == "not built"
+    assert "built without its kernels for GPUs: install dyngs with `pip install . -C cmake.define" in refused()
+    assert findings()["kernels for GPUs"] == "not built"
 
 
 def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:
     def fail() -> None:
-        raise DyngsError("the kernels for CUDA cards are not there (broken); install them")
+        raise DyngsError("the kernels for CUDA GPUs are not there (broken); install them")
 
     machine.setattr(device, "cuda_core", fail)
     assert "(broken)" in refused()
-    assert "(broken)" in findings()["kernels for cards"]
+    assert "(broken)" in findings()["kernels for GPUs"]
 
 
 def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
@@ -107,12 +107,12 @@ def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     assert "built with CUDA 13.0, but the driver knows 12.4 at most: update the driver, or build" in refused()
 
 
-def test_a_card_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
+def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.cuda, "get_device_capability", lambda: (7, 0))
-    assert re.search(r"Card has compute capability 7\.0,? .*7\.5 is needed", refused())
+    assert re.search(r"GPU has compute capability 7\.0,? .*7\.5 is needed", refused())
 
 
-def test_auto_says_why_only_where_a_card_seems_to_be(machine: pytest.MonkeyPatch) -> None:
+def test_auto_says_why_only_where_a_gpu_seems_to_be(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
     line = why_on_cpu("auto")
     assert line is not None
@@ -127,7 +127,7 @@ def test_other_choices_are_refused() -> None:
         device_for("tpu")
 
 
-def test_on_a_card_torch_is_told_to_repeat_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_gpu_torch_is_told_to_repeat_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     """And only there, only inside, and only if that is wanted."""
     told: list[tuple[bool, bool]] = []
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def veils(count: int = 1) -> Projection:
-    """Splats that cover any picture."""
+    """Splats that cover any image."""
     return Projection(
         means2d=torch.full((1, count, 2), 32.0),
         depths=torch.ones(1, count),
@@ -36,7 +36,7 @@ def veils(count: int = 1) -> Projection:
 @pytest.mark.parametrize("side", [-1, 0, MAX_SIDE + 1, 10**9, 2**31 - 8, 2**31, 2**63, 10**30])
 def test_sides_that_cannot_be_are_refused(side: int) -> None:
     """2^31 - 8 + 15 overflowed an int; 2^63 does not reach the kernels at all."""
-    message = f"^render refused: a picture of {side}x5 px; its sides can be 1 to 8388608 px$"
+    message = f"^render refused: an image of {side}x5 px; its sides can be 1 to 8388608 px$"
     with pytest.raises(DyngsError, match=message):
         check_size(side, 5)
     with pytest.raises(DyngsError, match=message):
@@ -57,7 +57,7 @@ def test_the_kernels_refuse_them_too() -> None:
             core.ProjectSettings(width, height, 0.3, 0.2, 1e10, 0.0, 0.0, False, threads)
 
 
-def test_a_picture_larger_than_memory_is_refused() -> None:
+def test_a_image_larger_than_memory_is_refused() -> None:
     side = MAX_SIDE
     with pytest.raises(
         DyngsError, match=r"^render refused: .* 8388608x8388608 px have tiles .* GB of memory are available"
@@ -65,7 +65,7 @@ def test_a_picture_larger_than_memory_is_refused() -> None:
         bin_tiles(veils(), torch.ones(1, 1), (side, side))
     nothing = bin_tiles(veils(), torch.zeros(1, 1), (16, 16))
     with pytest.raises(
-        DyngsError, match=r"^render refused: 1 picture\(s\) .* 3 channels take 1407374.9 GB; .* available"
+        DyngsError, match=r"^render refused: 1 image\(s\) .* 3 channels take 1407374.9 GB; .* available"
     ):
         rasterize(veils(), torch.ones(1, 1), torch.ones(1, 1, 3), (side, side), entries=nothing)
 
@@ -143,7 +143,7 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.ops.native import core
-from dyngs.rendering import render
+from dyngs.gaussians.rendering import render
 
 def draw(count, side):
     means = torch.tensor([[0.0, 0, 3]]).repeat(count, 1).requires_grad_()
@@ -174,12 +174,12 @@ print(float(draw(3, 64)))
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_AS")
 def test_what_memory_does_not_hold_is_refused() -> None:
-    """Pairs, a picture, gradients, and scratch memory that threads used to allocate; after which all is well."""
+    """Pairs, an image, gradients, and scratch memory that threads used to allocate; after which all is well."""
     path = os.pathsep.join([str(Path(dyngs.__file__).parents[1]), *(p for p in sys.path if p)])
     environment = os.environ | {"PYTHONPATH": path}
     run = subprocess.run([sys.executable, "-c", CHILD], env=environment, capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr[-2000:]
-    pairs, picture, gradients, scratch, drawn = run.stdout.splitlines()
+    pairs, image, gradients, scratch, drawn = run.stdout.splitlines()
     left, remedy = r"\d\.\d\d?\d? GB of memory are available", "lower the resolution, the scales or the number of views"
     assert re.fullmatch(
         r"render refused: 2000 Gaussians in 1 view\(s\) of 4096x4096 px meet 131072000 tiles, "
@@ -187,7 +187,7 @@ def test_what_memory_does_not_hold_is_refused() -> None:
         pairs,
     )
     assert re.fullmatch(
-        rf"render refused: 1 picture\(s\) of 8192x8192 px with 3 channels take 1\.3 GB; {left}; {remedy}", picture
+        rf"render refused: 1 image\(s\) of 8192x8192 px with 3 channels take 1\.3 GB; {left}; {remedy}", image
     )
     assert re.fullmatch(
         rf"render refused: the gradients of 4915200 \(Gaussian, tile\) pairs take 0\.2 GB; {left}; {remedy}", gradients

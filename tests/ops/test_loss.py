@@ -13,13 +13,13 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.ops.loss import _ssim_map, l1_ssim_loss, l1_ssim_op, reference_l1_ssim, ssim
 
-# Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its gradient; the pictures
+# Two blurs along two axes, of 11 additions of half a unit each, for the value and again for its gradient; the images
 # have contrast everywhere, so nothing cancels after that. Of 3,300 draws none had more than 4 units.
 TOLERANCE = 44 * 0.5 * torch.finfo(torch.float32).eps
 
 
-def make_pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Two similar pictures and a mask with zeros, ones and fractions."""
+def make_images(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Two similar images and a mask with zeros, ones and fractions."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height, width, 3, generator=generator)
     rendered = (target + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
@@ -54,7 +54,7 @@ def assert_equals_reference(rendered: Tensor, target: Tensor, ssim_weight: float
 )
 @settings(max_examples=25, deadline=None)
 def test_equals_float64_reference(height: int, width: int, ssim_weight: float, masked: bool, seed: int) -> None:
-    rendered, target, mask = make_pictures(height, width, seed)
+    rendered, target, mask = make_images(height, width, seed)
     mask[0, 0] = 1.0  # an all-zero mask has no gradient to compare with; it has its own test
     assert_equals_reference(rendered, target, ssim_weight, mask if masked else None)
 
@@ -62,16 +62,16 @@ def test_equals_float64_reference(height: int, width: int, ssim_weight: float, m
 # Sizes on both sides of the native tile (96 rows, 256 pixels) and of its vectors.
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 8192), (96, 256), (97, 257), (193, 515), (400, 1)])
 def test_equals_float64_reference_across_tiles(height: int, width: int) -> None:
-    rendered, target, mask = make_pictures(height, width)
+    rendered, target, mask = make_images(height, width)
     assert_equals_reference(rendered, target, 0.2, None)
     assert_equals_reference(rendered, target, 0.2, mask.clamp_min(0.1))
 
 
-def test_flat_bright_pictures_keep_their_digits() -> None:
+def test_flat_bright_images_keep_their_digits() -> None:
     # Here E[x^2] - E[x]^2 loses all digits in float32: the plain formula is off by half the value. The fused one works
     # on x - y and has the value; its gradient still contains the variance of x + y, hence the wider tolerance.
     target = torch.ones(64, 64, 3)
-    rendered = target - 1e-3 * make_pictures(64, 64)[0]
+    rendered = target - 1e-3 * make_images(64, 64)[0]
     value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
     expected, expected_gradient = value_and_gradient(reference_l1_ssim, rendered.double(), target.double(), 1.0)
     assert value == pytest.approx(expected, rel=2e-4)
@@ -80,7 +80,7 @@ def test_flat_bright_pictures_keep_their_digits() -> None:
 
 def test_reference_agrees_with_scikit_image() -> None:
     metrics = pytest.importorskip("skimage.metrics")
-    rendered, target, _ = (x.double() for x in make_pictures(40, 50))
+    rendered, target, _ = (x.double() for x in make_images(40, 50))
     expected = metrics.structural_similarity(
         rendered.numpy(),
         target.numpy(),
@@ -104,8 +104,8 @@ def test_known_answer_of_one_pixel() -> None:
     assert l1_ssim_loss(torch.full((1, 1, 3), x), torch.full((1, 1, 3), y)).item() == pytest.approx(expected, abs=1e-7)
 
 
-def test_equal_pictures_cost_exactly_nothing() -> None:
-    rendered, _, mask = make_pictures(30, 40)
+def test_equal_images_cost_exactly_nothing() -> None:
+    rendered, _, mask = make_images(30, 40)
     for m in (None, mask):
         value, gradient = value_and_gradient(l1_ssim_loss, rendered, rendered.clone(), 0.2, m)
         assert value == 0
@@ -114,7 +114,7 @@ def test_equal_pictures_cost_exactly_nothing() -> None:
 
 
 def test_any_number_of_threads_gives_the_same_bytes() -> None:
-    rendered, target, mask = make_pictures(210, 530)
+    rendered, target, mask = make_images(210, 530)
     before = torch.get_num_threads()
     results = []
     try:
@@ -129,7 +129,7 @@ def test_any_number_of_threads_gives_the_same_bytes() -> None:
 
 
 def test_mask_of_ones_is_no_mask() -> None:
-    rendered, target, _ = make_pictures(20, 30)
+    rendered, target, _ = make_images(20, 30)
     value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 0.2, torch.ones(20, 30))
     expected, expected_gradient = value_and_gradient(l1_ssim_loss, rendered, target, 0.2, None)
     assert value == expected
@@ -137,7 +137,7 @@ def test_mask_of_ones_is_no_mask() -> None:
 
 
 def test_what_the_mask_hides_does_not_matter() -> None:
-    rendered, target, mask = make_pictures(40, 40)
+    rendered, target, mask = make_images(40, 40)
     mask = (mask > 0.5).float()
     changed = torch.where(mask[..., None] == 0, torch.rand(40, 40, 3), rendered)
     value, gradient = value_and_gradient(l1_ssim_loss, changed, target, 0.2, mask)
@@ -146,7 +146,7 @@ def test_what_the_mask_hides_does_not_matter() -> None:
 
 
 def test_empty_mask_costs_nothing() -> None:
-    rendered, target, _ = make_pictures(9, 9)
+    rendered, target, _ = make_images(9, 9)
     for function in (l1_ssim_loss, reference_l1_ssim):
         value, gradient = value_and_gradient(function, rendered, target, 0.2, torch.zeros(9, 9))
         assert value == 0
@@ -155,7 +155,7 @@ def test_empty_mask_costs_nothing() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_non_finite_input_gives_non_finite_loss(bad: float) -> None:
-    rendered, target, _ = make_pictures(30, 30)
+    rendered, target, _ = make_images(30, 30)
     rendered[10, 20, 1] = bad
     loss = l1_ssim_loss(rendered.requires_grad_(), target)
     loss.backward()  # must return
@@ -164,9 +164,9 @@ def test_non_finite_input_gives_non_finite_loss(bad: float) -> None:
 
 @pytest.mark.parametrize("brightness", [1.9, 2.1, 50, 1000, 10000])
 @pytest.mark.parametrize("contrast", [1e-2, 0.2])
-def test_bright_pictures_keep_their_digits(brightness: float, contrast: float) -> None:
+def test_bright_images_keep_their_digits(brightness: float, contrast: float) -> None:
     """1000 +- 0.1 is off by 18% where variances are taken in float32; by rounding they even fall below zero."""
-    rendered, target, _ = (brightness + contrast * (x - 0.5) for x in make_pictures(60, 60))
+    rendered, target, _ = (brightness + contrast * (x - 0.5) for x in make_images(60, 60))
     value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
     expected, expected_gradient = value_and_gradient(reference_l1_ssim, rendered.double(), target.double(), 1.0)
     # Squares of up to 4 b^2 are rounded some 16 times before a variance is left of them, which has C2 = 9e-4 beside it:
@@ -180,7 +180,7 @@ def test_bright_pictures_keep_their_digits(brightness: float, contrast: float) -
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("large", [1e10, 1e30, -3e38])
 def test_one_large_pixel_costs_what_the_formula_says(large: float, ssim_weight: float) -> None:
-    rendered, target, mask = make_pictures(120, 300)  # four tiles, of which two see it
+    rendered, target, mask = make_images(120, 300)  # four tiles, of which two see it
     rendered[10, 20, 1] = large
     for m in (None, mask.clamp_min(0.1)):
         value, gradient = value_and_gradient(l1_ssim_loss, rendered, target, ssim_weight, m)
@@ -190,13 +190,13 @@ def test_one_large_pixel_costs_what_the_formula_says(large: float, ssim_weight: 
         assert value == pytest.approx(expected, rel=1e-6)
         assert gradient.isfinite().all()
         assert (gradient - expected_gradient).abs().max() <= TOLERANCE * expected_gradient.abs().max()
-    rendered[5, 5] = 0  # its own window, but far from the large pixel of the other picture
+    rendered[5, 5] = 0  # its own window, but far from the large pixel of the other image
     target[100, 280, 0] = large
     assert math.isfinite(value_and_gradient(l1_ssim_loss, rendered, target, ssim_weight)[0])
 
 
 def test_a_bright_tile_leaves_the_others_their_bytes() -> None:
-    rendered, target, _ = make_pictures(97, 800)
+    rendered, target, _ = make_images(97, 800)
     _, ordinary = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
     rendered[50, 10] = 30.0
     _, gradient = value_and_gradient(l1_ssim_loss, rendered, target, 1.0)
@@ -205,27 +205,27 @@ def test_a_bright_tile_leaves_the_others_their_bytes() -> None:
 
 
 def test_reference_in_float32_keeps_its_digits() -> None:
-    rendered, target, _ = (1000 + 0.2 * x for x in make_pictures(30, 30))
+    rendered, target, _ = (1000 + 0.2 * x for x in make_images(30, 30))
     expected = reference_l1_ssim(rendered.double(), target.double(), 1.0).item()
     assert reference_l1_ssim(rendered, target, 1.0).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_upstream_gradient_scales() -> None:
-    rendered, target, _ = make_pictures(12, 17)
+    rendered, target, _ = make_images(12, 17)
     _, gradient = value_and_gradient(l1_ssim_loss, rendered, target)
     _, tripled = value_and_gradient(lambda *x: 3 * l1_ssim_loss(*x), rendered, target)
     torch.testing.assert_close(tripled, 3 * gradient)
 
 
 def test_target_gets_no_gradient() -> None:
-    rendered, target, _ = make_pictures(8, 8)
+    rendered, target, _ = make_images(8, 8)
     target.requires_grad_()
     l1_ssim_loss(rendered.requires_grad_(), target).backward()
     assert target.grad is None
 
 
 def test_strided_and_half_inputs() -> None:
-    rendered, target, _ = make_pictures(20, 30)
+    rendered, target, _ = make_images(20, 30)
     expected, expected_gradient = value_and_gradient(l1_ssim_loss, rendered, target)
     strided = rendered.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     value, gradient = value_and_gradient(l1_ssim_loss, strided, target)
@@ -239,26 +239,26 @@ def test_strided_and_half_inputs() -> None:
 
 
 def test_no_grad_gives_the_same_value() -> None:
-    rendered, target, mask = make_pictures(20, 30)
+    rendered, target, mask = make_images(20, 30)
     value, _ = value_and_gradient(l1_ssim_loss, rendered, target, 0.2, mask)
     assert l1_ssim_loss(rendered, target, 0.2, mask).item() == value
 
 
 def test_gradcheck_in_float64() -> None:
-    rendered, target, mask = (x.double() for x in make_pictures(4, 7))
+    rendered, target, mask = (x.double() for x in make_images(4, 7))
     rendered.requires_grad_()
     assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, 0.2), rendered)
     assert torch.autograd.gradcheck(lambda x: l1_ssim_loss(x, target, 0.2, mask), rendered)
 
 
 def test_opcheck() -> None:
-    rendered, target, mask = make_pictures(13, 14)
+    rendered, target, mask = make_images(13, 14)
     torch.library.opcheck(l1_ssim_op, (rendered.clone().requires_grad_(), target, mask, 0.2, True))
     torch.library.opcheck(l1_ssim_op, (rendered, target, None, 0.2, False))
 
 
 def test_compiles_to_one_graph() -> None:
-    rendered, target, _ = make_pictures(13, 14)
+    rendered, target, _ = make_images(13, 14)
     compiled = torch.compile(l1_ssim_loss, fullgraph=True, backend="aot_eager")
     value, gradient = value_and_gradient(compiled, rendered, target)
     expected, expected_gradient = value_and_gradient(l1_ssim_loss, rendered, target)

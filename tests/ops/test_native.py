@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from emulated_card import compiled, compiler, emulated_kernels, session_folder
+from emulated_gpu import compiled, compiler, emulated_kernels, session_folder
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import active_isa, array, built_isas, choose_isa, core, core_for, kernel_threads, num_threads
@@ -103,7 +103,7 @@ def test_array_detaches_and_copies_only_if_needed() -> None:
     assert torch.from_dlpack(array(x[:, 0])).stride() == (1,)
 
 
-def test_float64_on_a_card_is_refused_in_one_line() -> None:
+def test_float64_on_a_gpu_is_refused_in_one_line() -> None:
     with pytest.raises(DyngsError, match=r"^float64 is not there on a GPU; use float32$"):
         core_for(torch.zeros(3, dtype=torch.float64, device="meta"))
 
@@ -173,7 +173,7 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.ops.native import kernel_threads, num_threads
-from dyngs.rendering import render
+from dyngs.gaussians.rendering import render
 
 def draw(count):
     fields = torch.zeros(count, 3) + torch.tensor([0.0, 0, 3]), torch.ones(count, 4), torch.full((count, 3), -2.0)

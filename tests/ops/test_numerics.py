@@ -14,10 +14,10 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.native import core
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, TileEntries, bin_tiles, rasterize
-from dyngs.rendering import RenderOptions, render
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -27,12 +27,12 @@ HALF_STEP = 2.0**-24  # of float32, relative
 
 @dataclass(frozen=True)
 class Needle:
-    """A needle through the middle of the picture.
+    """A needle through the middle of the image.
 
     Attributes:
         length, width: standard deviations along and across it, px.
         angle: of its direction, rad.
-        distance: from the middle of the picture to its centre, in lengths.
+        distance: from the middle of the image to its centre, in lengths.
     """
 
     length: float
@@ -57,7 +57,7 @@ class Needle:
 
 
 def drawn(needle: Needle, dtype: torch.dtype) -> tuple[Tensor, list[Tensor], float]:
-    """Picture, gradients by mean, quaternion and log scales of a weighted sum of it, and that sum."""
+    """Image, gradients by mean, quaternion and log scales of a weighted sum of it, and that sum."""
     x, y = math.cos(needle.angle), math.sin(needle.angle)
     away = needle.distance * needle.length
     mean = torch.tensor([[away * x + 2.3, away * y - 1.7, 100.0]])
@@ -69,10 +69,10 @@ def drawn(needle: Needle, dtype: torch.dtype) -> tuple[Tensor, list[Tensor], flo
     opacity, colors = torch.tensor([0.5], dtype=dtype), torch.tensor([[[1.0, 0.5, 0.2]]], dtype=dtype)
     splats = project(leaves[0], leaves[1], leaves[2].exp(), opacity, cameras, ProjectionOptions(alpha_min=0.0))
     options = BlendOptions(alpha_min=0.0, transmittance_min=0.0)
-    picture = rasterize(splats, opacity[None], colors, (WIDTH, HEIGHT), options=options).color
+    image = rasterize(splats, opacity[None], colors, (WIDTH, HEIGHT), options=options).color
     generator = torch.Generator().manual_seed(3)
-    total = (picture * torch.rand(picture.shape, generator=generator, dtype=torch.float64).to(dtype)).sum()
-    return picture.detach().double(), [x.double() for x in torch.autograd.grad(total, leaves)], total.item()
+    total = (image * torch.rand(image.shape, generator=generator, dtype=torch.float64).to(dtype)).sum()
+    return image.detach().double(), [x.double() for x in torch.autograd.grad(total, leaves)], total.item()
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -90,13 +90,13 @@ def drawn(needle: Needle, dtype: torch.dtype) -> tuple[Tensor, list[Tensor], flo
 @example(needle=Needle(1e6, 30, 0.01, 1.0))
 @example(needle=Needle(300, 0.5, 2.0, 0.0))
 def test_gradients_of_needles_centred_off_screen(isa: str, needle: Needle) -> None:
-    """As exact as the picture: rounding moves a needle by a share of its width, and changes each pixel's part in the
+    """As exact as the image: rounding moves a needle by a fraction of its width, and changes each pixel's part in the
     gradients by that share. Measured in what the gradients would be if all pixels pulled the same way; those of log
     scales reach it."""
-    picture, slopes, _ = drawn(needle, torch.float32)
+    image, slopes, _ = drawn(needle, torch.float32)
     truth, true_slopes, total = drawn(needle, torch.float64)
     tolerance = 16 * needle.rounding + 2e-6
-    assert (picture - truth).abs().max() < tolerance
+    assert (image - truth).abs().max() < tolerance
     by_mean = total / needle.drawn_width
     largest = [by_mean, by_mean * max(needle.length, needle.reach), total]
     for slope, true, unit in zip(slopes, true_slopes, largest, strict=True):
@@ -146,9 +146,9 @@ def tiny_render(entries: TileEntries | None = None, *, backward: bool = False) -
     splats = Projection(torch.full((1, 2, 2), 16.0), torch.ones(1, 2), factors, torch.ones(1, 2), radii)
     opacities = torch.full((1, 2), 0.5)
     right = bin_tiles(splats, opacities, (32, 32))
-    picture = rasterize(splats, opacities, torch.ones(1, 2, 3), (32, 32), entries=entries).color
+    image = rasterize(splats, opacities, torch.ones(1, 2, 3), (32, 32), entries=entries).color
     if backward:
-        picture.sum().backward()
+        image.sum().backward()
     return right
 
 
@@ -181,10 +181,10 @@ def test_entries_changed_between_the_passes_are_refused() -> None:
     factors = torch.tensor([0.2, 0, 0.2]).repeat(1, 2, 1).requires_grad_()
     radii = torch.full((1, 2, 2), 20, dtype=torch.int32)
     splats = Projection(torch.full((1, 2, 2), 16.0), torch.ones(1, 2), factors, torch.ones(1, 2), radii)
-    picture = rasterize(splats, torch.full((1, 2), 0.5), torch.ones(1, 2, 3), (32, 32), entries=entries).color
+    image = rasterize(splats, torch.full((1, 2), 0.5), torch.ones(1, 2, 3), (32, 32), entries=entries).color
     entries.slots.data.fill_(100)
     with pytest.raises(DyngsError, match=r"^rasterize, backward: slots name places that are not there$"):
-        picture.sum().backward()
+        image.sum().backward()
 
 
 def test_entries_of_another_kind_are_refused() -> None:

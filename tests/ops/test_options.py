@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.ops.options import check_choice, check_count, check_near_and_far, check_number
 from dyngs.ops.projection import ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
-from dyngs.rendering import RenderOptions
 
 WRONG: dict[str, list[Any]] = {
     "eps2d": [-0.1, math.nan, math.inf, "0.3", None],
@@ -39,7 +39,7 @@ CASES = [
 
 @pytest.mark.parametrize(("kind", "name", "value"), CASES)
 def test_options_out_of_range_are_refused_by_name(kind: type, name: str, value: Any) -> None:
-    """NaN gave an empty picture, an unknown word the last of the choices."""
+    """NaN gave an empty image, an unknown word the last of the choices."""
     with pytest.raises(DyngsError, match=f"^{name} must "):
         kind(**{name: value})
 

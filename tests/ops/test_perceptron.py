@@ -94,7 +94,7 @@ def test_float_is_near_double(widths: list[int], skip: int | None, rows: int) ->
     # The value: sums of up to 300 terms, 2^-24 each, mostly cancelling, through up to nine layers.
     assert_close(got[:1], expected[:1], 5e-6)
     # The gradients: as much again. In addition a ReLU whose input is within rounding of 0 may switch, which changes a
-    # row's share of the gradient by far more than rounding; of 10^5 to 10^6 units a few do, so these are counted only.
+    # row's part of the gradient by far more than rounding; of 10^5 to 10^6 units a few do, so these are counted only.
     for a, b in zip(got[1:], expected[1:], strict=True):
         off = (a.double() - b).abs() > 2e-5 * b.abs().max()
         assert off.double().mean() < 0.01

@@ -48,8 +48,8 @@ def make_coords(count: int, dtype: torch.dtype = torch.float64, reach: float = 1
 def sample(plane: Tensor, fast: Tensor, slow: Tensor) -> Tensor:
     """(M, C) bilinear samples of a plane (rows, columns, C) at coordinates (M,) in [-1, 1]."""
     grid = torch.stack([fast, slow], dim=1)[None, None]
-    picture = plane.permute(2, 0, 1)[None]
-    return grid_sample(picture, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
+    image = plane.permute(2, 0, 1)[None]
+    return grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)[0, :, 0].T
 
 
 def reference_features(coords: Tensor, time: float, levels: list[PlaneLevel]) -> Tensor:

@@ -96,7 +96,7 @@ def test_covariances_are_moved_exactly(seed: int, shear: float, spread: float) -
     quats, log_scales = normal(40, 4, seed=seed + 1), spread * normal(40, 3, seed=seed + 2) - 5
     still = covariances(quats, log_scales)
     wanted = linear @ still @ linear.mT
-    # T S T^T cancels where T nearly flattens the longest axis: what rounding does is a share of |T|^2 |S|. Up to 24
+    # T S T^T cancels where T nearly flattens the longest axis: what rounding does is a fraction of |T|^2 |S|. Up to 24
     # rotations of 4 roundings each, and the products before and after: 100 or so, twice in a square. Axes of less than
     # e^-16 of the longest are taken for that.
     size = linear.norm(dim=(1, 2)).square() * still.norm(dim=(1, 2))

@@ -172,7 +172,7 @@ def test_faint_and_small_splats_are_culled(dtype: torch.dtype) -> None:
     assert visible(splats(scene, ProjectionOptions(radius_clip=3.0)))[0].tolist() == [False, False, True]
 
 
-def test_splats_beside_the_picture_are_culled() -> None:
+def test_splats_beside_the_image_are_culled() -> None:
     scene = front(4)
     radius = float(splats(scene).radii[0, 0, 0])
     per_px = 3 / scene.intrinsics[0, 0, 0]

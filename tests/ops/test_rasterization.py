@@ -231,7 +231,7 @@ def test_probe_does_not_change_the_other_gradients(channels: int, scene: Scene) 
 
 
 def test_contributions_are_the_slopes_of_the_colours(scene: Scene) -> None:
-    """The sum over pixels of a one-channel picture is sum_i colour_i * contribution_i."""
+    """The sum over pixels of a one-channel image is sum_i colour_i * contribution_i."""
     projection, opacities = splats_of(scene)
     colors = torch.rand_like(opacities)[..., None].requires_grad_()
     total = rasterize(projection, opacities, colors, scene.size).color.sum()
@@ -241,7 +241,7 @@ def test_contributions_are_the_slopes_of_the_colours(scene: Scene) -> None:
     torch.testing.assert_close((sums * colors[..., 0]).sum(), total, rtol=1e-12, atol=0)
 
 
-def test_contributions_and_the_background_make_up_the_picture(scene: Scene) -> None:
+def test_contributions_and_the_background_make_up_the_image(scene: Scene) -> None:
     projection, opacities = splats_of(scene)
     sums = tally(projection, opacities, scene.size, Tally.WEIGHTS)
     light = draw(scene).blended.transmittance
@@ -253,9 +253,9 @@ def test_tally_of_pixels_counts_those_that_a_gaussian_was_blended_into() -> None
     scene = random_scene(n=30, views=1, seed=13)
     scene = replace(scene, opacities=scene.opacities**0.2, scales=2 * scene.scales)  # some pixels fill up
     projection, opacities = splats_of(scene)
-    picture = reference.rasterize(projection, opacities, torch.eye(30, dtype=torch.float64)[None], scene.size).color
+    image = reference.rasterize(projection, opacities, torch.eye(30, dtype=torch.float64)[None], scene.size).color
     pixels = tally(projection, opacities, scene.size, Tally.PIXELS)
-    assert torch.equal(pixels, (picture > 0).sum((1, 2)).double())
+    assert torch.equal(pixels, (image > 0).sum((1, 2)).double())
     lanes = tally(projection, opacities, scene.size, Tally.LANES)
     assert (lanes >= pixels).all()
     assert not (lanes % 16).any()  # whole 4x4 blocks
@@ -301,8 +301,8 @@ def test_order_of_the_gaussians_does_not_matter(scene: Scene) -> None:
     assert torch.equal(found, truth[order])
 
 
-def test_halves_of_a_picture_equal_crops() -> None:
-    """Shifting cx moves the picture; splats must be narrower than the clamp margin (15% of the width)."""
+def test_halves_of_a_image_equal_crops() -> None:
+    """Shifting cx moves the image; splats must be narrower than the clamp margin (15% of the width)."""
     scene = random_scene(n=60, views=1, size=(160, 24), seed=4)
     scene = replace(scene, scales=0.02 * scene.scales)
     whole = draw(scene).blended.color
@@ -324,7 +324,7 @@ def test_no_gaussians_leave_the_background() -> None:
 
 
 @pytest.mark.parametrize("size", [(8192, 1), (1, 8192)], ids=str)
-def test_long_thin_pictures(size: tuple[int, int]) -> None:
+def test_long_thin_images(size: tuple[int, int]) -> None:
     scene = random_scene(n=4, views=1, size=size)
     scene.means[:, :2] *= 0.1
     ours, truth = draw(scene).blended, draw(scene, REFERENCE).blended

@@ -1,4 +1,4 @@
-"""Copies that nobody waits for: values, and on a card (made up here) the order of what is queued."""
+"""Copies that nobody waits for: values, and on a GPU (made up here) the order of what is queued."""
 
 from __future__ import annotations
 
@@ -28,53 +28,53 @@ def test_arrays_come_as_they_are() -> None:
     assert sent(arrays[0], "meta").device.type == "meta"
 
 
-class MadeUpCard:
-    """What torch.cuda has of streams and events, for tensors whose device is said to be a card; notes all calls."""
+class MadeUpGpu:
+    """What torch.cuda has of streams and events, for tensors whose device is said to be a GPU; notes all calls."""
 
     def __init__(self) -> None:
         self.calls: list[str] = []
 
     def on(self, patch: pytest.MonkeyPatch) -> None:
-        card = self
+        gpu = self
 
         class Event:
             def record(self, stream: str) -> None:
-                card.calls.append(f"event recorded in {stream}")
+                gpu.calls.append(f"event recorded in {stream}")
 
             def synchronize(self) -> None:
-                card.calls.append("host waits for the event")
+                gpu.calls.append("host waits for the event")
 
         class Stream(str):
             def wait_event(self, _: Event) -> None:
-                card.calls.append(f"{self} waits for the event")
+                gpu.calls.append(f"{self} waits for the event")
 
         @contextmanager
         def stream(queue: str):
-            card.calls.append(f"begin {queue}")
+            gpu.calls.append(f"begin {queue}")
             yield
-            card.calls.append(f"end {queue}")
+            gpu.calls.append(f"end {queue}")
 
         patch.setattr(torch.cuda, "Event", Event)
         patch.setattr(torch.cuda, "stream", stream)
         patch.setattr(torch.cuda, "current_stream", lambda _: Stream("current"))
         patch.setattr("dyngs.ops.transfer._upload_stream", lambda _: Stream("uploads"))
-        patch.setattr(Tensor, "pin_memory", lambda x: card.calls.append("pinned") or x)
-        patch.setattr(Tensor, "record_stream", lambda _, s: card.calls.append(f"used in {s}"))
+        patch.setattr(Tensor, "pin_memory", lambda x: gpu.calls.append("pinned") or x)
+        patch.setattr(Tensor, "record_stream", lambda _, s: gpu.calls.append(f"used in {s}"))
         to = Tensor.to
 
         def copied(x: Tensor, device: torch.device, non_blocking: bool = False) -> Tensor:
-            card.calls.append("copied, queued" if non_blocking else "copied")
+            gpu.calls.append("copied, queued" if non_blocking else "copied")
             return to(x, "cpu")
 
         patch.setattr(Tensor, "to", copied)
 
 
-def test_a_picture_is_copied_beside_the_work_of_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    card, x = MadeUpCard(), torch.arange(3)
+def test_a_image_is_copied_beside_the_work_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu, x = MadeUpGpu(), torch.arange(3)
     with monkeypatch.context() as patch:
-        card.on(patch)
+        gpu.on(patch)
         upload = Upload([x], torch.device("cuda", 0))
-        assert card.calls == ["begin uploads", "pinned", "copied, queued", "event recorded in uploads", "end uploads"]
-        card.calls.clear()
+        assert gpu.calls == ["begin uploads", "pinned", "copied, queued", "event recorded in uploads", "end uploads"]
+        gpu.calls.clear()
         assert torch.equal(upload.arrays()[0], x)
-    assert card.calls == ["current waits for the event", "used in current"], "and the host waits for nothing"
+    assert gpu.calls == ["current waits for the event", "used in current"], "and the host waits for nothing"

@@ -60,7 +60,7 @@ def test_few_cameras_give_a_path(count: int) -> None:
     assert_rigid(path.cameras)
 
 
-def test_standing_cameras_are_visited_once_each() -> None:
+def test_fixed_cameras_are_visited_once_each() -> None:
     """Five cameras that stand, at four times each, in the order of time: the path is that of five cameras."""
     poses = np.linalg.inv(ring_of(5, np.zeros(3)).cam_from_world.numpy())
     times = np.repeat([0.0, 0.3, 0.6, 1.0], 5).tolist()

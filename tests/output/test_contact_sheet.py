@@ -40,14 +40,14 @@ def test_error_gain_is_five() -> None:
     assert np.array_equal(sheet[LABEL_HEIGHT + 4, -GAP - 4], expected)
 
 
-def test_large_and_unequal_pictures_fit() -> None:
+def test_large_and_unequal_images_fit() -> None:
     rows = [SheetRow("a" * 200, *[np.zeros((h, w, 3), np.uint8)] * 2) for h, w in ((40, 100), (10, 10), (1, 1))]
     sheet = contact_sheet(rows, panel_width=50)
     assert sheet.shape[1] == GAP + 3 * (50 + GAP)
     assert sheet.shape[0] == 3 * LABEL_HEIGHT + 20 + 10 + 1 + GAP
 
 
-def test_captions_of_small_pictures_end_inside() -> None:
+def test_captions_of_small_images_end_inside() -> None:
     """At the width of the demo's panels nothing of the last letter is cut off."""
     panel = np.zeros((8, 160, 3), np.uint8)
     sheet = contact_sheet([SheetRow("31.23 dB  images/test/r_M", panel, panel)])

@@ -1,4 +1,4 @@
-"""Pictures of runs and camera paths: which files appear, what they show, and safe names."""
+"""Images of runs and camera paths: which files appear, what they show, and safe names."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from two_balls import balls_job, cameras_around, two_balls
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.data.pictures.video import read_frames
+from dyngs.data.images.video import read_frames
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.output.camera_paths import static_path
 from dyngs.output.image_files import OutputOptions, file_stems, files_of, write_job_images, write_split_images
 from dyngs.output.render_job import RenderJob, job_frames
-from dyngs.rendering import RenderOptions
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 
 
@@ -48,7 +48,7 @@ def write_run(folder: Path, size: int = 24) -> Path:
     return folder / "run"
 
 
-def test_path_writes_numbered_pictures(tmp_path) -> None:
+def test_path_writes_numbered_images(tmp_path) -> None:
     written = write_job_images(balls_job(cameras_around(3)), tmp_path / "out")
     assert names(tmp_path / "out") == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
     assert [p.name for p in written] == names(tmp_path / "out")
@@ -135,18 +135,18 @@ def test_split_of_a_run(tmp_path) -> None:
     assert not (tmp_path / "val").exists()
 
 
-def test_pictures_of_the_capture_are_not_replaced(tmp_path) -> None:
-    """Views and their pictures have the same names; so may frames of a path."""
+def test_images_of_the_capture_are_not_replaced(tmp_path) -> None:
+    """Views and their images have the same names; so may frames of a path."""
     run_dir = write_run(tmp_path)
     views = read_capture(load_resolved(run_dir).data).splits["test"]
     folder = views[0].image_path.parent
     before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     (tmp_path / "link").symlink_to(folder)
     for out in (folder, tmp_path / "link"):
-        with pytest.raises(DyngsError, match=r"picture of the capture.*--out"):
+        with pytest.raises(DyngsError, match=r"image of the capture.*--out"):
             write_split_images(run_dir, "test", out)
     job = balls_job(cameras_around(1))
-    with pytest.raises(DyngsError, match="picture of the capture"):
+    with pytest.raises(DyngsError, match="image of the capture"):
         write_job_images(replace(job, protected=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
     assert files_of(read_capture(load_resolved(run_dir).data)) >= {view.image_path.resolve() for view in views}
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before

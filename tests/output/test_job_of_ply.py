@@ -12,9 +12,9 @@ from two_balls import cameras_around, two_balls
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.output.job_of_ply import job_of_ply
 from dyngs.output.render_job import RenderJobOptions, render_frame
-from dyngs.rendering import RenderOptions
 from dyngs.splats.ply import read_ply, write_ply
 from dyngs.splats.splat_file import SplatFile, splat_options
 from dyngs.static.scene import StaticScene
@@ -41,14 +41,14 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
         pixels = pixels[:, :2] / pixels[:, 2:]
         inside = (in_camera[:, 2] > 0) & (pixels >= 0).all(dim=1) & (pixels <= torch.tensor([80, 60])).all(dim=1)
         assert inside.float().mean() > 0.9
-        picture_up = -job.path.cameras.cam_from_world[i, 1, :3].numpy()
-        assert picture_up @ axis > 0.5
+        image_up = -job.path.cameras.cam_from_world[i, 1, :3].numpy()
+        assert image_up @ axis > 0.5
     assert job.options.mode is RasterizeMode.ANTIALIASED
     assert job.options.eps2d == 0.1
     assert job.background is not None
     assert torch.equal(job.background, torch.zeros(3))
     assert (job.path.times, job.notes) == (None, ())
-    assert job.scene.is_still
+    assert job.scene.is_static
 
 
 def test_an_unknown_path_is_named(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.output.camera_paths import CameraPath, write_path
@@ -97,7 +97,7 @@ def test_times_of_a_file_are_overridden(moving_run: Path, tmp_path: Path) -> Non
 
 def test_a_camera_that_stands_still(moving_run: Path) -> None:
     capture = capture_of(moving_run)
-    wanted = PictureLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
+    wanted = ImageLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
     job = job_of_run(moving_run, RenderJobOptions(None, times=(0.0, 0.5, 1.0), view="1"))
     assert job.path.times == (0.0, 0.5, 1.0)
     assert (job.path.cameras.width, job.path.cameras.height) == (16, 16)
@@ -110,7 +110,7 @@ def test_a_camera_that_stands_still(moving_run: Path) -> None:
     assert (len(small), small.width, small.height) == (1, 8, 4)
 
 
-def test_views_are_found_by_name_picture_and_number(moving_run: Path) -> None:
+def test_views_are_found_by_name_image_and_number(moving_run: Path) -> None:
     capture = capture_of(moving_run)
     test, train = capture.splits["test"], capture.splits["train"]
     assert view_to_show(capture) is test[0]

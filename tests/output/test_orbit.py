@@ -60,7 +60,7 @@ def test_spiral_stays_near_the_cameras_and_closes() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.sampled_from([(0, 0, 1), (0, -1, 0), (1, 2, 3)]), st.floats(0.01, 1000), st.integers(1, 5))
-def test_points_fill_the_picture(up: tuple[float, float, float], scale: float, frames: int) -> None:
+def test_points_fill_the_image(up: tuple[float, float, float], scale: float, frames: int) -> None:
     rng = np.random.default_rng(0)
     center = np.array([5.0, -3.0, 2.0]) * scale
     points = center + scale * rng.normal(size=(3000, 3)).clip(-2, 2)

@@ -1,4 +1,4 @@
-"""An orbit around a person: all around, with the person in every picture, also of a capture from one side."""
+"""An orbit around a person: all around, with the person in every image, also of a capture from one side."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def directions(centers: torch.Tensor) -> np.ndarray:
     return np.sort(np.degrees(np.arctan2(x, z)) % 360)
 
 
-def test_the_person_is_in_every_picture(person: Path) -> None:
+def test_the_person_is_in_every_image(person: Path) -> None:
     scene = assemble(Config(data=DataConfig(root=person), model=MODEL, train=TRAIN, run=RunConfig(threads=1))).scene
     assert isinstance(scene, HumanScene)
     cameras = person_orbit(scene, 8, (60, 80))

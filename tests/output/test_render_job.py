@@ -1,4 +1,4 @@
-"""Render jobs: frames are renders one by one, each at its time, and what was in a picture stays in it."""
+"""Render jobs: frames are renders one by one, each at its time, and what was in an image stays in it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from moving_scene import Sliding, camera, moving_scene, still_scene
 from two_balls import balls_job, cameras_around, two_balls
 
 from dyngs.camera import Cameras
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.output.camera_paths import static_path
 from dyngs.output.render_job import RenderJob, job_frames, render_frame, resize_cameras
-from dyngs.rendering import RenderOptions, render
 
 sizes = st.integers(1, 400)
 

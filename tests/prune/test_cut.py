@@ -41,7 +41,7 @@ def test_everything_that_a_cut_says(trainer: Trainer) -> None:
     count, whole = len(trainer.scene), field_size(trainer.scene)
     assert whole is not None
     assert whole.pieces == 3
-    cut = Cut(share=0.5, alpha_min=0.02, field=FieldSize(2, 1), harmonics=100.0)
+    cut = Cut(fraction=0.5, alpha_min=0.02, field=FieldSize(2, 1), harmonics=100.0)
     apply_cut(trainer, cut, torch.arange(float(count)))
     for _ in range(3):
         trainer.step()
@@ -79,11 +79,11 @@ def test_nothing_is_taken_by_no_cut(trainer: Trainer, end: Checkpoint, config: C
 
 
 def test_the_configuration_says_what_is_left(config: Config) -> None:
-    changed = cut_config(config, Cut(share=0.25, field=FieldSize(4, 2), harmonics=0.1))
+    changed = cut_config(config, Cut(fraction=0.25, field=FieldSize(4, 2), harmonics=0.1))
     match changed.model:
         case DynamicModel(deform=deform):
             assert (getattr(deform, "nodes", 0), getattr(deform, "pieces", 0)) == (4, 2)
         case _:
             raise AssertionError
     assert changed.colour.kind == "auto"
-    assert changed.prune.share == 0.25
+    assert changed.prune.fraction == 0.25

@@ -29,7 +29,7 @@ def config_of(root: Path, *keys: str) -> Config:
 def trainer(still: Path) -> Trainer:
     """The start of a run, whose Gaussians fill a cube, with one more: close before the first camera."""
     trainer = assemble(config_of(still))
-    cameras = trainer.pictures[0].cameras
+    cameras = trainer.images[0].cameras
     before = cameras.centers[0] + 0.3 * cameras.cam_from_world[0, 2, :3]
     gaussians = trainer.scene.gaussians.detach()
     tensors = {name: torch.cat([x, x[:1]]) for name, x in gaussians.tensors().items()}
@@ -91,6 +91,6 @@ def test_cameras_are_those_that_training_found(trainer: Trainer) -> None:
         pose[:, 2, 3] += 5.0 * (index == 0)
         return replace(cameras, cam_from_world=pose)
 
-    trainer.pictures.corrected = moved
+    trainer.images.corrected = moved
     assert bool(before[-1])
     assert not bool(floaters(trainer)[-1])

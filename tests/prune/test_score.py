@@ -9,9 +9,9 @@ import torch
 from moving_scene import Blinking, Sliding, camera, moving_scene, row_of_balls, still_scene
 
 from dyngs.deform.field import Offsets
+from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
+from dyngs.gaussians.scene import Scene
 from dyngs.prune.score import Importance, ScoringViews, importance
-from dyngs.rendering import RenderOptions, contributions, sensitivities
-from dyngs.scene import Scene
 from dyngs.static.scene import StaticScene
 
 BLACK = torch.zeros(3)
@@ -24,10 +24,10 @@ def views(scene: Scene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75,
 def test_sums_are_over_cameras_at_each_moment() -> None:
     scene = moving_scene(Sliding())
     found = importance(views(scene), slopes=True)
-    assert found.shares.shape == found.log_volumes.shape == found.opacities.shape == (5, 5)
+    assert found.fractions.shape == found.log_volumes.shape == found.opacities.shape == (5, 5)
     for k, time in ((0, 0.0), (3, 0.75)):
         both = [contributions(scene.at(time), c)[0] for c in (camera(), camera(40, 28))]
-        torch.testing.assert_close(found.shares[k], both[0] + both[1])
+        torch.testing.assert_close(found.fractions[k], both[0] + both[1])
     slopes = [sensitivities(scene.at(t), c, background=BLACK)[0] for t in (0.0, 0.25, 0.5, 0.75, 1.0)
               for c in (camera(), camera(40, 28))]  # fmt: skip
     assert found.slopes is not None
@@ -49,9 +49,9 @@ def test_what_is_hidden_or_transparent_is_worth_least() -> None:
         assert set(scores.argsort()[:2].tolist()) == {1, 3}
 
 
-def constant(shares: list[list[float]], opacities: list[list[float]] | None = None) -> Importance:
+def constant(fractions: list[list[float]], opacities: list[list[float]] | None = None) -> Importance:
     """K moments of N Gaussians of one size."""
-    c = torch.tensor(shares)
+    c = torch.tensor(fractions)
     o = torch.full_like(c, 0.5) if opacities is None else torch.tensor(opacities)
     return Importance(c, None, o, torch.zeros_like(c))
 

@@ -44,14 +44,14 @@ def test_the_last_step_that_keeps_the_promise(
     tried: list[float] = []
 
     def loss_of(cut: Cut) -> Candidate:
-        tried.append(cut.share)
-        return Candidate(cut, trainer.config, search.start, 10, 30.0, cut.share - 0.05)
+        tried.append(cut.fraction)
+        return Candidate(cut, trainer.config, search.start, 10, 30.0, cut.fraction - 0.05)
 
     monkeypatch.setattr(search, "_tried", loss_of)
-    levels = [(f"{k}", Cut(share=k / 12)) for k in range(1, 13)]
+    levels = [(f"{k}", Cut(fraction=k / 12)) for k in range(1, 13)]
     found, limit = search._bisected("Gaussians", levels, allowed)
     fits = [k for k in range(1, 13) if k / 12 - 0.05 <= allowed]
-    assert (None if found is None else found.cut) == (Cut(share=fits[-1] / 12) if fits else None)
+    assert (None if found is None else found.cut) == (Cut(fraction=fits[-1] / 12) if fits else None)
     assert len(tried) <= 4
     if len(fits) == 12:
         assert limit == Limit("Gaussians", "12", None)
@@ -65,16 +65,16 @@ def test_the_last_step_that_keeps_the_promise(
 def test_nothing_is_trained_on_what_is_held_out(trainer: Trainer) -> None:
     search = Search(trainer, trainer.checkpoint(), lambda text: None)
     assert search.held_out
-    names = {trainer.pictures[i].name for i in search.held_out}
-    seen = {trainer.step().picture.name for _ in range(2 * len(trainer.pictures))}
+    names = {trainer.images[i].name for i in search.held_out}
+    seen = {trainer.step().image.name for _ in range(2 * len(trainer.images))}
     assert not names & seen
-    assert len(seen | names) == len(trainer.pictures)
+    assert len(seen | names) == len(trainer.images)
     assert search.views == f"{len(names)} training views held out"
 
 
 def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> None:
     """And the run is compared as it is: nothing of it is memory."""
-    search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.pictures[0]])
+    search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.images[0]])
     assert (search.held_out, trainer.held_out) == ((), frozenset())
     assert search.views == "1 views never trained on"
     whole = search.run(-100.0).accepted

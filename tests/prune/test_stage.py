@@ -34,7 +34,7 @@ from dyngs.training.loop import Loop, Stopwatch
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-STAGE = PruneConfig(share=0.5, steps=6, mask_times=3, mask_below=1.0)
+STAGE = PruneConfig(fraction=0.5, steps=6, mask_times=3, mask_below=1.0)
 
 
 def moving_config(capture: Path, run_dir: Path, kind: str = "control_nodes", stage: PruneConfig = STAGE) -> Config:
@@ -75,7 +75,7 @@ def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(kind: str, mov
     wanted = final_bytes(folder)
     paths[-1].unlink()
     assert final_bytes(train(load_resolved(folder), resume_from=folder)) == wanted
-    if run.scene.is_still:
+    if run.scene.is_static:
         return
     assert run.scene.masks is not None
     assert run.scene.masks.count == len(run.scene)
@@ -139,9 +139,9 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     prune_(trainer)
     scene = trainer.scene
     assert scene.masks is not None
-    picture = trainer.pictures[3]
-    drawn = trainer.training.moment(scene, picture, trainer.done + 1)
-    active = scene.masks.active(scene.masks.interval(picture.time or 0.0))
+    image = trainer.images[3]
+    drawn = trainer.training.moment(scene, image, trainer.done + 1)
+    active = scene.masks.active(scene.masks.interval(image.time or 0.0))
     assert len(drawn.gaussians) == len(active)
     drawn.gaussians.means.sum().backward()
     grad = trainer.scene.gaussians.means.grad

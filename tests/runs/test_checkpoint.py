@@ -218,7 +218,7 @@ def test_load_run_fuses_the_filter_of_a_filtered_model(tmp_path: Path) -> None:
 
 def test_a_moving_scene_is_loaded_with_its_field(tmp_path: Path) -> None:
     scene = load_run(write_moving_run(tmp_path)).scene
-    assert not scene.is_still
+    assert not scene.is_static
     assert scene.rows.tolist() == list(MOVING_ROWS)
     assert scene.times == TRAIN_TIMES
     for time in (0.0, 0.3, 1.0):
@@ -265,7 +265,7 @@ def _header(**changes: object) -> dict[str, object]:
 
 @pytest.mark.parametrize("has_only_scene_file", [False, True])
 @pytest.mark.parametrize("kind", CONTENTS)
-def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_picture(
+def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
     tmp_path: Path, kind: str, has_only_scene_file: bool
 ) -> None:
     """The checksum fits; tensors lack, have other types, shapes and values, headers others kinds of fields."""

@@ -28,7 +28,7 @@ def fit_of(person: Path, folder: Path, raised: float = 0.01) -> Path:
         arrays = dict(np.load(person / name))
         np.savez(folder / name, **(arrays | {"trans": arrays["trans"] + np.array([0, raised, 0], np.float32)}))
     (folder / "fit_report.json").write_text("{}")
-    (folder / "fit_overlays.png").write_bytes(b"a picture")
+    (folder / "fit_overlays.png").write_bytes(b"an image")
     return folder
 
 

@@ -75,7 +75,7 @@ Command = Callable[[Path, Path, Path], object]
 """Of the capture, a run, and where to."""
 COMMANDS: dict[str, Command] = {
     "train": lambda capture, run, out: train(config_of(capture, out)),
-    "compact": lambda capture, run, out: prune_run(run, out, ("prune.share=0.5", "prune.steps=1", "run.threads=1")),
+    "compact": lambda capture, run, out: prune_run(run, out, ("prune.fraction=0.5", "prune.steps=1", "run.threads=1")),
     "export": lambda capture, run, out: write_scene_file(run, out),
     "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),
     "synth": lambda capture, run, out: require_new_folder(out),

@@ -11,7 +11,7 @@ import pytest
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.runs.remaining import RemainingTime
-from dyngs.training.schedule import picture_divisor
+from dyngs.training.schedule import image_divisor
 
 STEPS = 6000
 
@@ -38,7 +38,7 @@ class Run:
         return step / self.config.train.steps
 
     def drawn(self, step: int) -> int:
-        return self.pixels // picture_divisor(self.config.train, step) ** 2
+        return self.pixels // image_divisor(self.config.train, step) ** 2
 
     def seconds(self, first: int, last: int) -> float:
         """Of the steps after ``first`` up to ``last``."""
@@ -59,14 +59,14 @@ class Run:
 
 
 def sharpening(x: float) -> float:
-    """The Gaussians of a real clip of 854x480: to 30,000 in small pictures, then to the cap of 60,000."""
+    """The Gaussians of a real clip of 854x480: to 30,000 in small images, then to the cap of 60,000."""
     return 4000 + 47000 * min(x, 0.58) + (0 if x < 0.6 else min(1.0, (x - 0.6) / 0.1) * 29000)
 
 
 @pytest.mark.parametrize(
     "machine", [(0.02, 3e-7, 1e-6, 1.8), (0.01, 2e-7, 6e-7, 2.0), (0.04, 6e-7, 2e-6, 1.9), (0.12, 2e-6, 4e-6, 1.6)]
 )
-def test_small_pictures_first(machine: tuple[float, float, float, float]) -> None:
+def test_small_images_first(machine: tuple[float, float, float, float]) -> None:
     run = Run(dynamic(), sharpening, 854 * 480, *machine)
     done = STEPS // 10
     truth = run.seconds(done, STEPS)

@@ -1,4 +1,4 @@
-"""All formats through one reader and one writer: the same pictures, within what each format rounds."""
+"""All formats through one reader and one writer: the same images, within what each format rounds."""
 
 from __future__ import annotations
 
@@ -113,8 +113,8 @@ def test_one_gaussian_alone(kind: Format, tmp_path: Path) -> None:
 def test_every_truncation_is_an_error(kind: Format, tmp_path: Path) -> None:
     path = file_of(kind, tmp_path)
     data = write_splats(path, SplatFile(cloud(40, min(1, kind.max_degree)))).path.read_bytes()
-    for share in (0.5,) if kind.name == "usd" else (0.0, 0.01, 0.1, 0.5, 0.9, 0.999):  # USD is slow to read
-        path.write_bytes(data[: int(share * len(data)) - (kind.name == "splat")])  # a .splat ends after any row
+    for fraction in (0.5,) if kind.name == "usd" else (0.0, 0.01, 0.1, 0.5, 0.9, 0.999):  # USD is slow to read
+        path.write_bytes(data[: int(fraction * len(data)) - (kind.name == "splat")])  # a .splat ends after any row
         with pytest.raises(DyngsError, match="a\\.") as refused:
             read_splats(path)
         assert "\n" not in str(refused.value)

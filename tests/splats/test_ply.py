@@ -197,12 +197,12 @@ def test_doubles_beyond_float32_are_non_finite(tmp_path) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(share=st.floats(0, 1, exclude_max=True), fmt=st.sampled_from(["binary_little_endian", "ascii"]))
-def test_every_truncation_is_an_error(tmp_path_factory, share, fmt) -> None:
+@given(fraction=st.floats(0, 1, exclude_max=True), fmt=st.sampled_from(["binary_little_endian", "ascii"]))
+def test_every_truncation_is_an_error(tmp_path_factory, fraction, fmt) -> None:
     path = write_vertices(tmp_path_factory.mktemp("ply") / "a.ply", plain_columns(make_gaussians(3, 1)), fmt)
     whole = path.read_bytes().rstrip(b"\n") if fmt == "ascii" else path.read_bytes()
     last = whole.rfind(b" ") if fmt == "ascii" else len(whole)  # cutting digits off the last number cannot be noticed
-    path.write_bytes(whole[: int(share * last)])
+    path.write_bytes(whole[: int(fraction * last)])
     with pytest.raises(DyngsError, match=r"a\.ply"):
         read_ply(path)
 

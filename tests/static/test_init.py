@@ -102,7 +102,7 @@ def test_random_points_fill_their_cube(scene: Surroundings, options: PointsInit 
 
 @pytest.mark.parametrize(("offset", "by_convention"), [((7.0, -3.0, 11.0), True), ((0.0, 0.0, 0.0), False)])
 def test_other_random_points_lie_where_cameras_look(offset: tuple[float, float, float], by_convention: bool) -> None:
-    """Wherever the scene lies: all in three pictures or more, most of them near what all cameras look at."""
+    """Wherever the scene lies: all in three images or more, most of them near what all cameras look at."""
     scene = Surroundings(_views(offset), around_origin=by_convention)
     gaussians = initial_gaussians(scene, PointsInit(num_random=2000), StartValues(), 1, _generator())
     xyz = gaussians.means.double().numpy()

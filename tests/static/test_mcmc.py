@@ -1,4 +1,4 @@
-"""Relocation keeps the picture, the set grows to its cap, noise moves only what is nearly transparent."""
+"""Relocation keeps the image, the set grows to its cap, noise moves only what is nearly transparent."""
 
 from __future__ import annotations
 

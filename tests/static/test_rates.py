@@ -6,8 +6,8 @@ from dyngs.static.rates import Rates
 
 
 @given(st.integers(1, 1000), st.floats(0, 1))
-def test_rates_fall_once_over_training(steps: int, share: float) -> None:
-    rates, since = Rates(steps), int(share * (steps - 1))
+def test_rates_fall_once_over_training(steps: int, fraction: float) -> None:
+    rates, since = Rates(steps), int(fraction * (steps - 1))
     progress = [rates.progress(step, since) for step in range(steps + 20)]
     assert progress == sorted(progress)
     assert progress[: since + 1] == [0] * (since + 1)

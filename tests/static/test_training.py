@@ -1,11 +1,11 @@
-"""How a static scene is trained: on every picture, and its 3D filter is kept until it is due."""
+"""How a static scene is trained: on every image, and its 3D filter is kept until it is due."""
 
 from __future__ import annotations
 
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.state import part_of, tensors_of
 from dyngs.static.filters import filter_std, fuse_filter
@@ -25,14 +25,14 @@ def _camera() -> Cameras:
     return Cameras(torch.eye(4)[None], INTRINSICS[None], 100, 100)
 
 
-def _picture(time: float | None = None) -> Picture:
-    return Picture("view", _camera(), torch.zeros(100, 100, 3), None, None, time)
+def _image(time: float | None = None) -> Image:
+    return Image("view", _camera(), torch.zeros(100, 100, 3), None, None, time)
 
 
 def test_without_filter_parameters_pass_through() -> None:
     training, gaussians = StaticTraining(FilterUpdate()), _gaussians(2.0)
     scene = training.first_scene(gaussians)
-    moment = training.moment(scene, _picture(), 1)
+    moment = training.moment(scene, _image(), 1)
     assert moment.gaussians is gaussians
     assert moment.penalties == {}
     assert training.optimize(scene, 1) == 0
@@ -48,7 +48,7 @@ def test_nothing_depends_on_time() -> None:
     scene = training.first_scene(_gaussians(2.0, 7))
     assert scene.num_moving == 0
     assert training.all_moving(scene, 1.0) is scene
-    drawn = [training.moment(scene, _picture(time), 1).gaussians for time in (None, 0.0, 1.0)]
+    drawn = [training.moment(scene, _image(time), 1).gaussians for time in (None, 0.0, 1.0)]
     assert all(x is scene.gaussians for x in drawn)
 
 
@@ -63,7 +63,7 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
     with_near, with_far = (fuse_filter(far, filter_std(x.means, [_camera()])) for x in (near, far))
 
     def drawn(scene: StaticScene) -> Gaussians:
-        return training.moment(scene.with_gaussians(far), _picture(), 1).gaussians
+        return training.moment(scene.with_gaussians(far), _image(), 1).gaussians
 
     scene = training.after_step(training.first_scene(near).with_gaussians(far), 50, False)
     assert torch.equal(drawn(scene).log_scales, with_near.log_scales)
@@ -81,5 +81,5 @@ def test_state_goes_round() -> None:
     first = training.first_scene(_gaussians(2.0))
     stored = part_of(tensors_of(first.state()), "model")
     second = training.restored(_gaussians(4.0), stored, first)
-    drawn = (training.moment(scene, _picture(), 1).gaussians.log_scales for scene in (first, second))
+    drawn = (training.moment(scene, _image(), 1).gaussians.log_scales for scene in (first, second))
     assert torch.equal(*drawn)

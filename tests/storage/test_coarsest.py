@@ -1,4 +1,4 @@
-"""A file is rounded as coarsely as its pictures bear, and no more."""
+"""A file is rounded as coarsely as its images bear, and no more."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from moving_scene import write_moving_run
 
 from dyngs.build import restored_scene
 from dyngs.config.io import load_resolved
+from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import latest_checkpoint
-from dyngs.scene import Scene
 from dyngs.storage.coarsest import FACTORS, coarsest_file
 from dyngs.storage.file import decoded
 

@@ -13,16 +13,16 @@ from dyngs.config import DynamicModel, HumanModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
-from dyngs.scene import Scene
 from dyngs.state import Role, part_of
 from dyngs.static.scene import StaticScene
 from dyngs.storage.drawable import completed, drawable, stored_edit
-from dyngs.visibility import VisibilityMasks
 
 ROWS = (0, 2, 3, 6)
 

@@ -1,4 +1,4 @@
-"""How exactly a scene is stored is measured on pictures of its capture."""
+"""How exactly a scene is stored is measured on images of its capture."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:
 
 
 @pytest.mark.parametrize("moves", [True, False])
-def test_what_is_stored_changes_pictures_by_what_is_allowed(tmp_path: Path, moves: bool) -> None:
+def test_what_is_stored_changes_images_by_what_is_allowed(tmp_path: Path, moves: bool) -> None:
     run_dir = write_moving_run(tmp_path, moves=moves)
     fine, coarse = plan_of(run_dir, 0.1), plan_of(run_dir, 3.0)
     for plan, most in ((fine, 0.1), (coarse, 3.0)):
@@ -37,19 +37,19 @@ def test_what_is_stored_changes_pictures_by_what_is_allowed(tmp_path: Path, move
     assert any(a < b for a, b in steps)
 
 
-def test_the_pictures_that_are_compared_are_those_of_the_run(tmp_path: Path) -> None:
+def test_the_images_that_are_compared_are_those_of_the_run(tmp_path: Path) -> None:
     run_dir = write_moving_run(tmp_path)
     scene, plan = load_run(run_dir).scene, plan_of(run_dir, 0.5)
-    assert plan.pictures is not None
-    drawn = plan.pictures(scene)
+    assert plan.images is not None
+    drawn = plan.images(scene)
     assert len(drawn) == min(COMPARED, 5)
     assert all(x.shape == (16, 16, 3) and not x.requires_grad for x in drawn)
-    assert all(torch.equal(a, b) for a, b in zip(drawn, plan.pictures(scene), strict=True))
-    without = plan.pictures(scene.select(torch.tensor([0, 2, 4])))
+    assert all(torch.equal(a, b) for a, b in zip(drawn, plan.images(scene), strict=True))
+    without = plan.images(scene.select(torch.tensor([0, 2, 4])))
     assert any(not torch.equal(a, b) for a, b in zip(drawn, without, strict=True))
 
 
-def test_what_is_not_said_follows_the_errors_of_the_pictures(tmp_path: Path) -> None:
+def test_what_is_not_said_follows_the_errors_of_the_images(tmp_path: Path) -> None:
     allowed = plan_of(write_moving_run(tmp_path)).precision.allowed
     assert allowed is not None
     assert 0.1 < allowed < 255 * (10 ** (0.025 / 10) - 1) ** 0.5

@@ -1,4 +1,4 @@
-"""Steps are as coarse as the pictures allow."""
+"""Steps are as coarse as the images allow."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scenes import random_scene
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import render
+from dyngs.gaussians.rendering import render
 from dyngs.state import part_of
 from dyngs.static.scene import StaticScene
 from dyngs.storage.drawable import completed, drawable
@@ -20,7 +20,7 @@ from dyngs.storage.tensors import MAX_COARSENESS, Kind, coding_of, restored
 
 
 def tensors() -> dict[str, Tensor]:
-    """Of a still scene."""
+    """Of a static scene."""
     gaussians = random_scene(n=60, seed=1).to(torch.float32).gaussians
     return {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
 
@@ -31,12 +31,12 @@ def scene_of(stored: Mapping[str, Tensor]) -> StaticScene:
 
 
 def measured(stored: Mapping[str, Tensor], draw: Draw, max_change: float) -> Precision:
-    """How exactly a still scene must be stored."""
+    """How exactly a static scene must be stored."""
     return measured_precision(drawable(scene_of(stored)), draw(stored), draw, max_change)
 
 
 def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
-    """One picture."""
+    """One image."""
     fields = ("means", "quats", "log_scales", "logit_opacities", "sh")
     return [render(Gaussians(**{name: state[f"gaussians.{name}"] for name in fields}), camera()).rgb[0]]
 
@@ -67,7 +67,7 @@ def test_what_does_not_show_is_kept_finely_but_not_for_nothing() -> None:
     assert mean_size / 128 < step < mean_size / 8
 
 
-def test_without_pictures_steps_follow_the_size_of_gaussians() -> None:
+def test_without_images_steps_follow_the_size_of_gaussians() -> None:
     small = assumed_precision(scene_of(tensors()).gaussians).steps
     larger = tensors()
     larger["gaussians.log_scales"] = larger["gaussians.log_scales"] + 3
@@ -82,7 +82,7 @@ def test_coarseness_is_half_an_octave_per_octave() -> None:
 
 
 def change_after(stored: dict[str, Tensor], exact: dict[str, Tensor], steps: Mapping[str, float]) -> float:
-    """Grey levels by which rounding with ``steps`` changes the picture."""
+    """Grey levels by which rounding with ``steps`` changes the image."""
     rounded = {name: restored(x, coding_of(name, x, steps)) for name, x in exact.items()}
     before, after = draw(stored)[0].clamp(0, 1), draw(completed(rounded))[0].clamp(0, 1)
     return 255 * float((before - after).double().square().mean().sqrt())
@@ -120,7 +120,7 @@ def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
     assert coding_of("gaussians.means", means, precision.steps).kind is Kind.EXACT
 
 
-def test_a_picture_that_is_not_finite_is_not_within_what_is_allowed() -> None:
+def test_a_image_that_is_not_finite_is_not_within_what_is_allowed() -> None:
     def draw_nan(state: Mapping[str, Tensor]) -> list[Tensor]:
         return [x.fill_(torch.nan) for x in draw(state)]
 

@@ -145,9 +145,9 @@ def test_any_tensor_comes_back_within_its_bound(x: torch.Tensor, name: str, step
         assert bool((error <= 2.0**-11 * x.double().abs() + 2.0**-25).all())
     else:
         steps = torch.as_tensor(coding.steps(rows, x.ndim)).double()
-        share = 0.65 if coding.kind is Kind.SPARSE else 0.5
+        fraction = 0.65 if coding.kind is Kind.SPARSE else 0.5
         assert is_step(coding.step)
-        assert bool((error <= share * steps * (1 + 1e-12)).all())
+        assert bool((error <= fraction * steps * (1 + 1e-12)).all())
         assert bool((error[(x.double().abs() >= LIMIT * steps)] == 0).all())
 
 

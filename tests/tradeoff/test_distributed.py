@@ -30,18 +30,18 @@ NAMES = {"RANK": "1", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR":
 
 @given(st.lists(VARIANTS, unique=True, max_size=12), st.integers(1, 4))
 def test_all_is_shared_out_once(variants: list[Variant], size: int) -> None:
-    shares = [ProcessGroup(rank, size).share(variants) for rank in range(size)]
-    assert sorted(v.slug for share in shares for v in share) == sorted(v.slug for v in variants)
+    fractions = [ProcessGroup(rank, size).share(variants) for rank in range(size)]
+    assert sorted(v.slug for fraction in fractions for v in fraction) == sorted(v.slug for v in variants)
 
 
 def test_what_is_made_from_one_another_stays_together() -> None:
     tuned = Variant(prune=0.5, finetune=9)
     together = [tuned, Variant(prune=0.5, finetune=9, storage="auto"), Variant(prune=0.5, finetune=9, sh_degree=0)]
     others = [Variant(alpha_min=0.01), Variant(storage="auto"), Variant(), Variant(storage="auto", scale=0.5)]
-    shares = [ProcessGroup(rank, 2).share([*others, *together]) for rank in range(2)]
-    assert any(set(together) <= set(share) for share in shares)
-    assert any({others[1], others[3]} <= set(share) for share in shares)
-    assert all(shares)
+    fractions = [ProcessGroup(rank, 2).share([*others, *together]) for rank in range(2)]
+    assert any(set(together) <= set(fraction) for fraction in fractions)
+    assert any({others[1], others[3]} <= set(fraction) for fraction in fractions)
+    assert all(fractions)
 
 
 def test_one_process_waits_for_nobody() -> None:

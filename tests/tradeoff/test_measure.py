@@ -9,9 +9,9 @@ from moving_scene import Sliding, camera, moving_scene, still_scene
 
 from dyngs.config import StaticModel
 from dyngs.conventions import RasterizeMode
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import Lpips
-from dyngs.rendering import RenderOptions
 from dyngs.tradeoff.measure import (
     VariantRenderer,
     measure_quality,
@@ -26,9 +26,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 BLACK = torch.zeros(3)
 
 
-def picture_of(renderer: VariantRenderer, time: float = 0.0) -> Picture:
-    """A render, as a ground-truth picture."""
-    return Picture("view", camera(), renderer.picture(camera(), time).clamp(0, 1), None, None, time)
+def image_of(renderer: VariantRenderer, time: float = 0.0) -> Image:
+    """A render, as a ground-truth image."""
+    return Image("view", camera(), renderer.image(camera(), time).clamp(0, 1), None, None, time)
 
 
 def test_options_are_those_of_the_run_but_for_what_is_changed() -> None:
@@ -51,16 +51,16 @@ def test_a_shrunk_camera_sees_the_same() -> None:
 
 def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
     renderers = [VariantRenderer(still_scene(1), RenderOptions(), BLACK + 1, scale) for scale in (1.0, 0.5)]
-    pictures = [1 - renderer.picture(camera(40, 28), None).mean(2) for renderer in renderers]
-    assert [tuple(x.shape) for x in pictures] == [(28, 40), (28, 40)]
-    assert not torch.equal(*pictures)
-    across = [float((x.sum(0) * torch.arange(40)).sum() / x.sum()) for x in pictures]
+    images = [1 - renderer.image(camera(40, 28), None).mean(2) for renderer in renderers]
+    assert [tuple(x.shape) for x in images] == [(28, 40), (28, 40)]
+    assert not torch.equal(*images)
+    across = [float((x.sum(0) * torch.arange(40)).sum() / x.sum()) for x in images]
     assert across[0] == pytest.approx(across[1], abs=0.3)  # px; half a pixel's shift would be seen
 
 
 def test_quality_compares_each_view_at_its_time() -> None:
     moving = VariantRenderer(moving_scene(Sliding()), RenderOptions(), BLACK)
-    truths = [picture_of(moving, time) for time in (0.0, 0.5)]
+    truths = [image_of(moving, time) for time in (0.0, 0.5)]
     no_lpips = Lpips("alex", "not here")
     perfect = measure_quality(moving, truths, no_lpips)
     assert perfect.psnr == 100.0
@@ -74,13 +74,13 @@ def test_quality_compares_each_view_at_its_time() -> None:
 def test_lpips_is_the_mean_where_it_can_be_had() -> None:
     renderer = VariantRenderer(still_scene(), RenderOptions(), BLACK)
     distance = Lpips("alex", None, lambda a, b: (a - b).abs().mean() + 0.25)
-    assert measure_quality(renderer, [picture_of(renderer)] * 2, distance).lpips == pytest.approx(0.25)
+    assert measure_quality(renderer, [image_of(renderer)] * 2, distance).lpips == pytest.approx(0.25)
 
 
-def test_all_draw_every_picture_in_turn() -> None:
+def test_all_draw_every_image_in_turn() -> None:
     scenes = [moving_scene(Sliding()), moving_scene(Sliding())]
     renderers = [VariantRenderer(scene, RenderOptions(), BLACK) for scene in scenes]
-    views = [picture_of(renderers[0], 0.5)] * 3
+    views = [image_of(renderers[0], 0.5)] * 3
     before = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
     speeds = time_interleaved(renderers, views, rounds=2)
     after = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]

@@ -33,7 +33,7 @@ def test_points_have_names() -> None:
 
 
 def test_lines_join_the_front_and_the_values_of_a_setting() -> None:
-    """Pruning is faster and smaller; the smaller picture is neither, but a line leads there, too."""
+    """Pruning is faster and smaller; the smaller image is neither, but a line leads there, too."""
     rows = [
         row(Variant(), 30, 10, 5),
         row(Variant(prune=0.5), 29, 20, 2),

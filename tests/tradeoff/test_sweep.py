@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.train import train
@@ -96,20 +96,20 @@ def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: Va
         sweep(VariantRuns(runs.run_dir, tmp_path, 1), replace(PLAN, split="val"), lambda line: None)
 
 
-def test_on_a_card_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_gpu_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     briefly = replace(PLAN, variations=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
     expected = sweep(VariantRuns(runs.run_dir, tmp_path / "here", 1), briefly, lambda line: None)
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
-    with pretend_card():
+    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    with pretend_gpu():
         there = VariantRuns(runs.run_dir, tmp_path / "there", 1)
-        found = sweep(there, replace(briefly, device=CARD), lambda line: None)
+        found = sweep(there, replace(briefly, device=GPU), lambda line: None)
     assert [replace(x, speed=None) for x in found] == [replace(x, speed=None, memory_mb=None) for x in expected]
     with pytest.raises(DyngsError, match="another run, checkpoint, split or device"):
         sweep(there, briefly, lambda line: None)
 
 
 def test_the_report_has_every_point(points: list[Measurement], runs: VariantRuns) -> None:
-    table, values, picture, page, pixels = write_report(runs.out, points)
+    table, values, image, page, pixels = write_report(runs.out, points)
     assert pixels.read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [row["name"] for row in rows] == [p.variant.name for p in points]
@@ -118,7 +118,7 @@ def test_the_report_has_every_point(points: list[Measurement], runs: VariantRuns
     assert [Variant(**p["changes"]) for p in stored["points"]] == [p.variant for p in points]
     settings = {e["setting"] for e in stored["exchange_rates"]}
     assert settings >= {"prune", "prune + finetune", "storage", "storage + field_step"}
-    assert picture.read_text() in page.read_text()
+    assert image.read_text() in page.read_text()
     assert "src=" not in page.read_text()
 
 

@@ -1,4 +1,4 @@
-"""Training of a network on the pictures of one person: it shows them better; no step changes nothing."""
+"""Training of a network on the images of one person: it shows them better; no step changes nothing."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from dyngs.training.prediction import Filmed, human_options, new_network, scene_
 STEPS = 12
 
 
-def test_it_shows_the_pictures_better(tmp_path: Path) -> None:
-    """The error of the pictures falls, by the same every time; no step changes nothing."""
+def test_it_shows_the_images_better(tmp_path: Path) -> None:
+    """The error of the images falls, by the same every time; no step changes nothing."""
     shown = person(people(tmp_path, (1,)) / "p1")
     first, trained, again = (error_after(shown, steps) for steps in (0, STEPS, STEPS))
     assert trained < first
@@ -33,15 +33,12 @@ def error_after(shown: Filmed, steps: int) -> float:
     unchanged = all(torch.equal(x, before[name]) for name, x in network.state_dict().items())
     assert unchanged == (steps == 0)
     with torch.no_grad():
-        avatar = predict_gaussians(shown.sitter, shown.look(views), mean, network, NET.min_silhouette_share)
+        avatar = predict_gaussians(shown.sitter, shown.look(views), mean, network, NET.min_silhouette_fraction)
         scene, white = scene_of(human_options(NET), avatar, Rates(1))[0], torch.ones(3)
         return sum(
-            (
-                scene.render(picture.cameras, scene.moment(picture.time), background=white).rgb[0]
-                - picture.composite(white)
-            )
+            (scene.render(image.cameras, scene.moment(image.time), background=white).rgb[0] - image.composite(white))
             .abs()
             .mean()
             .item()
-            for picture in (shown.pictures[view] for view in views)
+            for image in (shown.images[view] for view in views)
         )

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.training.background import WEIGHT, evaluation_background, measured_alpha_weight, share_alike
 
 
@@ -28,20 +28,20 @@ def test_it_is_that_of_training(choice: str, has_alpha: bool, name: str) -> None
     assert rgb.tolist() == [1.0 if name == "white" else 0.0] * 3
 
 
-def picture(rgb: torch.Tensor, alpha: torch.Tensor | None, mask: torch.Tensor | None = None) -> Picture:
+def image(rgb: torch.Tensor, alpha: torch.Tensor | None, mask: torch.Tensor | None = None) -> Image:
     """One of straight colours (H, W, 3) and alpha (H, W)."""
     height, width = rgb.shape[:2]
     cameras = Cameras(torch.eye(4)[None], torch.eye(3)[None], width, height)
-    return Picture("a", cameras, rgb if alpha is None else rgb * alpha[..., None], alpha, mask, 0.0)
+    return Image("a", cameras, rgb if alpha is None else rgb * alpha[..., None], alpha, mask, 0.0)
 
 
-def half_opaque(level: float, num_alike: int) -> Picture:
+def half_opaque(level: float, num_alike: int) -> Image:
     """8 x 10 px, the lower half empty; of the 40 opaque ones ``num_alike`` have ``level``, the others are dark red."""
     rgb = torch.tensor([0.4, 0.0, 0.0]).repeat(8, 10, 1)
     rgb.view(-1, 3)[:num_alike] = level
     alpha = torch.ones(8, 10)
     alpha[4:] = 0.0
-    return picture(rgb, alpha)
+    return image(rgb, alpha)
 
 
 def test_the_share_of_pixels_that_look_like_the_background_is_counted() -> None:
@@ -58,15 +58,15 @@ def test_what_is_masked_or_half_transparent_does_not_count() -> None:
     white, shown = torch.ones(3), half_opaque(1.0, 20)
     mask = torch.ones(8, 10)
     mask[:2] = 0.0
-    assert share_alike([picture(shown.rgb_premultiplied, shown.alpha, mask)], white) == 0.0
-    assert share_alike([picture(torch.ones(8, 10, 3), torch.full((8, 10), 0.5))], white) is None
+    assert share_alike([image(shown.rgb_premultiplied, shown.alpha, mask)], white) == 0.0
+    assert share_alike([image(torch.ones(8, 10, 3), torch.full((8, 10), 0.5))], white) is None
 
 
 def test_without_a_background_nothing_is_measured() -> None:
-    everything = picture(torch.ones(4, 4, 3), torch.ones(4, 4))
-    for pictures in ([], [picture(torch.ones(4, 4, 3), None)], [everything]):
-        assert measured_alpha_weight(pictures, torch.ones(3)).weight == 0.0
-        assert measured_alpha_weight(pictures, torch.ones(3)).finding is None
+    everything = image(torch.ones(4, 4, 3), torch.ones(4, 4))
+    for images in ([], [image(torch.ones(4, 4, 3), None)], [everything]):
+        assert measured_alpha_weight(images, torch.ones(3)).weight == 0.0
+        assert measured_alpha_weight(images, torch.ones(3)).finding is None
 
 
 def test_silhouettes_count_where_much_looks_like_the_background() -> None:

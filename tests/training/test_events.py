@@ -8,7 +8,7 @@ import pytest
 from steps import report_of, step_done
 
 
-def test_the_quality_of_a_step_is_that_of_its_picture() -> None:
+def test_the_quality_of_a_step_is_that_of_its_image() -> None:
     assert report_of(1, 0.1).psnr == pytest.approx(20.0, abs=1e-4)
     assert report_of(1, 0.0).psnr == 100.0, "the most there is"
     assert math.isnan(report_of(1, math.nan).psnr)

@@ -142,7 +142,7 @@ def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     require_possible(NOTHING)
     with pytest.raises(DyngsError, match=r"budget.max_mb: a network"):
         require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
-    both = NOTHING.model_copy(update={"prune": PruneConfig(share=0.5), "run": RunConfig(dir=tmp_path / "run")})
+    both = NOTHING.model_copy(update={"prune": PruneConfig(fraction=0.5), "run": RunConfig(dir=tmp_path / "run")})
     with pytest.raises(DyngsError, match=r"train.minutes: .*dyngs prune"):
         train(timed(both, 5.0))
     with pytest.raises(DyngsError, match=r"train.minutes: a network"):

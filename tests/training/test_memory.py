@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 from tensor_bytes import TensorBytes
 
 from dyngs.build import assemble
@@ -43,7 +43,7 @@ from dyngs.training.memory import (
 GB = 10**9
 PLENTY = MemoryForecast(
     program=GB // 2,
-    pictures=2 * GB,
+    images=2 * GB,
     drawing=GB // 10,
     field=0,
     count=250_000,
@@ -71,32 +71,28 @@ def _config(capture: Path, **changes: object) -> Config:
     return Config(data=DataConfig(root=capture), init=RandomInit(num_random=60)).model_copy(update=changes)
 
 
-def test_on_a_card_the_scene_is_forecast_there_and_the_rest_here(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: CARD)
+def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
     monkeypatch.setattr(memory, "card_memory", lambda _: (3 * GB, 8 * GB))
     monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: (2000, 8 * GB))
     config = _config(capture, strategy=DefaultStrategy(max_gaussians=10**7), train=TrainConfig(steps=30_000))
-    with pretend_card():
+    with pretend_gpu():
         trainer = assemble(config)
-        card, machine = memory_forecasts(trainer)
+        gpu, machine = memory_forecasts(trainer)
         monkeypatch.setattr(memory, "card_memory", lambda _: (GB // 100, 8 * GB))
         small = memory_forecasts(trainer, 2)[0]
-    assert (card.free, card.whole, card.program, card.pictures) == (3 * GB, 8 * GB, 0, 500)
-    assert card.count > 60
+    assert (gpu.free, gpu.whole, gpu.program, gpu.images) == (3 * GB, 8 * GB, 0, 500)
+    assert gpu.count > 60
     assert machine.count == machine.field == 0
-    assert machine.pictures > 4 * 16 * 16 * 3 - 500
-    assert card.total + machine.total > memory_forecast(trainer).total
-    line = (
-        r"memory of the card: about [\d.]+ GB \(3 are there\): [\d.e-]+ pictures \(as many as a quarter of it keeps\), "
-    )
-    assert re.match(line, str(card))
+    assert machine.images > 4 * 16 * 16 * 3 - 500
+    assert gpu.total + machine.total > memory_forecast(trainer).total
+    line = r"memory of the GPU: about [\d.]+ GB \(3 are there\): [\d.e-]+ images \(as many as a quarter of it keeps\), "
+    assert re.match(line, str(gpu))
     assert str(machine).endswith(" drawing, no Gaussians")
     assert small.processes == 2
     warning = small.warning()
     assert warning is not None
-    assert "GB of memory of the card are needed" in warning
+    assert "GB of memory of the GPU are needed" in warning
     assert "strategy.max_gaussians=" in warning
     assert "data.cache_mb" not in warning, "it is not what limits them there"
 
@@ -105,14 +101,14 @@ def test_a_run_is_forecast_before_it_begins(capture: Path) -> None:
     found = memory_forecast(assemble(_config(capture, strategy=FixedStrategy())))
     assert found.count == found.most == 60
     assert found.each == 4 * 7 * 59
-    # four pictures, of 3 bytes a pixel, and those that are decoded ahead
-    assert 4 * 16 * 16 * 3 <= found.pictures <= 4 * 16 * 16 * 200
+    # four images, of 3 bytes a pixel, and those that are decoded ahead
+    assert 4 * 16 * 16 * 3 <= found.images <= 4 * 16 * 16 * 200
     assert found.all_kept
     assert found.warning() is None
     none = memory_forecast(
         assemble(_config(capture, data=DataConfig(root=capture, cache_mb=0), strategy=FixedStrategy()))
     )
-    assert none.pictures == 45 * 16 * 16, "what decoding one takes"
+    assert none.images == 45 * 16 * 16, "what decoding one takes"
     assert not none.all_kept
 
 
@@ -127,7 +123,7 @@ def test_it_is_told_in_a_line_and_too_little_in_another() -> None:
     assert "3 GB of memory are needed, and 1.5 are there: give data.cache_mb=" in warning
     # with what it says, the run has room
     cache_mb = float(warning.split("data.cache_mb=")[1].split()[0])
-    assert replace(PLENTY, free=GB, pictures=round(1e6 * cache_mb)).warning() is None
+    assert replace(PLENTY, free=GB, images=round(1e6 * cache_mb)).warning() is None
 
 
 def _with(forecast: MemoryForecast, advice: str) -> MemoryForecast:
@@ -135,7 +131,7 @@ def _with(forecast: MemoryForecast, advice: str) -> MemoryForecast:
     for key, value in re.findall(r"([a-z_]+[.][a-z_]+)=(\d+)", advice):
         match key:
             case "data.cache_mb":
-                forecast = replace(forecast, pictures=min(forecast.pictures, 10**6 * int(value)))
+                forecast = replace(forecast, images=min(forecast.images, 10**6 * int(value)))
             case "strategy.max_gaussians":
                 forecast = replace(forecast, count=min(forecast.count, int(value)))
             case "data.longest_side":
@@ -147,14 +143,14 @@ def _with(forecast: MemoryForecast, advice: str) -> MemoryForecast:
 
 
 @pytest.mark.parametrize("count", [1000, 3_000_000])
-@pytest.mark.parametrize("pictures", [0, 8 * GB])
+@pytest.mark.parametrize("images", [0, 8 * GB])
 @pytest.mark.parametrize("drawing", [GB // 100, 5 * GB])
 @pytest.mark.parametrize("free", [GB // 2, 3 * GB])
 @pytest.mark.parametrize("processes", [1, 2])
 def test_with_what_a_warning_says_the_run_has_room(
-    count: int, pictures: int, drawing: int, free: int, processes: int
+    count: int, images: int, drawing: int, free: int, processes: int
 ) -> None:
-    parts = {"count": count, "pictures": pictures, "drawing": drawing, "free": free, "processes": processes}
+    parts = {"count": count, "images": images, "drawing": drawing, "free": free, "processes": processes}
     forecast = replace(PLENTY, **parts)
     warning = forecast.warning()
     if warning is None:
@@ -165,7 +161,7 @@ def test_with_what_a_warning_says_the_run_has_room(
 
 
 def test_the_key_that_limits_the_gaussians_is_that_of_the_run(capture: Path) -> None:
-    free = replace(PLENTY, pictures=0, count=10**7, free=GB)
+    free = replace(PLENTY, images=0, count=10**7, free=GB)
     assert "give strategy.max_gaussians=" in (free.warning() or "")
     found = replace(free, limits=("model.resolution", 2000)).warning()
     assert found is not None
@@ -204,7 +200,7 @@ def _peak(config: Config, steps: int) -> tuple[int, int]:
     """The most bytes of tensors in a run of ``steps``, in which all may move, and the number of Gaussians."""
     with TensorBytes() as found:
         trainer = assemble(config)
-        if not trainer.scene.is_still or trainer.scene.times:
+        if not trainer.scene.is_static or trainer.scene.times:
             trainer.scene = trainer.training.all_moving(trainer.scene, trainer.extent)
             trainer.done = 25  # past the step at which motion begins
         found.most = found.now

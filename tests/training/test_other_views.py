@@ -36,14 +36,14 @@ def test_where_too_few_see_a_place_nothing_is_known(case: dict[str, float]) -> N
 
 
 def test_colours_lie_on_the_background_and_masked_cells_do_not_count() -> None:
-    picture = seen_from(cameras_before_wall(1))[0]
+    image = seen_from(cameras_before_wall(1))[0]
     alpha, mask = (
-        torch.zeros_like(picture.rgb_premultiplied[..., 0]),
-        torch.ones_like(picture.rgb_premultiplied[..., 0]),
+        torch.zeros_like(image.rgb_premultiplied[..., 0]),
+        torch.ones_like(image.rgb_premultiplied[..., 0]),
     )
     mask[:, :40] = 0
-    empty = type(picture)("e", picture.cameras, torch.zeros_like(learned(picture.cameras)), alpha, mask, None)
-    colours, counts = OtherViews([empty], [picture.cameras]).cells_of(0, torch.tensor([0.2, 0.4, 0.6]))  # type: ignore[arg-type]
+    empty = type(image)("e", image.cameras, torch.zeros_like(learned(image.cameras)), alpha, mask, None)
+    colours, counts = OtherViews([empty], [image.cameras]).cells_of(0, torch.tensor([0.2, 0.4, 0.6]))  # type: ignore[arg-type]
     assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand_as(colours))
     assert not bool(counts[:, :20].any())
     assert bool(counts[:, 20:].all())
@@ -67,7 +67,7 @@ def test_places_are_found_by_cameras_as_they_are_by_now() -> None:
     more = torch.stack([torch.full_like(rgb[..., 0], DISTANCE), torch.ones_like(rgb[..., 0])], -1)
     grid = grid_of(rgb.shape[1], rgb.shape[0])
     drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
-    which, pictures = torch.ones(grid, dtype=torch.bool), seen_from(right)
-    given = OtherViews(pictures, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
-    found = OtherViews(pictures, wrong, lambda i, _: right[i]).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
+    which, images = torch.ones(grid, dtype=torch.bool), seen_from(right)
+    given = OtherViews(images, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
+    found = OtherViews(images, wrong, lambda i, _: right[i]).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
     assert torch.equal(found, given)

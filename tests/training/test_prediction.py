@@ -53,7 +53,7 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) ->
 
 
 def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
-    """Of the same person, pictures and background, before and after 20 steps."""
+    """Of the same person, images and background, before and after 20 steps."""
     long = config(folder, tmp_path)
     trainer = assembled(long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})}))
     losses = [trainer.step().loss for _ in range(24)]
@@ -78,7 +78,7 @@ def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_pa
 
 
 def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
-    """Every other one of fewer pictures."""
+    """Every other one of fewer images."""
     trainer = assembled(config(folder, tmp_path, source_sets=4, source_views=3))
     assert [[len(choice) for choice in person.choices] for person in trainer.people] == [[3, 1, 3, 2]] * 2
     same = assembled(config(folder, tmp_path, source_sets=4, source_views=2, fewest_views=2))

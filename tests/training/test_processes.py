@@ -14,9 +14,9 @@ from dyngs.training.processes import Processes, _checksum, numbers_of_torchrun
 
 def test_views_are_shared_evenly_in_order_and_each_once() -> None:
     for size, batch in ((1, 1), (1, 5), (2, 2), (4, 12)):
-        shares = [Processes(rank, size).share(batch) for rank in range(size)]
-        assert [view for share in shares for view in share] == list(range(batch))
-        assert len({len(share) for share in shares}) == 1
+        fractions = [Processes(rank, size).share(batch) for rank in range(size)]
+        assert [view for fraction in fractions for view in fraction] == list(range(batch))
+        assert len({len(fraction) for fraction in fractions}) == 1
     with pytest.raises(DyngsError, match="batch_size=3 views cannot be shared evenly among 2 processes; give a mult"):
         Processes(0, 2).share(3)
     with pytest.raises(DyngsError, match="cannot be shared"):

@@ -19,8 +19,8 @@ from dyngs.training.schedule import (
     filter_steps,
     grad_threshold,
     growth_per_change,
+    image_divisor,
     means_rate,
-    picture_divisor,
 )
 
 
@@ -137,11 +137,11 @@ def test_short_runs_stay_still_for_longer(steps: int, fine: int) -> None:
 @pytest.mark.parametrize(
     ("coarsest", "expected"), [(1, {1}), (2, {2, 1}), (8, {8, 4, 2, 1})], ids=["never", "one level", "three levels"]
 )
-def test_pictures_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None:
+def test_images_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None:
     options = TrainConfig.model_validate(
         {"steps": 1000, "initial_downscale": coarsest, "resolution_grows_from": 0.3, "resolution_full_at": 0.6}
     )
-    divisors = [picture_divisor(options, step) for step in range(1, 1001)]
+    divisors = [image_divisor(options, step) for step in range(1, 1001)]
     assert set(divisors) == expected
     assert divisors == sorted(divisors, reverse=True)
     assert set(divisors[:299]) == {coarsest}
@@ -150,8 +150,8 @@ def test_pictures_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> No
         assert [divisors.index(x) + 1 for x in (4, 2, 1)] == [300, 450, 600]
 
 
-def test_pictures_may_sharpen_at_once() -> None:
+def test_images_may_sharpen_at_once() -> None:
     """Also where the last halving is asked for before the first."""
     for to in (0.5, 0.2):
         options = TrainConfig(steps=10, initial_downscale=4, resolution_grows_from=0.5, resolution_full_at=to)
-        assert [picture_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6
+        assert [image_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6

@@ -7,7 +7,7 @@ import torch
 from scenes import random_scene
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.training.step_check import StepCheck
 
@@ -16,37 +16,37 @@ MOVES_BY = "field", "model.deform"
 
 
 @pytest.fixture
-def picture() -> Picture:
+def image() -> Image:
     cameras = Cameras(torch.eye(4)[None], torch.eye(3)[None], 2, 2)
-    return Picture("r_7", cameras, torch.zeros(2, 2, 3), alpha=None, mask=None, time=0.25)
+    return Image("r_7", cameras, torch.zeros(2, 2, 3), alpha=None, mask=None, time=0.25)
 
 
-def test_the_loss_is_the_sum_of_its_terms(picture: Picture) -> None:
-    terms = {"picture": torch.tensor(0.5, requires_grad=True), "alpha": torch.tensor(0.125, dtype=torch.float64)}
-    assert StepCheck(terms, random_scene().gaussians, CPU).loss(3, picture, MOVES_BY) == 0.625
-    assert StepCheck(terms, None, CPU).loss(3, picture, MOVES_BY) == 0.625
+def test_the_loss_is_the_sum_of_its_terms(image: Image) -> None:
+    terms = {"image": torch.tensor(0.5, requires_grad=True), "alpha": torch.tensor(0.125, dtype=torch.float64)}
+    assert StepCheck(terms, random_scene().gaussians, CPU).loss(3, image, MOVES_BY) == 0.625
+    assert StepCheck(terms, None, CPU).loss(3, image, MOVES_BY) == 0.625
 
 
-def test_the_value_is_that_of_the_moment_of_asking(picture: Picture) -> None:
+def test_the_value_is_that_of_the_moment_of_asking(image: Image) -> None:
     term = torch.tensor(0.5)
-    check = StepCheck({"picture": term}, None, CPU)
+    check = StepCheck({"image": term}, None, CPU)
     term.fill_(torch.nan)
-    assert check.loss(3, picture, MOVES_BY) == 0.5
+    assert check.loss(3, image, MOVES_BY) == 0.5
 
 
-@pytest.mark.parametrize(("name", "advice"), [("picture", "look at that picture"), ("alpha", "lower its weight")])
+@pytest.mark.parametrize(("name", "advice"), [("image", "look at that image"), ("alpha", "lower its weight")])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_a_term_that_is_not_finite_is_named(picture: Picture, name: str, advice: str, value: float) -> None:
-    terms = {"picture": torch.tensor(0.5), "alpha": torch.tensor(0.1)} | {name: torch.tensor(value)}
+def test_a_term_that_is_not_finite_is_named(image: Image, name: str, advice: str, value: float) -> None:
+    terms = {"image": torch.tensor(0.5), "alpha": torch.tensor(0.1)} | {name: torch.tensor(value)}
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': the loss term '{name}' is {value}; {advice}"):
-        StepCheck(terms, None, CPU).loss(3, picture, MOVES_BY)
+        StepCheck(terms, None, CPU).loss(3, image, MOVES_BY)
 
 
-def test_gaussians_that_are_not_finite_come_first(picture: Picture) -> None:
+def test_gaussians_that_are_not_finite_come_first(image: Image) -> None:
     """They are the cause of whatever else is not."""
     gaussians = random_scene().gaussians
     gaussians.means[3, 1], gaussians.quats[0, 0] = torch.nan, torch.inf
-    terms = {"picture": torch.tensor(torch.nan)}
+    terms = {"image": torch.tensor(torch.nan)}
     message = r"the field makes means, quats at 0\.25 not finite; lower the rates in model\.deform$"
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': {message}"):
-        StepCheck(terms, gaussians, CPU).loss(3, picture, MOVES_BY)
+        StepCheck(terms, gaussians, CPU).loss(3, image, MOVES_BY)

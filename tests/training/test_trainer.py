@@ -28,17 +28,17 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.data.loader import Picture
-from dyngs.data.pictures.images import read_picture
+from dyngs.data.images.images import read_image
+from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import write_tensors
 from dyngs.files.write import write_image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.rendering import RenderOptions, render
+from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.gaussians.scene import Moment, Scene, SceneTraining
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
-from dyngs.scene import Moment, Scene, SceneTraining
 from dyngs.state import Role, State, with_role
 from dyngs.training.trainer import Trainer
 
@@ -71,7 +71,7 @@ class _LiftedScene(Scene):
         return ()
 
     @property
-    def is_still(self) -> bool:
+    def is_static(self) -> bool:
         return False
 
     @property
@@ -100,9 +100,9 @@ class _Lifted:
     def trains_on(self, time: float | None, step: int) -> bool:
         return True
 
-    def moment(self, scene: _LiftedScene, picture: Picture, step: int) -> Moment:
+    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
         penalties = {"height": self.penalty * scene.gaussians.means[:, 2].abs().sum()} if self.penalty else {}
-        return replace(scene.moment(picture.time), penalties=penalties)
+        return replace(scene.moment(image.time), penalties=penalties)
 
     def optimize(self, scene: _LiftedScene, step: int) -> int:
         self.steps.append(step)
@@ -261,7 +261,7 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
             findings[step] = report.finding
             dropped = trainer.colours.frozen_rest()
         if step <= MEASURED_AFTER:
-            seen.add(report.picture.name)
+            seen.add(report.image.name)
     assert len(seen) == 6
     assert list(findings) == [MEASURED_AFTER]
     assert len(counts) > 4
@@ -284,7 +284,7 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
     assert trainer.scene.gaussians.sh_degree == 0
     scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.colours.network
     assert network is not None
-    camera = trainer.pictures[0].cameras
+    camera = trainer.images[0].cameras
     gaussians, shader = trainer.scene.gaussians.detach(), network.shader(None, None)
     drawn = scene.render(camera, options=RenderOptions(), background=torch.zeros(3)).rgb
     assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
@@ -296,19 +296,19 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
 class _Exploding(_Lifted):
     """From step 3 on it draws positions and rotations that are not finite."""
 
-    def moment(self, scene: _LiftedScene, picture: Picture, step: int) -> Moment:
+    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
         if step < 3:
-            return super().moment(scene, picture, step)
+            return super().moment(scene, image, step)
         now, factor = scene.gaussians, float("nan")
-        return Moment(now.replace(means=now.means * factor, quats=now.quats * factor), picture.time)
+        return Moment(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
 
 
 class _Overweight(_Lifted):
     """From step 3 on it has an infinite penalty."""
 
-    def moment(self, scene: _LiftedScene, picture: Picture, step: int) -> Moment:
+    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
         self.penalty = 0.0 if step < 3 else float("inf")
-        return super().moment(scene, picture, step)
+        return super().moment(scene, image, step)
 
 
 def _stops_in_step_3(trainer: Trainer) -> str:
@@ -347,7 +347,7 @@ def test_only_times_that_the_training_wants_are_trained_on(tmp_path: Path) -> No
             return time is not None and time <= 0.1 * step
 
     trainer = _trained_by(_trainer(write_timed_capture(tmp_path)), _Early())
-    seen = [trainer.step().picture.time for _ in range(40)]
+    seen = [trainer.step().image.time for _ in range(40)]
     assert all(time is not None and time <= 0.1 * (i + 1) for i, time in enumerate(seen))
     assert set(seen[20:]) == set(TRAIN_TIMES)
 
@@ -355,8 +355,8 @@ def test_only_times_that_the_training_wants_are_trained_on(tmp_path: Path) -> No
 @pytest.mark.parametrize(("choice", "value"), [("white", 1.0), ("black", 0.0), ("auto", 1.0)])
 def test_truth_and_render_share_the_background(capture: Path, choice: str, value: float) -> None:
     report = _trainer(capture, background=choice).step()
-    assert report.picture.alpha is not None
-    empty = report.picture.alpha == 0
+    assert report.image.alpha is not None
+    empty = report.image.alpha == 0
     assert empty.any()
     assert (report.truth[empty] == value).all()
 
@@ -366,8 +366,8 @@ def test_a_random_background_is_new_in_each_step(capture: Path) -> None:
     colours = []
     for _ in range(3):
         report = trainer.step()
-        assert report.picture.alpha is not None
-        shown = report.truth[report.picture.alpha == 0].unique(dim=0)
+        assert report.image.alpha is not None
+        shown = report.truth[report.image.alpha == 0].unique(dim=0)
         assert len(shown) == 1
         colours.append(tuple(shown[0].tolist()))
     assert len(set(colours)) == 3
@@ -413,12 +413,12 @@ def test_a_state_that_does_not_fit_is_one_line(
     trainer.step()
 
 
-def with_pictures(capture: Path, out: Path, edit: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None) -> Path:
-    """Return a copy of a capture whose training pictures are edited, and have a mask."""
+def with_images(capture: Path, out: Path, edit: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None) -> Path:
+    """Return a copy of a capture whose training images are edited, and have a mask."""
     shutil.copytree(capture, out)
     frames = json.loads((out / "transforms_train.json").read_text())
     for view in read_capture(out).splits["train"]:
-        write_image(view.image_path, edit(read_picture(view.image_path).numpy()))
+        write_image(view.image_path, edit(read_image(view.image_path).numpy()))
     if mask is not None:
         write_image(out / "mask.png", mask)
         frames["frames"] = [frame | {"mask_path": "mask.png"} for frame in frames["frames"]]
@@ -447,7 +447,7 @@ def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> N
         return edit
 
     nothing, ignored, counting = (
-        trained_state(with_pictures(capture, tmp_path / name, repainted(columns), mask))
+        trained_state(with_images(capture, tmp_path / name, repainted(columns), mask))
         for name, columns in (("a", slice(0, 0)), ("b", slice(8, 16)), ("c", slice(0, 8)))
     )
     assert all(torch.equal(x, ignored[name]) for name, x in nothing.items())
@@ -465,7 +465,7 @@ def test_what_is_transparent_is_trained_on_as_background(capture: Path, tmp_path
         return edit
 
     dark, light, opaque = (
-        trained_state(with_pictures(capture, tmp_path / name, edit, None))
+        trained_state(with_images(capture, tmp_path / name, edit, None))
         for name, edit in (("a", transparent(0, 0)), ("b", transparent(200, 0)), ("c", transparent(200, 255)))
     )
     assert all(torch.equal(x, light[name]) for name, x in dark.items())

@@ -12,7 +12,7 @@ from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.build import assemble
 from dyngs.config import Config, ControlNodesField
-from dyngs.scene import Variant
+from dyngs.gaussians.scene import Variant
 from dyngs.training import trial
 from dyngs.training.processes import Processes
 from dyngs.training.state import Checkpoint, CheckpointInfo
@@ -23,7 +23,7 @@ MEAN_PSNR = trial._mean_psnr
 
 
 class Runner:
-    """As a trainer whose scene is one number in place, whose pictures are as good as it is, and who learns 1 a step."""
+    """As a trainer whose scene is one number in place, whose images are as good as it is, and who learns 1 a step."""
 
     def __init__(self) -> None:
         self.scene, self.done, self.bad_gradients = torch.tensor([20.0]), 7, 3

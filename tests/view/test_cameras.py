@@ -23,7 +23,7 @@ def test_a_pose_goes_to_the_browser_and_back() -> None:
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 20 / 14, 3.0])
-def test_a_window_shows_the_whole_picture(aspect: float) -> None:
+def test_a_window_shows_the_whole_image(aspect: float) -> None:
     one = camera()
     half = math.tan(fitting_fov(one, aspect) / 2)
     assert half >= 0.5 * 14 / 20 - 1e-9

@@ -12,7 +12,7 @@ def test_frusta_are_spread_over_the_cameras(count: int, most: int, chosen: list[
     assert spread(count, most) == chosen
 
 
-def test_a_standing_camera_is_shown_once() -> None:
+def test_a_fixed_camera_is_shown_once() -> None:
     poses = np.tile(np.eye(4), (6, 1, 1))
     poses[[1, 3], 0, 3] = 1.0
     poses[5, 2, 3] = 2.0
@@ -21,7 +21,7 @@ def test_a_standing_camera_is_shown_once() -> None:
 
 def test_frusta_are_as_small_as_the_cameras_stand_close() -> None:
     poses = np.tile(np.eye(4), (4, 1, 1))
-    assert frustum_size(poses, 4.0) == pytest.approx(0.2)  # one standing camera
+    assert frustum_size(poses, 4.0) == pytest.approx(0.2)  # one fixed camera
     poses[:, 0, 3] = [-1, 1, -1, 1]
     assert frustum_size(poses, 4.0) == pytest.approx(0.15)
     assert frustum_size(100 * poses, 4.0) == pytest.approx(0.2)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import MOVING_ROWS, camera, still_scene, write_moving_run
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 from view_sessions import balls
 
 from dyngs.output.render_job import render_frame
@@ -26,7 +26,7 @@ def test_colours_are_those_of_dyngs_render() -> None:
 
 @pytest.mark.parametrize("layer", LAYERS)
 @pytest.mark.parametrize("part", PARTS)
-def test_every_layer_of_every_part_is_a_picture(layer: str, part: str) -> None:
+def test_every_layer_of_every_part_is_a_image(layer: str, part: str) -> None:
     for viewed in (balls(), replace(balls(), scene=still_scene())):
         shown = draw(viewed, Shot(camera(), 0.5, layer, part))  # type: ignore[arg-type]
         assert shown.shape == (14, 20, 3)
@@ -34,12 +34,12 @@ def test_every_layer_of_every_part_is_a_picture(layer: str, part: str) -> None:
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_a_card_draws_every_layer_alike(run: Viewed, layer: str) -> None:
+def test_a_gpu_draws_every_layer_alike(run: Viewed, layer: str) -> None:
     view = 0 if layer in ("colour", "error") else None
     shots = [Shot(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
     expected = [draw(run, shot) for shot in shots]
-    with pretend_card():
-        there = run.on(CARD)
+    with pretend_gpu():
+        there = run.on(GPU)
         found = [draw(there, shot) for shot in shots]
     for a, b in zip(found, expected, strict=True):
         assert np.array_equal(a, b)
@@ -76,9 +76,9 @@ def test_the_truth_fits_the_window(run: Viewed, size: tuple[int, int]) -> None:
     assert truth.shape == (size[1], size[0], 3)
     inside = ~np.isnan(truth).any(-1)
     side = min(size)
-    assert inside.sum() == side * side  # the pictures are square
-    assert run.footage.pictures is not None
-    mean = run.footage.pictures[0].composite(run.background).mean((0, 1)).numpy()
+    assert inside.sum() == side * side  # the images are square
+    assert run.footage.images is not None
+    mean = run.footage.images[0].composite(run.background).mean((0, 1)).numpy()
     assert truth[inside].mean(0) == pytest.approx(mean, abs=0.02)
 
 
@@ -101,7 +101,7 @@ def test_the_error_is_that_of_render_and_truth(run: Viewed) -> None:
     assert np.corrcoef(error.ravel(), np.minimum(wanted * 4, 1).ravel())[0, 1] > 0.9
 
 
-def test_beside_the_true_picture_it_is_darker(run: Viewed) -> None:
+def test_beside_the_true_image_it_is_darker(run: Viewed) -> None:
     wide = draw(run, Shot(camera(96, 48), view=0, divide=1.0))
     assert wide[:, :20].mean() <= 128
     assert wide[:, 40:56].mean() > 128

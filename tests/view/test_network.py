@@ -21,12 +21,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_a_person_is_predicted_from_the_pictures_that_are_picked(folder: Path) -> None:
+def test_a_person_is_predicted_from_the_images_that_are_picked(folder: Path) -> None:
     assert is_network(folder / "net")
     source = open_source(folder / "net")
     assert source.network is not None
     person = source.names[0]
-    names = source.network.pictures_of(person)
+    names = source.network.images_of(person)
     viewed = source.network.predict(person, names[:2])
     assert person_in(viewed) is not None
     assert all(name in viewed.notes[-1] for name in names[:2])

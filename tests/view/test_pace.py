@@ -4,7 +4,7 @@ from dyngs.view.pace import SMALLEST_AREA, Pace, size_within
 
 
 def run(pace: Pace, fixed: float, per_pixel: float, full: int = 800 * 600, count: int = 40) -> float:
-    """The area that settles where a picture takes ``fixed + per_pixel * pixels`` seconds, refined now and then."""
+    """The area that settles where an image takes ``fixed + per_pixel * pixels`` seconds, refined now and then."""
     for i in range(count):
         area = pace.next_area(full, None)
         pace.observe(area, fixed + per_pixel * area, is_refined=False)
@@ -13,7 +13,7 @@ def run(pace: Pace, fixed: float, per_pixel: float, full: int = 800 * 600, count
     return pace.next_area(full, None)
 
 
-def test_pictures_take_as_long_as_they_may() -> None:
+def test_images_take_as_long_as_they_may() -> None:
     assert 0.01 + 1e-6 * run(Pace(0.07), 0.01, 1e-6) == pytest.approx(0.07, rel=0.05)
 
 
@@ -21,16 +21,16 @@ def test_a_fast_scene_is_always_drawn_whole() -> None:
     assert run(Pace(0.07), 1e-4, 1e-9) == 800 * 600
 
 
-def test_pictures_do_not_vanish_where_gaussians_take_all_the_time() -> None:
+def test_images_do_not_vanish_where_gaussians_take_all_the_time() -> None:
     area = run(Pace(0.07), 0.2, 1e-6)
     assert area == pytest.approx(0.1 / 1e-6, rel=0.1)  # half as long for the pixels as for the Gaussians
 
 
-def test_a_hopeless_scene_keeps_the_smallest_pictures() -> None:
+def test_a_hopeless_scene_keeps_the_smallest_images() -> None:
     assert run(Pace(0.07), 0.0, 1.0) == SMALLEST_AREA
 
 
-def test_a_still_picture_is_refined_in_steps_up_to_the_whole() -> None:
+def test_a_still_image_is_refined_in_steps_up_to_the_whole() -> None:
     pace, area, steps = Pace(0.07), 20_000.0, 0
     while area < 1_000_000:
         area, steps = pace.next_area(1_000_000, area), steps + 1
@@ -38,7 +38,7 @@ def test_a_still_picture_is_refined_in_steps_up_to_the_whole() -> None:
     assert steps == 3
 
 
-def test_no_picture_takes_longer_than_the_longest() -> None:
+def test_no_image_takes_longer_than_the_longest() -> None:
     pace = Pace(0.05, longest=0.3)
     run(pace, 0.05, 1e-6, full=2_000_000)
     assert pace.largest == pytest.approx(0.25 / 1e-6, rel=0.05)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import camera
-from pretend_card import CARD, pretend_card
+from pretend_gpu import GPU, pretend_gpu
 from scene_kinds import scene_of_kind
 
 from dyngs.errors import DyngsError
@@ -22,7 +22,7 @@ def viewed() -> Viewed:
 def test_sliders_at_zero_are_the_rest_pose(viewed: Viewed) -> None:
     rest = in_motion(viewed, AT_REST, {}, {"neck": (90.0, 0, 0)})  # sliders do not count
     zero = in_motion(viewed, BY_SLIDERS, {}, {"neck": (0.0, 0, 0)})
-    assert rest.is_still
+    assert rest.is_static
     assert torch.allclose(rest.scene.at(None).means, zero.scene.at(None).means, atol=1e-6)
     assert in_motion(viewed, AS_CAPTURED, {}, {}) is viewed
 
@@ -34,12 +34,12 @@ def test_a_turned_joint_moves_some_of_the_person(viewed: Viewed) -> None:
     assert torch.allclose(back, rest, atol=1e-4)
 
 
-def test_a_person_on_a_card_is_posed_there(viewed: Viewed) -> None:
+def test_a_person_on_a_gpu_is_posed_there(viewed: Viewed) -> None:
     angles = {"neck": (30.0, 0.0, 0.0)}
     expected = in_motion(viewed, BY_SLIDERS, {}, angles).scene.at(None).means
-    with pretend_card():
-        posed_there = in_motion(viewed.on(CARD), BY_SLIDERS, {}, angles).scene.at(None).means
-        assert posed_there.device == CARD
+    with pretend_gpu():
+        posed_there = in_motion(viewed.on(GPU), BY_SLIDERS, {}, angles).scene.at(None).means
+        assert posed_there.device == GPU
         found = posed_there.cpu()
     assert torch.equal(found, expected)
 
@@ -68,4 +68,4 @@ def test_motion_files_are_found_by_suffix(tmp_path: Path) -> None:
 def test_a_motion_that_cannot_be_read_is_one_line(viewed: Viewed, tmp_path: Path) -> None:
     assert viewed.run is None
     shown = in_motion(replace(viewed, run=None), "walk.npz", {"walk.npz": tmp_path / "walk.npz"}, {})
-    assert shown.is_still  # without a run, which holds the template, only poses
+    assert shown.is_static  # without a run, which holds the template, only poses

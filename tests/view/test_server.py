@@ -52,7 +52,7 @@ def until(is_so: Callable[[], bool], page: Page | None = None, seconds: float = 
 
 
 def opened(viewer: Viewer, browser: Browser) -> tuple[Page, Browsing]:
-    """A page whose picture is complete."""
+    """A page whose image is complete."""
     known = viewer.browsing
     page = browser.open(f"{viewer.link}?fixedDpr=1", *SIZE)  # viser draws fewer pixels where the browser is slow
     until(lambda: len(viewer.browsing) > len(known), page)
@@ -122,7 +122,7 @@ def test_two_browsers_have_cameras_of_their_own_and_one_may_go(viewer: Viewer, b
         page.click("text=Play")
     sent = second.num_sent
     until(lambda: second.num_sent > sent + 3, two)
-    one.close()  # while it gets pictures
+    one.close()  # while it gets images
     until(lambda: len(viewer.browsing) == 1, two)
     sent = second.num_sent
     until(lambda: second.num_sent > sent + 3, two)

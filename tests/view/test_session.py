@@ -5,7 +5,7 @@ import pytest
 import torch
 from moving_scene import Sliding, camera, moving_scene, still_scene
 
-from dyngs.scene import Scene
+from dyngs.gaussians.scene import Scene
 from dyngs.view.cameras import camera_at, pose_of
 from dyngs.view.layers import Shot, draw
 from dyngs.view.pace import STILL_AFTER
@@ -64,14 +64,14 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     looked.after(0)
     first = looked.sent[0]
     assert not first.is_refined
-    assert first.picture.shape[0] < 600
+    assert first.image.shape[0] < 600
     due = looked.session.due()
     assert due is not None
     assert 0 < due <= STILL_AFTER
     looked.after(due)
     looked.after(0.1)
     assert looked.sent[-1].is_refined
-    assert looked.sent[-1].picture.shape == (600, 800, 3)
+    assert looked.sent[-1].image.shape == (600, 800, 3)
     assert looked.session.due() is None
     looked.session.move(eye(size=(800, 600)))  # the same
     assert looked.session.due() is None
@@ -85,7 +85,7 @@ def test_the_newest_camera_wins() -> None:
         looked.session.move(eye(x))
     looked.after(0)
     assert len(looked.sent) == 1
-    small = looked.sent[0].picture
+    small = looked.sent[0].image
     wanted = draw(viewed(), Shot(eye(0.3).camera((small.shape[1], small.shape[0])), 0.0))
     assert np.array_equal(small, wanted)
 
@@ -98,13 +98,13 @@ def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
     assert looked.session.due() is None
     before = len(looked.sent)
     looked.session.change_timeline(playing=True, loops=False)
-    pictures = []
+    images = []
     for _ in range(4):
         looked.clock.now += 1.0
         looked.session.draw_next()
-        pictures.append(looked.sent[-1].picture)
+        images.append(looked.sent[-1].image)
     assert len(looked.sent) == before + 4
-    assert not np.array_equal(pictures[0], pictures[1])
+    assert not np.array_equal(images[0], images[1])
     looked.after(5)
     assert not looked.session.timeline.playing  # the end
     assert looked.session.time == 1.0
@@ -167,10 +167,10 @@ def test_the_scene_in_training_is_drawn_again_as_large_as_it_was() -> None:
     looked.session.move(eye())
     looked.after(1)
     looked.after(1)
-    whole = looked.sent[-1].picture.shape
+    whole = looked.sent[-1].image.shape
     looked.session.take(viewed(), refreshes=False)
     assert looked.session.due() is None
     looked.session.take(replace(viewed(), name="later"), refreshes=True)
     looked.after(1)
     assert looked.sent[-1].is_refined
-    assert looked.sent[-1].picture.shape == whole
+    assert looked.sent[-1].image.shape == whole

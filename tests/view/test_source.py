@@ -14,7 +14,7 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     (tmp_path / "broken" / "config.yaml").write_text("model: 3")
     source = open_source(tmp_path)
     assert source.names == ("a/deep/run", "b/run")
-    assert not source.load("b/run").is_still
+    assert not source.load("b/run").is_static
     assert source.load("b/run").name == "b/run"
     next((tmp_path / "a/deep/run/checkpoints").iterdir()).write_bytes(b"damaged")
     first = first_of(source)

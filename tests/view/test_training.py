@@ -10,7 +10,7 @@ import dyngs
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.drawer import Drawer
+from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Session
 from dyngs.view.training import DrawnBetweenSteps
 from dyngs.view.viewed import viewed_training
@@ -21,9 +21,9 @@ class Onlooker:
 
     def __init__(self) -> None:
         self.drawer = Drawer(lambda session, message: pytest.fail(message))
-        ticks = itertools.count(step=100.0)  # a picture is due after each step, however fast the machine is
+        ticks = itertools.count(step=100.0)  # an image is due after each step, however fast the machine is
         self.clock = lambda: next(ticks)
-        self.drawn = DrawnBetweenSteps(self.drawer, share=0.9, clock=self.clock)
+        self.drawn = DrawnBetweenSteps(self.drawer, fraction=0.9, clock=self.clock)
         self.seen: list[bytes] = []
 
     def __call__(self, event: Event) -> None:
@@ -32,8 +32,8 @@ class Onlooker:
                 trainer = event.loop.trainer
                 assert isinstance(trainer, Trainer)
                 if event.step == 2:
-                    first = viewed_training("run", trainer.config, trainer.scene, trainer.pictures, torch.ones(3))
-                    session = Session(first, lambda sent: self.seen.append(sent.picture.tobytes()), clock=self.clock)
+                    first = viewed_training("run", trainer.config, trainer.scene, trainer.images, torch.ones(3))
+                    session = Session(first, lambda sent: self.seen.append(sent.image.tobytes()), clock=self.clock)
                     self.drawer.add(session)
                 for session in self.drawer.sessions:
                     session.change(divide=event.step / 1000)
@@ -56,7 +56,7 @@ def test_training_gives_the_same_bytes_whoever_looks(preset: str, tmp_path: Path
     assert len(set(onlooker.seen)) > 2
 
 
-def test_pictures_take_no_more_than_their_share() -> None:
+def test_images_take_no_more_than_their_share() -> None:
     threads = threading.active_count()
     now, drawer = [0.0], Drawer(lambda session, message: None)
     session, sent = looking_at_balls()
@@ -66,7 +66,7 @@ def test_pictures_take_no_more_than_their_share() -> None:
         now[0] += 0.01  # whatever is done takes a while
         return now[0]
 
-    drawn = DrawnBetweenSteps(drawer, share=0.25, clock=clock)
+    drawn = DrawnBetweenSteps(drawer, fraction=0.25, clock=clock)
     assert drawn.after_step(scene) == 0.0
     assert now == [0.0]  # without browsers not even the clock is read
     drawer.add(session)
@@ -77,4 +77,4 @@ def test_pictures_take_no_more_than_their_share() -> None:
         spent += drawn.after_step(scene)
     assert sent
     assert 0.05 < spent / now[0] < 0.3
-    assert threading.active_count() < threads + 20, "not one for each picture"
+    assert threading.active_count() < threads + 20, "not one for each image"

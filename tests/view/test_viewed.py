@@ -15,7 +15,7 @@ from dyngs.view.viewed import load_viewed
 def test_a_run_has_the_cameras_times_and_background_of_its_capture(tmp_path: Path) -> None:
     viewed = load_viewed(write_moving_run(tmp_path))
     assert sorted(time for time in viewed.footage.times if time is not None) == sorted(TRAIN_TIMES + TEST_TIMES)
-    assert not viewed.is_still
+    assert not viewed.is_static
     assert viewed.has_timeline
     assert viewed.background.tolist() == [1, 1, 1]
     assert torch.equal(viewed.start.cam_from_world, viewed.footage.cameras[0].cam_from_world)
@@ -38,7 +38,7 @@ def test_a_run_without_its_capture_is_shown_all_the_same(tmp_path: Path) -> None
 def test_a_file_is_seen_from_where_all_of_it_is_in_view(tmp_path: Path, name: str) -> None:
     write_splats(tmp_path / name, SplatFile(row_of_balls(201)))
     viewed = load_viewed(tmp_path / name)
-    assert viewed.is_still
+    assert viewed.is_static
     assert not viewed.has_timeline
     places = viewed.start.cam_from_world[0, :3, :3] @ viewed.scene.gaussians.means.T
     shown = viewed.start.intrinsics[0] @ (places + viewed.start.cam_from_world[0, :3, 3:])

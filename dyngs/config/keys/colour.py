@@ -55,6 +55,7 @@ class AutoColour(ColourSection):
         description="harmonics only for the Gaussians where dependence on the view pays on held-out training views",
     )
     measure_at: Annotated[float, Field(gt=0, lt=1)] = Field(
-        default=0.6, description="share of the run after which that is measured; until then every 8th view is held out"
+        default=0.6,
+        description="fraction of the run after which that is measured; until then every 8th view is held out",
     )
     tolerance: float = Field(default=0.05, ge=0, description="PSNR that may be lost by it, dB")

@@ -1,4 +1,4 @@
-"""Section ``data``: where the pictures are and how they are read."""
+"""Section ``data``: where the images are and how they are read."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dyngs.files.containment import MAX_MEGAPIXELS
 
 
 class DataConfig(Section):
-    """Where the pictures are and how they are read."""
+    """Where the images are and how they are read."""
 
     root: Path = Field(description="folder of the capture")
     format: Literal[
@@ -33,18 +33,18 @@ class DataConfig(Section):
     )
     pose_frames: str | None = Field(
         default=None,
-        description="start:stop:step over the times that data.frames leaves: pictures of a person that are held out as "
+        description="start:stop:step over the times that data.frames leaves: images of a person that are held out as "
         "the split pose; -20:: is the last 20; null: none",
     )
     train_cameras: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
         default=None,
         min_length=1,
-        description="cameras whose pictures are trained on, by index from 0 as the capture has them; those of all "
+        description="cameras whose images are trained on, by index from 0 as the capture has them; those of all "
         "others are for testing; null: as the capture says",
     )
     times: Literal["files", "order"] = Field(
         default="files",
-        description="when the pictures were taken; files: as the capture says; order: in the order of their names, by "
+        description="when the images were taken; files: as the capture says; order: in the order of their names, by "
         "the numbers that these end in",
     )
     frames_per_second: float | None = Field(
@@ -52,29 +52,29 @@ class DataConfig(Section):
         gt=0,
         description="with times=order: so many numbers, or places in the order, are a second; null: not known",
     )
-    downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the pictures by this")
+    downscale: float = Field(default=1.0, ge=1.0, description="divide width and height of the images by this")
     longest_side: int | None = Field(
-        default=None, ge=1, description="shrink pictures so that the longer side has at most this many px; null: do not"
+        default=None, ge=1, description="shrink images so that the longer side has at most this many px; null: do not"
     )
     undistort: Literal["same_focal", "wide"] = Field(
         default="same_focal",
-        description="pinhole that pictures of other lenses are undistorted to; same_focal: of the same focal length, "
+        description="pinhole that images of other lenses are undistorted to; same_focal: of the same focal length, "
         "what lies beyond its edges is lost; wide: of a shorter one that shows all the lens saw, within 120 degrees",
     )
     test_every: int = Field(
-        default=8, ge=0, description="hold out every n-th picture by name where the capture has no split; 0: none"
+        default=8, ge=0, description="hold out every n-th image by name where the capture has no split; 0: none"
     )
     background: Literal["auto", "white", "black", "random"] = Field(
         default="auto",
-        description="colour behind the Gaussians; auto: white where the pictures have alpha, black otherwise; "
+        description="colour behind the Gaussians; auto: white where the images have alpha, black otherwise; "
         "random: another one in each step",
     )
     body: Path | None = Field(
         default=None, description="folder of a fit by `dyngs data fit`, read in place of the capture's body parameters"
     )
-    cache_mb: float = Field(default=4096, ge=0, description="memory for decoded pictures, MB")
+    cache_mb: float = Field(default=4096, ge=0, description="memory for decoded images, MB")
     frame_cache_mb: float = Field(default=4096, ge=0, description="disk space for decoded video frames, MB")
     follow_links: bool = Field(default=False, description="allow files of the capture that lie outside its folder")
     max_megapixels: Positive = Field(
-        default=MAX_MEGAPIXELS, description="pictures and videos with more megapixels are refused, not decoded"
+        default=MAX_MEGAPIXELS, description="images and videos with more megapixels are refused, not decoded"
     )

@@ -84,7 +84,7 @@ class ControlNodesField(FieldSection):
     smoothness: float = Field(default=0.01, ge=0, description="weight of the nodes' squared acceleration")
     block_matching: bool = Field(
         default=False,
-        description="now and then look up to three small pixels around for where moving blocks of the drawn picture "
+        description="now and then look up to three small pixels around for where moving blocks of the drawn image "
         "belong in the true one, and correct the splines by that where it lowers the error",
     )
     rigid_groups: Literal["never", "auto", "always"] = Field(
@@ -126,7 +126,7 @@ class DynamicModel(SceneModel):
     ] = HexplaneField()
     compare_with_still: bool = Field(
         default=False,
-        description="find out first whether anything moves; train a still model, too, compare the two on held-out "
+        description="find out first whether anything moves; train a static model, too, compare the two on held-out "
         "training views, and keep the better one",
     )
     pilot_steps: int = Field(
@@ -137,7 +137,7 @@ class DynamicModel(SceneModel):
     )
     motion_from: Fraction = Field(
         default=0.13,
-        description="share of the run after which motion is learned; until then a static model is trained on all "
+        description="fraction of the run after which motion is learned; until then a static model is trained on all "
         "views, for 1000 steps or a third of the run at least (coarse stage of 4DGS)",
     )
     motion_threshold: float = Field(
@@ -150,14 +150,14 @@ class DynamicModel(SceneModel):
     )
     time_window: Fraction = Field(
         default=1.0,
-        description="share of the training views, around the middle of the clip, that motion is first learned on; "
+        description="fraction of the training views, around the middle of the clip, that motion is first learned on; "
         "1: all at once",
     )
     time_window_grows_from: Fraction = Field(
-        default=0.0, description="share of the run after which more views are added to these"
+        default=0.0, description="fraction of the run after which more views are added to these"
     )
     time_window_full_at: Fraction = Field(
-        default=0.5, description="share of the run after which all views are trained on"
+        default=0.5, description="fraction of the run after which all views are trained on"
     )
     freeze_below_px: float = Field(
         default=0.3,

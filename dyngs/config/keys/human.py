@@ -23,9 +23,9 @@ class _OnTemplate(SceneModel):
         description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
         "multi-scaffold of GHG)",
     )
-    min_silhouette_share: Fraction = Field(
+    min_silhouette_fraction: Fraction = Field(
         default=0.9,
-        description="Gaussians above the lowest scaffold must lie inside at least this share of the silhouettes "
+        description="Gaussians above the lowest scaffold must lie inside at least this fraction of the silhouettes "
         "(visual hull); 0: all are kept",
     )
 
@@ -44,10 +44,10 @@ class HumanModel(_OnTemplate):
     refine: bool = Field(
         default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
     )
-    refine_from: Fraction = Field(default=0.1, description="share of the run after which these are learned")
+    refine_from: Fraction = Field(default=0.1, description="fraction of the run after which these are learned")
     refine_frames_from: Fraction = Field(
         default=0.25,
-        description="share of the run after which poses of single frames are, too: what all frames share comes first",
+        description="fraction of the run after which poses of single frames are, too: what frames share comes first",
     )
     pose_offsets: bool = Field(
         default=False,
@@ -60,11 +60,11 @@ class HumanModel(_OnTemplate):
     )
     fine_limbs: bool = Field(
         default=True,
-        description="four texels instead of one on hands and feet, if one is wider than two pixels of the pictures",
+        description="four texels instead of one on hands and feet, if one is wider than two pixels of the images",
     )
     fill_unseen: bool = Field(
         default=True,
-        description="after the last step, fill what the pictures hardly show from the other side of the body and from "
+        description="after the last step, fill what the images hardly show from the other side of the body and from "
         "around it",
     )
     offset_weight: float = Field(
@@ -82,26 +82,26 @@ class HumanModel(_OnTemplate):
 
 
 class HumanPredictorModel(_OnTemplate):
-    """A network that predicts people from a few pictures, trained on others (docs/people_network.md)."""
+    """A network that predicts people from a few images, trained on others (docs/people_network.md)."""
 
     kind: Literal["human_predictor"] = Field(
         default="human_predictor",
-        description="a network that predicts people from a few pictures, after GHG (docs/people_network.md)",
+        description="a network that predicts people from a few images, after GHG (docs/people_network.md)",
     )
     scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02, 0.04),
         min_length=1,
         description=str(_OnTemplate.model_fields["scaffold_heights"].description),
     )
-    source_views: int = Field(default=3, ge=1, description="pictures of a person that it is predicted from, at most")
+    source_views: int = Field(default=3, ge=1, description="images of a person that it is predicted from, at most")
     fewest_views: int = Field(
-        default=1, ge=1, description="every other training example is predicted from fewer pictures, at least so many"
+        default=1, ge=1, description="every other training example is predicted from fewer images, at least so many"
     )
     source_sets: int = Field(
         default=6, ge=1, description="different choices of source views per person in training; their maps are cached"
     )
     target_views: int = Field(
-        default=2, ge=1, description="pictures of one moment that a prediction is compared with in each step"
+        default=2, ge=1, description="images of one moment that a prediction is compared with in each step"
     )
     squared_weight: float = Field(
         default=1.0, ge=0, description="weight of the mean squared error in the loss, which counts edges more"

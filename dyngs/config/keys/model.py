@@ -1,4 +1,4 @@
-"""Section ``model``, part 1: what all kinds have in common, and still scenes."""
+"""Section ``model``, part 1: what all kinds have in common, and static scenes."""
 
 from __future__ import annotations
 
@@ -39,4 +39,4 @@ class SceneModel(Section):
 class StaticModel(SceneModel):
     """3D Gaussian splatting, Mip-Splatting's filters as options."""
 
-    kind: Literal["static"] = Field(default="static", description="3D Gaussians of a still scene (3DGS)")
+    kind: Literal["static"] = Field(default="static", description="3D Gaussians of a static scene (3DGS)")

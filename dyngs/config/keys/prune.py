@@ -12,7 +12,7 @@ from dyngs.config.keys.section import Fraction, Section
 class PruneConfig(Section):
     """A last stage with fewer Gaussians, after ``train.steps`` (docs/prune.md). Off where nothing is asked for."""
 
-    share: float = Field(default=0.0, ge=0, lt=1, description="share of the Gaussians to remove; 0: none")
+    fraction: float = Field(default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none")
     score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
         default="sensitivity", description="importance of a Gaussian (docs/prune.md); the lowest are removed"
     )
@@ -26,10 +26,11 @@ class PruneConfig(Section):
     )
     steps: int = Field(default=2000, ge=1, description="steps of fine-tuning after pruning")
     rewind: Fraction = Field(
-        default=0.3, description="share of training whose learning rates fine-tuning goes back to (Renda et al. 2020)"
+        default=0.3,
+        description="fraction of training whose learning rates fine-tuning goes back to (Renda et al. 2020)",
     )
 
     @property
     def is_wanted(self) -> bool:
         """Whether Gaussians are to be pruned or masked."""
-        return self.share > 0 or self.mask_times > 1
+        return self.fraction > 0 or self.mask_times > 1

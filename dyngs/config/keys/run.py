@@ -18,8 +18,8 @@ class RunConfig(Section):
     seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
     threads: int = Field(default=0, ge=0, le=1024, description="CPU threads; 0: one per core")
     device: Literal["auto", "cpu", "cuda"] = Field(
-        default="auto", description="what computes; auto: a CUDA card that can be used (docs/gpu.md), else the CPU"
+        default="auto", description="what computes; auto: a CUDA GPU that can be used (docs/gpu.md), else the CPU"
     )
     deterministic: bool = Field(
-        default=True, description="on a card: the same bytes on every run; false may be faster (the CPU's always are)"
+        default=True, description="on a GPU: the same bytes on every run; false may be faster (the CPU's always are)"
     )

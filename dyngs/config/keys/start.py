@@ -18,7 +18,7 @@ class PointsInit(Section):
     triangulate: int = Field(
         default=24,
         ge=0,
-        description="pictures of one moment to triangulate points from where the capture has none; 0: do not",
+        description="images of one moment to triangulate points from where the capture has none; 0: do not",
     )
     num_random: int = Field(default=100_000, ge=1, description="random points where there are no others")
     half_extent: Positive = Field(

@@ -26,13 +26,13 @@ class TrainConfig(Section):
         "(docs/several_processes.md), and 1 means one for each process there",
     )
     initial_downscale: Literal[1, 2, 4, 8, 16] = Field(
-        default=1, description="sides of the training pictures are divided by this at first; 1: full resolution"
+        default=1, description="sides of the training images are divided by this at first; 1: full resolution"
     )
     resolution_grows_from: Fraction = Field(
-        default=0.4, description="share of the run after which initial_downscale is halved for the first time"
+        default=0.4, description="fraction of the run after which initial_downscale is halved for the first time"
     )
     resolution_full_at: Fraction = Field(
-        default=0.7, description="share of the run after which pictures have their full resolution"
+        default=0.7, description="fraction of the run after which images have their full resolution"
     )
     ssim_weight: Fraction = Field(
         default=0.2, description="weight w of 1 - SSIM; the loss is (1 - w) L1 + w (1 - SSIM)"
@@ -40,7 +40,7 @@ class TrainConfig(Section):
     alpha_weight: float | None = Field(
         default=0.0,
         ge=0,
-        description="weight of the mean error of alpha, where pictures have alpha; null: 0.1 for a moving scene in "
+        description="weight of the mean error of alpha, where images have alpha; null: 0.1 for a moving scene in "
         "front of a background of its own colours, else 0",
     )
     depth_weight: float = Field(
@@ -55,16 +55,16 @@ class TrainConfig(Section):
         default=1.0, ge=0, description="weight of the error against 2D tracks, where the capture has any; 0: not used"
     )
     motion_masks: bool = Field(
-        default=True, description="let motion masks say what moves, where the capture has any and they fit its pictures"
+        default=True, description="let motion masks say what moves, where the capture has any and they fit its images"
     )
     robust: Literal["never", "auto", "always"] = Field(
         default="never",
-        description="leave out pixels that disagree with the other views (people who walk through); still scenes only; "
+        description="leave out pixels that disagree with the other views (people who walk by); static scenes only; "
         "auto: where two small runs beforehand say that it pays",
     )
     exposure: Literal["never", "auto", "always"] = Field(
         default="never",
-        description="learn exposure and white balance of each training picture (an affine colour, the mean one is the "
+        description="learn exposure and white balance of each training image (an affine colour, the mean one is the "
         "identity); auto: where small runs beforehand say that it pays",
     )
     remove_floaters: bool = Field(
@@ -84,7 +84,7 @@ class TrainConfig(Section):
         "them; 0: none",
     )
     hold_out_until: Fraction = Field(
-        default=0.9, description="share of the run after which views that were held out are trained on, too"
+        default=0.9, description="fraction of the run after which views that were held out are trained on, too"
     )
     log_every: int = Field(default=10, ge=1, description="steps between lines of log.jsonl")
     save_every: int = Field(default=0, ge=0, description="steps between checkpoints; 0: only the last")

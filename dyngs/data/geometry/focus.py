@@ -23,7 +23,7 @@ def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
     return middle + np.linalg.solve(normal_matrix, right_side)
 
 
-def share_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
+def fraction_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
     """Return the share in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of them."""
     depth = np.einsum("vi,vi->v", point - world_from_cam[:, :3, 3], world_from_cam[:, :3, 2])
     return float((depth > 0).mean())

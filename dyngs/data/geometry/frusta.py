@@ -8,7 +8,7 @@ import numpy as np
 
 from dyngs.data.capture import View
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.geometry.focus import focus_point, share_in_front
+from dyngs.data.geometry.focus import focus_point, fraction_in_front
 from dyngs.data.geometry.poses import camera_center, inverse_rigid
 from dyngs.data.geometry.projection import times_seen
 
@@ -17,11 +17,11 @@ NEAR_PER_FOCUS = 0.25
 FAR_PER_BASELINE = 38.0
 """Farthest depth, in the largest distance between cameras: from there it is seen under 1.5 degrees, COLMAP's least."""
 MIN_VIEWS = 3
-"""Pictures that see a random point, where there are as many."""
+"""Images that see a random point, where there are as many."""
 COUNTED_VIEWS = 60
 """Views, evenly spaced, in which points are counted."""
 MIN_CUBE_SEEN = 0.5
-"""Share of a cube that two cameras must see for the scene to lie in it."""
+"""Fraction of a cube that two cameras must see for the scene to lie in it."""
 
 
 def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
@@ -38,7 +38,7 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
     baseline = baseline if baseline > 1e-6 else 1.0
     focus = focus_point(poses)
     distance = baseline
-    if focus is not None and share_in_front(poses, focus) > 0.5:
+    if focus is not None and fraction_in_front(poses, focus) > 0.5:
         distance = float(np.median(np.linalg.norm(centers - focus, axis=1)))
     return NEAR_PER_FOCUS * distance, max(FAR_PER_BASELINE * baseline, 2 * distance)
 
@@ -46,7 +46,7 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
 def points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return candidates for random points: places (P, 3), and in how many of up to ``COUNTED_VIEWS`` views each lies.
 
-    Each lies at a random place of the picture of a random view; its inverse depth is uniform between ``depth_bounds``.
+    Each lies at a random place of the image of a random view; its inverse depth is uniform between ``depth_bounds``.
 
     Args:
         views: one or more.
@@ -77,7 +77,7 @@ def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
     """
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     focus = focus_point(poses)
-    if focus is not None and share_in_front(poses, focus) > 0.5 and np.abs(focus).max() > half_extent:
+    if focus is not None and fraction_in_front(poses, focus) > 0.5 and np.abs(focus).max() > half_extent:
         return f"the cameras look at ({', '.join(f'{x:.3g}' for x in focus)})"
     steps = (np.arange(8) + 0.5) / 4 - 1
     grid = half_extent * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)

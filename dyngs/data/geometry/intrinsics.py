@@ -1,4 +1,4 @@
-"""Pinhole camera matrices of stored pictures, and their scaling with the picture."""
+"""Pinhole camera matrices of stored images, and their scaling with the image."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy as np
 from dyngs.errors import DyngsError
 
 MAX_SIDE = 2**20
-"""Largest side of a picture in pixels; more is taken for a mistake."""
+"""Largest side of an image in pixels; more is taken for a mistake."""
 FOCAL_RANGE = (1e-4, 1e6)
-"""Plausible focal lengths, in units of the picture's longer side: fields of view from 0.00006 to 179.99 degrees."""
+"""Plausible focal lengths, in units of the image's longer side: fields of view from 0.00006 to 179.99 degrees."""
 
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
@@ -18,19 +18,19 @@ def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 
 
 def scaled_intrinsics(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray:
-    """Return the (3, 3) matrix for the picture scaled by the two factors; exact, as pixel centres are at (0.5, 0.5)."""
+    """Return the (3, 3) matrix for the image scaled by the two factors; exact, as pixel centres are at (0.5, 0.5)."""
     return np.diag([scale_x, scale_y, 1.0]) @ intrinsics
 
 
 def match_size(
     intrinsics: np.ndarray, described: tuple[int, int], stored: tuple[int, int] | None, where: str
 ) -> tuple[np.ndarray, tuple[int, int], bool]:
-    """Return the intrinsics for the stored picture, its (width, height), and whether they were rescaled.
+    """Return the intrinsics for the stored image, its (width, height), and whether they were rescaled.
 
     Args:
-        intrinsics: (3, 3) for a picture of ``described`` (width, height).
+        intrinsics: (3, 3) for an image of ``described`` (width, height).
         stored: (width, height) of the file, None where it could not be opened.
-        where: the picture, for messages.
+        where: the image, for messages.
 
     Raises:
         DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal point.
@@ -39,13 +39,13 @@ def match_size(
     if stored is None or stored == described:
         return intrinsics, described, False
     scale_x, scale_y = stored[0] / described[0], stored[1] / described[1]
-    # Each side of a shrunk picture was rounded to whole pixels: half a pixel either way is the same aspect.
+    # Each side of a shrunk image was rounded to whole pixels: half a pixel either way is the same aspect.
     slack = max(0.5 / stored[0], 0.5 / stored[1]) + 1e-9
     if abs(scale_x / scale_y - 1) > 2 * slack:
         turned = " (turned by its EXIF tag?)" if stored == described[::-1] else ""
         raise DyngsError(
-            f"{where}: the picture is {stored[0]}x{stored[1]} but its intrinsics are for {described[0]}x{described[1]}"
-            f"{turned}; correct the size and focal length or restore the original picture"
+            f"{where}: the image is {stored[0]}x{stored[1]} but its intrinsics are for {described[0]}x{described[1]}"
+            f"{turned}; correct the size and focal length or restore the original image"
         )
     return scaled_intrinsics(intrinsics, scale_x, scale_y), stored, True
 
@@ -56,7 +56,7 @@ def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: 
     fx, fy, *center = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if not (low <= fx <= high and low <= fy <= high):
         raise DyngsError(
-            f"{where}: the focal length ({fx:g}, {fy:g}) px does not suit a picture of {described[0]}x{described[1]}; "
+            f"{where}: the focal length ({fx:g}, {fy:g}) px does not suit an image of {described[0]}x{described[1]}; "
             "correct it, or the field of view that it follows from"
         )
     if not all(abs(x) <= high for x in center):
@@ -64,7 +64,7 @@ def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: 
 
 
 def rescale_warning(where: list[str]) -> list[str]:
-    """Return one line about the pictures whose intrinsics were rescaled, none if there are none."""
+    """Return one line about the images whose intrinsics were rescaled, none if there are none."""
     if not where:
         return []
-    return [f"{len(where)} pictures have another size than their intrinsics, which were rescaled; first {where[0]}"]
+    return [f"{len(where)} images have another size than their intrinsics, which were rescaled; first {where[0]}"]

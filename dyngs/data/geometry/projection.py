@@ -1,4 +1,4 @@
-"""Points projected into views, in shares of the picture: which views see which points."""
+"""Points projected into views, in fractions of the image: which views see which points."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ NEAREST = 1e-9
 
 
 def projected(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of points in a picture: (P, 2) in [0, 1] across and down, and (P,) whether they lie in it.
+    """Return the places of points in an image: (P, 2) in [0, 1] across and down, and (P,) whether they lie in it.
 
-    As a pinhole camera sees them; places of points that are not in the picture mean nothing.
+    As a pinhole camera sees them; places of points that are not in the image mean nothing.
 
     Args:
         points: (P, 3) float64 in the world of the view.

@@ -45,7 +45,7 @@ def read_camera_folders(root: Path) -> Capture:
     is held out where there are three or more. Times run from the first frame number to the last one.
 
     Raises:
-        DyngsError: broken or incomplete calibration, no pictures, pictures without a number in their name, bad videos.
+        DyngsError: broken or incomplete calibration, no images, images without a number in their name, bad videos.
     """
     path = root / CALIBRATION
     file = _read_calibration(path)

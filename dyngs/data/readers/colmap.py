@@ -12,7 +12,7 @@ from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View
 from dyngs.data.frame_seconds import read_seconds
 from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import checked_pose, repair_warning
-from dyngs.data.pictures.images import SUFFIXES, header_if_readable
+from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.colmap_check import check_model_file
 from dyngs.data.readers.shared.transforms import view_name
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 TEST_LIST = "test.txt"
-"""Names of the pictures for testing, a line each, in the model's folder (as 3DGS has it)."""
+"""Names of the images for testing, a line each, in the model's folder (as 3DGS has it)."""
 MAX_LIST_BYTES = 10_000_000
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 _EXTENSIONS = (".bin", ".txt")
@@ -57,13 +57,13 @@ def is_colmap(root: Path) -> bool:
 
 
 def read_colmap(root: Path) -> Capture:
-    """Read a COLMAP model with pictures below ``images/``, and with ``masks/`` and ``times.json`` where they are.
+    """Read a COLMAP model with images below ``images/``, and with ``masks/`` and ``times.json`` where they are.
 
     Registered images become training views, but for those that ``test.txt`` in the model's folder lists; distorted
     camera models are kept as ``View.lens``.
 
     Raises:
-        DyngsError: incomplete or inconsistent model files, no ``images`` folder, an unsupported camera model, pictures
+        DyngsError: incomplete or inconsistent model files, no ``images`` folder, an unsupported camera model, images
             whose aspect ratio is not their camera's.
     """
     folder = find_model(root)
@@ -71,8 +71,8 @@ def read_colmap(root: Path) -> Capture:
         raise DyngsError(f"{root}: holds no COLMAP model (cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)})")
     model = _load_model(folder)
     if not (root / "images").is_dir():
-        raise DyngsError(f"{root / 'images'}: no such folder; put the model's pictures there")
-    with reading(folder, "names of images must be UTF-8; rename the pictures and export the model again"):
+        raise DyngsError(f"{root / 'images'}: no such folder; put the model's images there")
+    with reading(folder, "names of images must be UTF-8; rename the images and export the model again"):
         posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     masks, seconds = find_masks(root / "masks"), read_seconds(root)
     repaired: dict[str, float] = {}
@@ -154,12 +154,12 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     path = folder / TEST_LIST
     if not path.is_file():
         return {"train": tuple(views)}, []
-    with reading(path, "it must list names of pictures, a line each; repair or remove it"):
+    with reading(path, "it must list names of images, a line each; repair or remove it"):
         text = inside(path).read_bytes()[:MAX_LIST_BYTES].decode()
     listed = {line.strip() for line in text.splitlines() if line.strip()}
     test = tuple(view for name, view in zip(names, views, strict=True) if name in listed)
     unknown = sorted(listed - set(names))
-    notes = [f"{path}: {len(unknown)} listed pictures have no pose, first {unknown[0]:.80}"] if unknown else []
+    notes = [f"{path}: {len(unknown)} listed images have no pose, first {unknown[0]:.80}"] if unknown else []
     if not test:
         return {"train": tuple(views)}, notes
     train = tuple(view for name, view in zip(names, views, strict=True) if name not in listed)
@@ -178,7 +178,7 @@ def find_masks(folder: Path) -> dict[str, Path]:
 
 
 def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
-    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png``, else ``a/b.jpg``, else ``a/b`` with any picture extension."""
+    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png``, else ``a/b.jpg``, else ``a/b`` with any image extension."""
     stem = image_name.rpartition(".")[0]
     return masks.get(f"{image_name}.png") or masks.get(image_name) or masks.get(stem)
 
@@ -199,7 +199,7 @@ def _warnings(folder: Path, model: pycolmap.Reconstruction, views: list[View], h
         warnings.append(f"{folder.parent}: holds several models, which are not connected; only {folder.name} is read")
     without = [view.name for view in views if view.mask_path is None]
     if has_masks and without:
-        warnings.append(f"{len(without)} pictures have no mask, first {without[0]}")
+        warnings.append(f"{len(without)} images have no mask, first {without[0]}")
     return warnings
 
 

@@ -31,11 +31,11 @@ def read_llff(root: Path) -> Capture:
     """Read ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, sorted by name.
 
     Each row holds a 3x5 matrix, row by row, and the near and far bounds (not used). Its columns: the camera's down,
-    right and backward axes and its position in the world, then height, width and focal length of the full picture in
+    right and backward axes and its position in the world, then height, width and focal length of the full image in
     pixels (Mildenhall et al. 2019). The first camera is the test view, as in N3V.
 
     Raises:
-        DyngsError: an unreadable file, rows and cameras that differ in number, bad poses, pictures or videos.
+        DyngsError: an unreadable file, rows and cameras that differ in number, bad poses, images or videos.
     """
     path = root / POSES
     rows = _read_rows(path)

@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, Splits
 from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
-from dyngs.data.pictures.images import SUFFIXES, header_if_readable
+from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
@@ -31,8 +31,8 @@ class _Scene:
 
 
 @dataclass(frozen=True)
-class _Pictures:
-    """Pictures of one resolution: their folder, and the factor by which they are smaller than their cameras say."""
+class _Images:
+    """Images of one resolution: their folder, and the factor by which they are smaller than their cameras say."""
 
     folder: Path
     factor: int
@@ -45,9 +45,9 @@ def is_nerfies(root: Path) -> bool:
 
 
 def read_nerfies(root: Path) -> Capture:
-    """Read the capture, in the world scaled as ``scene.json`` says, with the largest pictures that exist.
+    """Read the capture, in the world scaled as ``scene.json`` says, with the largest images that exist.
 
-    Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th picture); the time is
+    Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th image); the time is
     ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if present, are the sparse points, grey.
     Cameras (Park et al. 2021): ``orientation`` has the camera's OpenCV axes as rows, ``position`` is its centre.
 
@@ -63,11 +63,11 @@ def read_nerfies(root: Path) -> Capture:
     metadata = _metadata(root, used)
     times = _times(root, metadata)
     scene = _scene(root / "scene.json")
-    pictures = _find_pictures(root)
+    images = _find_images(root)
     skewed: list[str] = []
     frames = []
     for name in used:
-        own = _camera(root / "camera" / f"{name}.json", scene, pictures, name, skewed)
+        own = _camera(root / "camera" / f"{name}.json", scene, images, name, skewed)
         camera = metadata[name].get("camera_id")
         frames.append(
             Frame(str(root / "camera" / f"{name}.json"), {**own, "time": times.get(name), "camera": camera}, {})
@@ -88,7 +88,7 @@ def read_nerfies(root: Path) -> Capture:
 def _ids(root: Path, dataset: dict[str, object], key: str) -> list[str]:
     value = dataset.get(key, [])
     if not isinstance(value, list) or not all(isinstance(item, str) and _is_plain(item) for item in value):
-        raise DyngsError(f"{root / 'dataset.json'}: '{key}' must be a list of picture names")
+        raise DyngsError(f"{root / 'dataset.json'}: '{key}' must be a list of image names")
     return list(dict.fromkeys(value))
 
 
@@ -110,7 +110,7 @@ def _metadata(root: Path, names: list[str]) -> dict[str, dict[str, object]]:
 
 
 def _times(root: Path, metadata: dict[str, dict[str, object]]) -> dict[str, float]:
-    """Time of each picture that has one: its number divided by the largest number."""
+    """Time of each image that has one: its number divided by the largest number."""
     numbers: dict[str, int] = {}
     for name, own in metadata.items():
         value = own.get("warp_id", own.get("time_id"))
@@ -154,8 +154,8 @@ def _scene(path: Path) -> _Scene:
     return _Scene(_numbers(path, fields, "center", (3,)), scale)
 
 
-def _find_pictures(root: Path) -> _Pictures:
-    """Find the largest pictures: ``rgb/1x`` if it holds any, else ``rgb/2x`` and so on."""
+def _find_images(root: Path) -> _Images:
+    """Find the largest images: ``rgb/1x`` if it holds any, else ``rgb/2x`` and so on."""
     folders = {}
     for path in (root / "rgb").iterdir() if (root / "rgb").is_dir() else ():
         match = re.fullmatch(r"(\d+)x", path.name)
@@ -164,12 +164,12 @@ def _find_pictures(root: Path) -> _Pictures:
     for factor, folder in sorted(folders.items()):
         files = {path.stem: path for path in sorted(folder.iterdir(), reverse=True) if path.suffix.lower() in SUFFIXES}
         if files:
-            return _Pictures(folder, factor, files)
-    raise DyngsError(f"{root / 'rgb'}: no pictures in 1x, 2x, 4x or the like; restore one of these folders")
+            return _Images(folder, factor, files)
+    raise DyngsError(f"{root / 'rgb'}: no images in 1x, 2x, 4x or the like; restore one of these folders")
 
 
-def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: list[str]) -> dict[str, object]:
-    """Return the camera as a frame of a transforms file, for pictures smaller by the factor of their folder."""
+def _camera(path: Path, scene: _Scene, images: _Images, name: str, skewed: list[str]) -> dict[str, object]:
+    """Return the camera as a frame of a transforms file, for images smaller by the factor of their folder."""
     if not path.is_file():
         raise DyngsError(f"{path}: no such camera file, although dataset.json lists it; restore it")
     fields = read_json_object(path)
@@ -180,8 +180,8 @@ def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: l
         raise DyngsError(f"{path}: 'image_size' must be positive")
     if "skew" in fields and abs(float(_numbers(path, fields, "skew", ()))) > 1e-6 * focal:
         skewed.append(str(path))
-    picture = pictures.files.get(name, pictures.folder / f"{name}.png")
-    width, height = _scaled_size(full, pictures.factor, picture)
+    image = images.files.get(name, images.folder / f"{name}.png")
+    width, height = _scaled_size(full, images.factor, image)
     scale_x, scale_y = width / full[0], height / full[1]
     # Older Nerfies files have "tangential".
     tangential = "tangential_distortion" if "tangential_distortion" in fields else "tangential"
@@ -194,15 +194,15 @@ def _camera(path: Path, scene: _Scene, pictures: _Pictures, name: str, skewed: l
     lens = {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2, "cx": cx * scale_x, "cy": cy * scale_y}
     return {
         **{key: float(value) for key, value in (sizes | lens).items()},
-        "file_path": f"rgb/{pictures.folder.name}/{picture.name}",
+        "file_path": f"rgb/{images.folder.name}/{image.name}",
         "transform_matrix": (world_from_cam @ OPENGL_FROM_OPENCV).tolist(),
     }
 
 
-def _scaled_size(full: np.ndarray, factor: int, picture: Path) -> tuple[int, int]:
-    """(width, height) of the picture: the stored size if that is ``full / factor`` rounded, else the rounded one."""
+def _scaled_size(full: np.ndarray, factor: int, image: Path) -> tuple[int, int]:
+    """(width, height) of the image: the stored size if that is ``full / factor`` rounded, else the rounded one."""
     nominal = round(float(full[0]) / factor), round(float(full[1]) / factor)
-    header = header_if_readable(picture)
+    header = header_if_readable(image)
     if header is None:
         return nominal
     near = abs(header.width - full[0] / factor) <= 1 and abs(header.height - full[1] / factor) <= 1

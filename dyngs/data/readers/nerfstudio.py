@@ -63,7 +63,7 @@ def _splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]
     if "test" not in splits and "val" in splits:
         splits["test"] = splits.pop("val")
     used = {view.name for kept in splits.values() for view in kept}
-    notes = [f"{len(unknown)} listed pictures have no frame, first {unknown[0]}"] if unknown else []
+    notes = [f"{len(unknown)} listed images have no frame, first {unknown[0]}"] if unknown else []
     if len(used) < len(views):
         notes.append(f"{len(views) - len(used)} frames are in no split and are ignored")
     return splits, notes

@@ -1,4 +1,4 @@
-"""Reader for NeuMan folders: a COLMAP model, masks, and a body fitted to each picture and aligned with the model."""
+"""Reader for NeuMan folders: a COLMAP model, masks, and a body fitted to each image and aligned with the model."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def is_neuman(root: Path) -> bool:
 def read_neuman(root: Path) -> Capture:
     """Read the capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's world and unit.
 
-    Body parameters, one row per posed picture in order of their names: ``4d_humans/smpl_optimized_aligned_scale.npz``
+    Body parameters, one row per posed image in order of their names: ``4d_humans/smpl_optimized_aligned_scale.npz``
     (global_orient, body_pose, betas, transl, scale), else ``smpl_output_optimized.pkl`` or ``smpl_output_romp.pkl``
-    (pose, betas of one person) with ``alignments.npy`` (picture name to a (4, 3) matrix M, ``world = [v 1] M``). Masks
-    in ``segmentations`` under the pictures' names are black where the person is. Splits are those of
+    (pose, betas of one person) with ``alignments.npy`` (image name to a (4, 3) matrix M, ``world = [v 1] M``). Masks
+    in ``segmentations`` under the images' names are black where the person is. Splits are those of
     ``{train,val,test}_split.txt``, if there.
 
     Raises:
@@ -64,7 +64,7 @@ def _read(root: Path) -> Capture:
         )
     body = _aligned(root, numbers) if (root / ALIGNED).is_file() else _fitted(root, names, numbers)
     without = [name for name, view in people.items() if view.silhouette is None]
-    notes = [f"{len(without)} pictures have no mask in segmentations, first {without[0]}"] if without else []
+    notes = [f"{len(without)} images have no mask in segmentations, first {without[0]}"] if without else []
     splits, more = _splits(root, people)
     warnings = (*capture.warnings, *notes, *more)
     return capture.replace(format="neuman", splits=splits, body=of_one_clip(body), warnings=warnings)
@@ -73,19 +73,19 @@ def _read(root: Path) -> Capture:
 def _aligned(root: Path, numbers: list[int]) -> BodyFrames:
     path = root / ALIGNED
     found = read_npz(path, ("global_orient", "body_pose", "betas", "transl", "scale"))
-    parts = [_per_picture(path, key, found[key], len(numbers)) for key in ("global_orient", "body_pose")]
+    parts = [_per_image(path, key, found[key], len(numbers)) for key in ("global_orient", "body_pose")]
     return body_frames(path, numbers, np.concatenate(parts, axis=1), found["transl"], found["betas"], found["scale"])
 
 
 def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
-    """SMPL fitted in a frame of its own, mapped to the world by the similarity transform of each picture."""
+    """SMPL fitted in a frame of its own, mapped to the world by the similarity transform of each image."""
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
     fits = read_pickle(inside(path))
     if not isinstance(fits, dict) or len(fits) != 1:
         count = len(fits) if isinstance(fits, dict) else 0
         raise DyngsError(f"{path}: must hold the body parameters of one person, got {count}; keep one")
     fit = next(iter(fits.values()))
-    poses = _per_picture(path, "pose", entry(path, fit, "pose"), len(numbers))
+    poses = _per_image(path, "pose", entry(path, fit, "pose"), len(numbers))
     alignments = read_pickled_array(inside(root / ALIGNMENTS))
     scales, turns, trans = [], [], []
     for name in names:
@@ -105,12 +105,12 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
     )
 
 
-def _per_picture(path: Path, key: str, value: object, count: int) -> np.ndarray:
-    """Return ``value`` as (count, width), one row per posed picture."""
+def _per_image(path: Path, key: str, value: object, count: int) -> np.ndarray:
+    """Return ``value`` as (count, width), one row per posed image."""
     rows = len(value) if isinstance(value, np.ndarray) and value.ndim else 0
     if rows != count or not isinstance(value, np.ndarray):
         raise DyngsError(
-            f"{path}: '{key}' has {rows} rows, but the COLMAP model has {count} posed pictures; fit the body to those"
+            f"{path}: '{key}' has {rows} rows, but the COLMAP model has {count} posed images; fit the body to those"
         )
     return value.reshape(count, -1)
 
@@ -131,7 +131,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
         path = root / f"{split}_split.txt"
         if not path.is_file():
             continue
-        with reading(path, "it lists names of pictures, one a line"):
+        with reading(path, "it lists names of images, one a line"):
             listed = list(dict.fromkeys(inside(path).read_text(encoding="utf-8").split()))
         unposed += [name for name in listed if name not in people]
         splits[split] = tuple(people[name] for name in listed if name in people)
@@ -140,7 +140,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
         splits["train"] = tuple(view for view in people.values() if view.name not in held_out)
     if not unposed:
         return splits, []
-    return splits, [f"{len(unposed)} pictures of the splits have no pose and are left out: {first_few(unposed)}"]
+    return splits, [f"{len(unposed)} images of the splits have no pose and are left out: {first_few(unposed)}"]
 
 
 FORMAT = CaptureFormat(

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.geometry.poses import opengl_from_cam
-from dyngs.data.pictures.silhouettes import MASKS
-from dyngs.data.pictures.video import VIDEO_SUFFIXES
+from dyngs.data.images.silhouettes import MASKS
+from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views, video_fps
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.errors import DyngsError, reading
@@ -49,21 +49,21 @@ def _read(root: Path) -> Capture:
     camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)
     usable = set(body.frames) & set(range(hdf5_length(root / MASK_FILE, MASKS)))
-    pictures = {number: path for number, path in camera.pictures.items() if number in usable}
-    if not pictures:
+    images = {number: path for number, path in camera.images.items() if number in usable}
+    if not images:
         raise DyngsError(
             f"{root}: no frame of {video.name} has both a mask and body parameters; restore the HDF5 files"
         )
     views, warnings = sequence_views(
-        root / CAMERA, [replace(camera, pictures=pictures)], {camera.name: _calibration(root / CAMERA)}
+        root / CAMERA, [replace(camera, images=images)], {camera.name: _calibration(root / CAMERA)}
     )
     people = tuple(
         replace(view, silhouette=Silhouette(root / MASK_FILE, "nonzero", number))
-        for view, number in zip(views[camera.name], sorted(pictures), strict=True)
+        for view, number in zip(views[camera.name], sorted(images), strict=True)
     )
-    lost = len(camera.pictures) - len(pictures)
+    lost = len(camera.images) - len(images)
     if lost:
-        warnings.append(f"{video.name}: {lost} of {len(camera.pictures)} frames lack a mask or a pose and are left out")
+        warnings.append(f"{video.name}: {lost} of {len(camera.images)} frames lack a mask or a pose and are left out")
     capture = Capture(root, "people_snapshot", {"train": people}, fps=video_fps([camera]), warnings=tuple(warnings))
     return capture.replace(body=of_one_clip(body))
 

@@ -31,7 +31,7 @@ _NUM_JOINTS = 24
 
 @dataclass(frozen=True)
 class _Shot:
-    """One picture of one camera.
+    """One image of one camera.
 
     Attributes:
         file: path below the capture's folder, with or without extension.
@@ -56,11 +56,11 @@ def is_zju_mocap(root: Path) -> bool:
 def read_zju_mocap(root: Path) -> Capture:
     """Read the capture of a person by several calibrated static cameras or by one; units are metres.
 
-    ``annots.npy`` (Peng et al. 2021) holds ``cams`` (K, D, R, T in mm, per camera) and ``ims`` (pictures of all cameras
-    per frame); SMPL parameters lie in ``new_params/N.npy`` or ``params/N.npy``, N being the number in the picture's
-    name; masks (labels, 0 is background) in ``mask_cihp``, ``mask`` or ``masks`` under the pictures' names. Of three
+    ``annots.npy`` (Peng et al. 2021) holds ``cams`` (K, D, R, T in mm, per camera) and ``ims`` (images of all cameras
+    per frame); SMPL parameters lie in ``new_params/N.npy`` or ``params/N.npy``, N being the number in the image's
+    name; masks (labels, 0 is background) in ``mask_cihp``, ``mask`` or ``masks`` under the images' names. Of three
     cameras or more the first one is for testing. ``cameras.pkl`` and ``mesh_infos.pkl`` (Weng et al. 2022) hold
-    the same per picture of ``images/``, in metres; masks (white) lie in ``masks/``.
+    the same per image of ``images/``, in metres; masks (white) lie in ``masks/``.
 
     Parameters: v = Rh LBS(x; poses) + Th, about the template's origin: kept as ``BodyFrames.turns``. OpenCV calibrated
     these cameras, with pixel centres at whole numbers: half a pixel is added to the principal point.
@@ -90,7 +90,7 @@ def _read(root: Path) -> Capture:
     ]
     without = [view.name for view, mask in zip(views, masks, strict=True) if mask is None]
     if without:
-        warnings.append(f"{len(without)} pictures have no mask in {' or '.join(folders)}, first {without[0]}")
+        warnings.append(f"{len(without)} images have no mask in {' or '.join(folders)}, first {without[0]}")
     splits, notes = _splits(people)
     return Capture(root, "zju_mocap", splits, warnings=(*warnings, *notes)).replace(body=of_one_clip(body))
 
@@ -113,7 +113,7 @@ def _annotated_shots(path: Path) -> list[_Shot]:
         files = _items(f"{path}, ims {index}", own, "ims")
         if len(files) != len(calibrations) or not all(isinstance(file, str) for file in files):
             raise DyngsError(
-                f"{path}, ims {index}: must name one picture for each of the {len(calibrations)} cameras, got "
+                f"{path}, ims {index}: must name one image for each of the {len(calibrations)} cameras, got "
                 f"{len(files)}; export it again"
             )
         frame = _frame_number(path, str(files[0]))
@@ -122,7 +122,7 @@ def _annotated_shots(path: Path) -> list[_Shot]:
             for camera, (file, calibration) in enumerate(zip(files, calibrations, strict=True))
         ]
     if not shots:
-        raise DyngsError(f"{path}: 'ims' lists no pictures; export it again")
+        raise DyngsError(f"{path}: 'ims' lists no images; export it again")
     return shots
 
 
@@ -191,7 +191,7 @@ def _calibration(where: str, intrinsics: object, lens: object, cam_from_world: n
 
 
 def _views(path: Path, shots: Sequence[_Shot]) -> tuple[list[View], list[str]]:
-    """One view per picture, and warnings; times run from 0 at the lowest frame number to 1 at the highest one."""
+    """One view per image, and warnings; times run from 0 at the lowest frame number to 1 at the highest one."""
     first, last = min(shot.frame for shot in shots), max(shot.frame for shot in shots)
     frames = []
     for shot in shots:
@@ -214,10 +214,10 @@ def _splits(views: Sequence[View]) -> tuple[Splits, list[str]]:
 
 def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
     """Find the mask ``FOLDER/a/b.png`` of ``a/b.jpg`` or ``images/a/b.jpg``, in the first folder that has it."""
-    picture = PurePosixPath(file.replace("\\", "/"))
-    name = picture.name if not picture.suffix else picture.with_suffix("").name
-    below = [picture.parent / f"{name}.png"]
-    if picture.parts[0] == "images":
+    image = PurePosixPath(file.replace("\\", "/"))
+    name = image.name if not image.suffix else image.with_suffix("").name
+    below = [image.parent / f"{name}.png"]
+    if image.parts[0] == "images":
         below.append(PurePosixPath(*below[0].parts[1:]))
     candidates = (root / folder / path for folder in folders for path in below)
     return next((path for path in candidates if path.is_file()), None)
@@ -228,18 +228,18 @@ def _frame_number(path: Path, name: str) -> int:
     stem = PurePosixPath(name.replace("\\", "/")).name
     found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem)
     if not found:
-        raise DyngsError(f"{path}: no frame number in the name {name!r:.80}; call the picture 000000.jpg or the like")
+        raise DyngsError(f"{path}: no frame number in the name {name!r:.80}; call the image 000000.jpg or the like")
     return int(found[1])
 
 
 def _by_name(path: Path) -> dict[str, dict[str, object]]:
-    """Read a pickle of a dictionary from picture names to dictionaries."""
+    """Read a pickle of a dictionary from image names to dictionaries."""
     fields = read_pickle(inside(path))
     if not isinstance(fields, dict) or not fields or not all(isinstance(own, dict) for own in fields.values()):
-        raise DyngsError(f"{path}: must be a dictionary from picture names to parameters; export it again")
+        raise DyngsError(f"{path}: must be a dictionary from image names to parameters; export it again")
     strange = [name for name in fields if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name)]
     if strange:
-        raise DyngsError(f"{path}: {strange[0]!r:.80} is no name of a picture; export it again")
+        raise DyngsError(f"{path}: {strange[0]!r:.80} is no name of an image; export it again")
     return fields
 
 

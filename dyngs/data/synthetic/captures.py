@@ -18,12 +18,12 @@ from dyngs.files.write import write_image, write_text
 
 
 @dataclass(frozen=True)
-class PictureOptions:
-    """Options of rendered pictures.
+class ImageOptions:
+    """Options of rendered images.
 
     Attributes:
         size: width and height in pixels.
-        num_val, num_test: pictures that are held out.
+        num_val, num_test: images that are held out.
         seed: turns the training cameras; one seed gives the same bytes each time.
         distance: of the cameras from the origin, world units.
         samples: S, samples per pixel side.
@@ -38,25 +38,25 @@ class PictureOptions:
 
 
 @dataclass(frozen=True)
-class StillOptions(PictureOptions):
-    """Options of a capture of the still scene.
+class StillOptions(ImageOptions):
+    """Options of a capture of the static scene.
 
     Attributes:
-        num_train: training pictures.
+        num_train: training images.
     """
 
     num_train: int = 48
 
 
 @dataclass(frozen=True)
-class DynamicOptions(PictureOptions):
+class DynamicOptions(ImageOptions):
     """Options of a capture of a moving scene. The seed also assigns times to cameras.
 
-    Test pictures lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room``
+    Test images lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room``
     both numbers only say whether there is a camera of that kind, which is never trained on.
 
     Attributes:
-        num_times: training times, evenly spaced in [0, 1]; in ``room`` each camera takes a picture at each.
+        num_times: training times, evenly spaced in [0, 1]; in ``room`` each camera takes an image at each.
         num_cameras: training cameras of ``room``.
     """
 
@@ -68,7 +68,7 @@ class DynamicOptions(PictureOptions):
 
 @dataclass(frozen=True)
 class _Shot:
-    """One picture to render: its path below the root without suffix, the (4, 4) OpenGL pose, and the time."""
+    """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, and the time."""
 
     name: str
     world_from_cam: np.ndarray
@@ -77,10 +77,10 @@ class _Shot:
 
 
 def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
-    """Write pictures of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
+    """Write images of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
 
     Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA, straight alpha, sRGB) for
-    every split with pictures. Each file is written atomically, the JSON last.
+    every split with images. Each file is written atomically, the JSON last.
 
     Raises:
         DyngsError: the folder cannot be written.
@@ -98,18 +98,18 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
 
 
 def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = DynamicOptions()) -> Path:
-    """Write pictures of the moving scene ``name`` in the layout of D-NeRF; returns ``out``.
+    """Write images of the moving scene ``name`` in the layout of D-NeRF; returns ``out``.
 
-    Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the pictures, RGBA with straight alpha. Each
+    Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the images, RGBA with straight alpha. Each
     time is seen by one camera somewhere else on the hemisphere. ``room`` is a video of several fixed cameras instead:
     ``camAA/frame_BBBB.png`` without alpha, frames with ``camera``; test and val have one camera each, never trained on.
 
-    ``motion/`` holds a mask for each picture, white where something that moves is seen, and ``true_tracks.npz`` the
+    ``motion/`` holds a mask for each image, white where something that moves is seen, and ``true_tracks.npz`` the
     tracks of points on it (``TrueTracks``). Frames of val and test name their mask (``motion_mask_path``), those of
     train do not: training would take it as a prior.
 
     Raises:
-        DyngsError: no such scene, no pictures asked for, ``out`` holds something already, or cannot be written.
+        DyngsError: no such scene, no images asked for, ``out`` holds something already, or cannot be written.
     """
     scene_at(name, 0.0)
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
@@ -140,7 +140,7 @@ def _write_split(
     scene_of: Callable[[_Shot], Scene],
     options: StillOptions | DynamicOptions,
 ) -> None:
-    """Write the pictures of one split, then its JSON; nothing where it has no pictures."""
+    """Write the images of one split, then its JSON; nothing where it has no images."""
     if not shots:
         return
     frames = []
@@ -225,8 +225,8 @@ def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
     A Fibonacci spiral from 6 to 80 degrees of elevation, turned by a random azimuth.
     """
     turn = np.random.default_rng(seed).uniform(0.0, 2 * np.pi)
-    share = (np.arange(count) + 0.5) / max(count, 1)
-    heights = np.sin(np.radians(6.0)) * (1 - share) + np.sin(np.radians(80.0)) * share
+    fraction = (np.arange(count) + 0.5) / max(count, 1)
+    heights = np.sin(np.radians(6.0)) * (1 - fraction) + np.sin(np.radians(80.0)) * fraction
     azimuths = turn + np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
     return _look_at_origin(distance, azimuths, np.arcsin(heights))
 

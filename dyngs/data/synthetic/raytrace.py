@@ -1,6 +1,6 @@
 """A small ray tracer in NumPy: painted balls, boxes and waving sheets under a soft lamp and the sky.
 
-It shares no formula with the rasterizer, so that its pictures are an independent ground truth. A scene is a tuple of
+It shares no formula with the rasterizer, so that its images are an independent ground truth. A scene is a tuple of
 primitives; a scene that moves is a function from time to such a tuple.
 
 Local letters: R rays (or points on surfaces), S samples per pixel side.
@@ -68,7 +68,7 @@ class Sphere:
         return (points - _f32(self.center)) / np.float32(self.radius)
 
     def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(R,) share of the cosine-weighted sky that the ball hides: the form factor of a sphere."""
+        """(R,) fraction of the cosine-weighted sky that the ball hides: the form factor of a sphere."""
         offset = _f32(self.center) - points
         distance = np.sqrt(np.maximum(_dot(offset, offset), 1e-12))
         cosine = np.maximum(_dot(normals, offset) / distance, 0.0)
@@ -122,7 +122,7 @@ class Box:
         return side * self._axes()[face]
 
     def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(R,) share of the sky hidden, as by a ball that fills the box."""
+        """(R,) fraction of the sky hidden, as by a ball that fills the box."""
         return Sphere(self.center, min(self.half_extents), self.paint).occlusion(points, normals)
 
 
@@ -229,7 +229,7 @@ class Sheet:
         return _unit(normals)
 
     def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(R,) share of the sky hidden: the form factor, for a point on its axis, of a level disk of equal area."""
+        """(R,) fraction of the sky hidden: the form factor, for a point on its axis, of a level disk of equal area."""
         offset = _f32(self.center) - points
         squared = np.maximum(_dot(offset, offset), 1e-12)
         cosines = np.maximum(_dot(normals, offset), 0.0) * np.abs(offset[:, 2]) / squared
@@ -248,16 +248,16 @@ class Scene:
         primitives: what there is.
         lamp: centre of the lamp.
         lamp_size: side of the lamp, world units; it softens the shadows.
-        faint: a neighbour that hides no more than this share of a point's sky hides nothing, which leaves what is far
-            from a moving thing exactly as it is.
-        num_still: the first so many primitives stand still; None: all do.
+        faint: a neighbour that hides no more than this fraction of a point's sky hides nothing, which leaves what is
+            far from a moving thing exactly as it is.
+        num_static: the first so many primitives stand still; None: all do.
     """
 
     primitives: tuple[Primitive, ...]
     lamp: tuple[float, float, float] = (2.2, -2.6, 4.4)
     lamp_size: float = 0.9
     faint: float = 0.0
-    num_still: int | None = None
+    num_static: int | None = None
     _sky: tuple[float, float, float] = field(default=(0.46, 0.50, 0.56), repr=False)
     _ground: tuple[float, float, float] = field(default=(0.20, 0.17, 0.15), repr=False)
     _lamplight: tuple[float, float, float] = field(default=(0.80, 0.74, 0.66), repr=False)
@@ -265,11 +265,11 @@ class Scene:
     @property
     def movers(self) -> range:
         """Indices of the primitives that move."""
-        return range(len(self.primitives) if self.num_still is None else self.num_still, len(self.primitives))
+        return range(len(self.primitives) if self.num_static is None else self.num_static, len(self.primitives))
 
 
 def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
-    """(size, size, 4) uint8 picture: sRGB with straight alpha, transparent background.
+    """(size, size, 4) uint8 image: sRGB with straight alpha, transparent background.
 
     Sample (a, b) of every pixel sees the lamp at place (a, b) of its grid, so shadows are soft and agree between views.
 
@@ -322,7 +322,7 @@ def render_movers(scene: Scene, world_from_cam: np.ndarray, size: int, samples: 
 
 
 def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(R,) bool: points on surfaces of which a camera sees, somewhere in its picture or not; NaN is never seen.
+    """(R,) bool: points on surfaces of which a camera sees, somewhere in its image or not; NaN is never seen.
 
     Args:
         scene: what there is.

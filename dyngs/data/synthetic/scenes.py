@@ -82,7 +82,7 @@ def _spin(time: float) -> Scene:
             ),
         ),
         faint=_FAINT,
-        num_still=2,
+        num_static=2,
     )
 
 
@@ -98,7 +98,7 @@ def _wave(time: float) -> Scene:
             Sheet((0.0, 0.0, 0.16), (0.74, 0.56), waves, _carpet()),
         ),
         faint=_FAINT,
-        num_still=4,
+        num_static=4,
     )
 
 
@@ -121,7 +121,7 @@ def _merge(time: float) -> Scene:
     if grown > 0:
         paint = _swirl((0.40, 0.16, 0.52), (0.93, 0.80, 0.86))
         things.append(Sphere((-0.50, 0.42, _PLATE_TOP + grown), grown, paint, gloss=0.6))
-    return Scene(tuple(things), faint=_FAINT, num_still=2)
+    return Scene(tuple(things), faint=_FAINT, num_static=2)
 
 
 def _room(time: float) -> Scene:
@@ -148,7 +148,7 @@ def _room(time: float) -> Scene:
             ),
         ),
         faint=_FAINT,
-        num_still=7,
+        num_static=7,
     )
 
 
@@ -167,9 +167,9 @@ def _rotation(axis: Literal["x", "y", "z"], angle: float) -> np.ndarray:
     return turn
 
 
-def _ease(share: float) -> float:
+def _ease(fraction: float) -> float:
     """Smoothstep: 0 below 0, 1 above 1."""
-    x = min(max(share, 0.0), 1.0)
+    x = min(max(fraction, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
@@ -189,8 +189,8 @@ def _swirl(first: tuple[float, float, float], second: tuple[float, float, float]
 
     def paint(local: np.ndarray) -> np.ndarray:
         wave = np.sin(9.0 * local[:, 2] + 2.0 * np.arctan2(local[:, 1], local[:, 0]) + 1.5 * np.sin(4.0 * local[:, 0]))
-        share = (0.5 + 0.5 * np.clip(4.0 * wave, -1.0, 1.0))[:, None].astype(np.float32)
-        return share * _f32(first) + (1 - share) * _f32(second)
+        fraction = (0.5 + 0.5 * np.clip(4.0 * wave, -1.0, 1.0))[:, None].astype(np.float32)
+        return fraction * _f32(first) + (1 - fraction) * _f32(second)
 
     return paint
 
@@ -250,8 +250,8 @@ def _wallpaper(across: int, up: int, counts: tuple[int, int], ground: Rgb, spot:
         row = (local[:, up] + 1.0) * counts[1]
         column = (local[:, across] + 1.0) * counts[0] + 0.5 * (np.floor(row) % 2)
         distance = np.hypot(row % 1.0 - 0.5, column % 1.0 - 0.5)
-        share = np.clip((0.34 - distance) / 0.08, 0.0, 1.0)[:, None].astype(np.float32)
-        return share * _f32(spot) + (1 - share) * _f32(ground)
+        fraction = np.clip((0.34 - distance) / 0.08, 0.0, 1.0)[:, None].astype(np.float32)
+        return fraction * _f32(spot) + (1 - fraction) * _f32(ground)
 
     return paint
 

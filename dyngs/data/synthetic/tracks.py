@@ -28,7 +28,7 @@ def true_tracks(
     random = np.random.default_rng(seed)
     local = {i: fullest.primitives[i].sampled(POINTS_PER_THING, random) for i in fullest.movers}
     points = {time: _placed(scenes[time], local) for time in times}
-    visible = [is_in_picture(points[time], pose) & is_seen(scenes[time], points[time], pose) for _, time, pose in shots]
+    visible = [is_in_image(points[time], pose) & is_seen(scenes[time], points[time], pose) for _, time, pose in shots]
     return TrueTracks(
         np.stack([points[time] for time in times]),
         np.array(times, np.float64),
@@ -38,8 +38,8 @@ def true_tracks(
     )
 
 
-def is_in_picture(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(P,) bool: points (P, 3) before the camera and within its square picture; NaN is not."""
+def is_in_image(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
+    """(P,) bool: points (P, 3) before the camera and within its square image; NaN is not."""
     x, y, z = ((np.nan_to_num(points) - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
     reach = np.tan(0.5 * CAMERA_ANGLE_X) * -z
     return np.isfinite(points).all(axis=1) & (z < 0) & (np.abs(x) < reach) & (np.abs(y) < reach)

@@ -48,7 +48,7 @@ class OrbitCamera {
     this.pitch = Math.min(Math.max(this.pitch + y, -STEEPEST), STEEPEST);
   }
 
-  // Moves the scene by shares of the picture's height.
+  // Moves the scene by fractions of the image's height.
   shift(x, y) {
     const [right, down] = this.axes, reach = (this.distance * this.frame.height) / this.frame.intrinsics[1];
     this.target = plus(plus(this.target, right, -x * reach), down, -y * reach);
@@ -58,7 +58,7 @@ class OrbitCamera {
     this.distance = Math.min(Math.max(this.distance * factor, 1e-6), 1e9);
   }
 
-  // The view into a canvas of `width` x `height`: the picture of the capture fits into it.
+  // The view into a canvas of `width` x `height`: the image of the capture fits into it.
   view(width, height) {
     const { intrinsics: [fx, fy, cx, cy], width: w, height: h } = this.frame;
     const scale = Math.min(width / w, height / h);

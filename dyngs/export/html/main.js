@@ -11,7 +11,7 @@ class App {
     this.renderer = new Renderer(this.canvas, scene, new Motion(scene));
     this.camera = new OrbitCamera(scene);
     this.player = new Player(scene, () => this.changed());
-    this.coarse = 1; // share of the pixels' sides that are drawn
+    this.coarse = 1; // fraction of the pixels' sides that are drawn
     this.frames = 0;
     this.wanted = false;
     this.refining = 0;
@@ -97,11 +97,11 @@ class App {
     this.player.time = view.time ?? this.player.time;
     this.player.show();
     this.renderer.draw({ ...view, time: this.player.time });
-    return this.picture();
+    return this.image();
   }
 
-  // The picture as it is drawn now, a data: address of a PNG.
-  picture() {
+  // The image as it is drawn now, a data: address of a PNG.
+  image() {
     this.renderer.blendAll(); // browsers keep a canvas only until it is shown
     return this.canvas.toDataURL("image/png");
   }

@@ -131,7 +131,7 @@ class Bones {
   }
 }
 
-// Shares of 8 bits as floats whose sums, `count` of them each, are 1.
+// Fractions of 8 bits as floats whose sums, `count` of them each, are 1.
 function wholeShares(bytes, count) {
   const shares = Float32Array.from(bytes);
   for (let i = 0; i < shares.length; i += count) {

@@ -12,15 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyngs.colour.network import ColourNetwork
 from dyngs.deform.curves import Curves, curves_of, fitted_curves
 from dyngs.deform.field import Offsets
 from dyngs.deform.scene import DynamicScene, field_scene_of
 from dyngs.export.html.lists import Lists
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.colour.network import ColourNetwork
+from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.scene import Scene
 from dyngs.storage.order import storage_order
 
 BONES = 8
@@ -53,7 +53,7 @@ def add_scene(scene: Scene, lists: Lists, tolerance: float) -> dict[str, Any]:
     told |= _add_gaussians(gaussians.detach(), lists, with_rest=scene.colour is None)
     if scene.colour is not None:
         told["network"] = _add_network(scene.colour, lists)
-    return told | {"count": len(scene), "frames": len(scene.times), "moves": not scene.is_still}
+    return told | {"count": len(scene), "frames": len(scene.times), "moves": not scene.is_static}
 
 
 def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:
@@ -95,10 +95,10 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
         has_nodes = curves.pivots is not None  # few, each of which moves many
         own = points if has_nodes else points[order]
         lists.quantised(f"curve_{name}", _numpy(own.flatten(1)), 16 if has_nodes and name in FINE else 8)
-    if curves.pivots is not None and curves.followed is not None and curves.shares is not None:
+    if curves.pivots is not None and curves.followed is not None and curves.fractions is not None:
         lists.exact("pivots", _numpy(curves.pivots))
         lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
-        lists.exact("shares", _shares(curves.shares[order]))
+        lists.exact("shares", _fractions(curves.fractions[order]))
     if curves.lives is not None:
         lists.exact("lives", _numpy(curves.lives[order]))
     count, points, _ = curves.heads["means"].shape
@@ -112,11 +112,11 @@ def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float
     clip, skeleton = scene.moves_as, scene.learned_skeleton
     top = scene.weights[order].topk(min(BONES, scene.weights.shape[1]), dim=1)
     more = BONES - top.values.shape[1]
-    boned, shares = (torch.nn.functional.pad(x, (0, more)) for x in (top.indices, top.values))
+    boned, fractions = (torch.nn.functional.pad(x, (0, more)) for x in (top.indices, top.values))
     quats = Rotation.from_rotvec(_numpy(clip.poses).reshape(-1, 3)).as_quat(canonical=True)
     quats = np.roll(quats, 1, axis=1).astype(np.float32).reshape(len(clip), -1)
     lists.exact("boned", boned.numpy().astype(np.uint16))
-    lists.exact("boned_shares", _shares(shares))
+    lists.exact("boned_shares", _fractions(fractions))
     lists.exact("joints", _numpy(skeleton.joints))
     lists.exact("clip_times", _numpy(clip.times[:, None]))
     lists.exact("clip_places", _numpy(torch.cat([clip.trans, clip.scale[:, None]], dim=1)))
@@ -152,9 +152,9 @@ def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
     return told | {"time": network.sees_time, "normals": network.sees_normals}
 
 
-def _shares(shares: Tensor) -> NDArray[np.uint8]:
+def _fractions(fractions: Tensor) -> NDArray[np.uint8]:
     """Return shares in [0, 1] as 8 bits; the page makes their sums 1 again."""
-    return (255 * shares).round().numpy().astype(np.uint8)
+    return (255 * fractions).round().numpy().astype(np.uint8)
 
 
 def _numpy(x: Tensor) -> NDArray[np.float32]:

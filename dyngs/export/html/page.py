@@ -15,8 +15,8 @@ from dyngs.conventions import RasterizeMode
 from dyngs.export.html.lists import Lists
 from dyngs.export.html.numbers import add_scene
 from dyngs.files.write import write_text
-from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Scene
 
 HERE = Path(__file__).parent
 SCRIPTS = ("data.js", "motion.js", "sort.js", "renderer.js", "camera.js", "player.js", "main.js")

@@ -179,7 +179,7 @@ class Renderer {
     gl.bindBuffer(gl.ARRAY_BUFFER, null);
     gl.disable(gl.DEPTH_TEST);
     if (this.deep) {
-      this.picture = gl.createTexture();
+      this.image = gl.createTexture();
       this.target = gl.createFramebuffer();
     }
   }
@@ -192,12 +192,12 @@ class Renderer {
     canvas.height = height;
     if (!this.deep) return;
     gl.activeTexture(gl.TEXTURE0 + this.textures.length);
-    gl.bindTexture(gl.TEXTURE_2D, this.picture);
+    gl.bindTexture(gl.TEXTURE_2D, this.image);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
     this.unfiltered();
     for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.picture, 0);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.image, 0);
     if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) this.deep = false;
   }
 
@@ -273,7 +273,7 @@ class Renderer {
     if (!this.deep) return;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.useProgram(this.copy.program);
-    gl.uniform1i(this.copy.at("uPicture"), this.textures.length);
+    gl.uniform1i(this.copy.at("uImage"), this.textures.length);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 }

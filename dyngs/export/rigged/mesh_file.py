@@ -89,10 +89,10 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
     document = mesh_document(mesh, rig, image, animation)
     with atomic_file(path) as temporary:
         document.write(temporary)
-    share = (filled.mirrored + filled.spread) / max(len(texels), 1)
+    fraction = (filled.mirrored + filled.spread) / max(len(texels), 1)
     notes = [
-        f"texture of {len(image)} x {len(image)}; {100 * share:.1f} % of the body is not seen in the Gaussians and has "
-        f"colours from around it, {100 * filled.mirrored / max(len(texels), 1):.1f} % from its mirror side"
+        f"texture of {len(image)} x {len(image)}; {100 * fraction:.1f} % of the body is not seen in the Gaussians and "
+        f"has colours from around it, {100 * filled.mirrored / max(len(texels), 1):.1f} % from its mirror side"
     ]
     if surface.margin is None:
         notes.append(f"the surface is that of the template, whose silhouettes agree best ({surface.plain:.3f})")
@@ -141,7 +141,7 @@ def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: Animat
     } | add_weights(document, mesh.weights)
     kind = np.uint16 if len(mesh.vertices) < 2**16 - 1 else np.uint32
     indices = document.add_numbers(mesh.faces.flatten().numpy().astype(kind), INDICES)
-    picture = document.add_bytes(_png(image))
+    view = document.add_bytes(_png(image))
     texture = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
     document.json |= {
         "scene": 0,
@@ -150,7 +150,7 @@ def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: Animat
         "meshes": [{"name": "person", "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [{"name": "person", "pbrMetallicRoughness": texture, "extensions": {"KHR_materials_unlit": {}}}],
         "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"name": "albedo", "bufferView": picture, "mimeType": "image/png"}],
+        "images": [{"name": "albedo", "bufferView": view, "mimeType": "image/png"}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
         "extensionsUsed": ["KHR_materials_unlit"],
     }

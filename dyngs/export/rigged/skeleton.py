@@ -153,13 +153,13 @@ def add_animation(document: GlbDocument, animation: Animation, first: int) -> No
 
 def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
     """Add the joints and weights (V, J) of vertices; return the accessors by attribute, the heaviest four first."""
-    joints, shares = heaviest_joints(weights)
-    filled = -(-shares.shape[1] // 4) * 4 - shares.shape[1]
-    joints, shares = (torch.nn.functional.pad(x, (0, filled)) for x in (joints, shares))
-    joints = torch.where(shares > 0, joints, 0).to(torch.uint8)
+    joints, fractions = heaviest_joints(weights)
+    filled = -(-fractions.shape[1] // 4) * 4 - fractions.shape[1]
+    joints, fractions = (torch.nn.functional.pad(x, (0, filled)) for x in (joints, fractions))
+    joints = torch.where(fractions > 0, joints, 0).to(torch.uint8)
     found: dict[str, int] = {}
-    for k in range(0, shares.shape[1], 4):
-        own = shares[:, k : k + 4]
+    for k in range(0, fractions.shape[1], 4):
+        own = fractions[:, k : k + 4]
         if k and not bool(own.any()):
             break
         found[f"JOINTS_{k // 4}"] = document.add_numbers(joints[:, k : k + 4].numpy(), VERTICES)

@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.colour.bake import with_harmonics
+from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.placement import rest_clip
@@ -31,7 +31,7 @@ _REACH = (-0.04, 0.07)
 _FACING = 0.3
 """Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not colour the trunk."""
 _TOP = 0.1
-"""Share of what is seen from which a texel counts as covered."""
+"""Fraction of what is seen from which a texel counts as covered."""
 _CHUNK = 8192
 SEEN = 0.1
 """Opacity from which a texel has a colour of its own."""
@@ -48,7 +48,7 @@ class BakedTexels:
     """What is seen straight above P texels.
 
     Attributes:
-        rgb: (P, 3) in [0, 1], display-referred as the pictures were.
+        rgb: (P, 3) in [0, 1], display-referred as the images were.
         alpha: (P,) opacity.
         top: (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is reached.
     """
@@ -121,9 +121,9 @@ def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Te
     weight = alpha * torch.cat([torch.ones_like(clear[:, :1]), clear[:, :-1]], dim=1)
     colours = colours.gather(1, order[..., None].expand(-1, -1, 3))
     total = weight.sum(1)
-    share = weight / total.clamp_min(1e-8)[:, None]
-    first = (share.cumsum(1) < _TOP).sum(1, keepdim=True).clamp_max(share.shape[1] - 1)
-    return (share[..., None] * colours).sum(1), total, height.gather(1, first)[:, 0]
+    fraction = weight / total.clamp_min(1e-8)[:, None]
+    first = (fraction.cumsum(1) < _TOP).sum(1, keepdim=True).clamp_max(fraction.shape[1] - 1)
+    return (fraction[..., None] * colours).sum(1), total, height.gather(1, first)[:, 0]
 
 
 def _turned(linear: Tensor, directions: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ def fill_unseen(baked: BakedTexels, texels: Texels) -> Filled:
 def texture_image(rgb: Tensor, texels: Texels) -> np.ndarray:
     """Return the atlas (S, S, 3) uint8; what no triangle covers has the colour of the nearest texel.
 
-    So neither interpolation nor smaller copies of the picture show seams.
+    So neither interpolation nor smaller copies of the image show seams.
     """
     size = texels.resolution
     image = np.zeros((size * size, 3), np.float32)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import HumanModel
+from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.light import TERMS, Light
 from dyngs.human.avatar.posing import BodyPose, Skeleton
@@ -20,7 +21,6 @@ from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.joints import mirrored_joints
 from dyngs.ops.transfer import sent
-from dyngs.parameters import Parameters
 from dyngs.state import Role, fields_moved_to
 
 LR = {
@@ -31,7 +31,7 @@ LR = {
     "log_scale": 2e-4,
     "weights": 5e-3,  # logarithms
     "pose_dirs": 1e-4,  # m per unit of a rotation matrix
-    "light": 5e-3,  # share of the colour
+    "light": 5e-3,  # fraction of the colour
     "normals": 1e-3,
 }
 """Learning rates."""

@@ -1,4 +1,4 @@
-"""Hands and feet on smaller texels, where the pictures have pixels for them.
+"""Hands and feet on smaller texels, where the images have pixels for them.
 
 The atlas of a template gives a face much room and a finger one texel across. Local letter: N Gaussians.
 """
@@ -29,7 +29,7 @@ def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> 
     """Return the side of a pixel on the person, m of the template: the median over the cameras; infinite without any.
 
     Args:
-        cameras: of the training views, as large as the pictures.
+        cameras: of the training views, as large as the images.
         clip: where the person is; the mean place counts.
         pelvis: (3,) at rest, m.
     """
@@ -40,7 +40,7 @@ def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> 
 
 
 def surface_texels(body: BodyTemplate, resolution: int, vertices: Tensor, pixel: float) -> list[Texels]:
-    """Return the texels of the atlas, and apart from them smaller ones of hands and feet where pictures show more.
+    """Return the texels of the atlas, and apart from them smaller ones of hands and feet where images show more.
 
     Args:
         body: a template with texture coordinates.

@@ -1,4 +1,4 @@
-"""Observations of surface points of a posed body in pictures: inside the silhouette or not, and colour.
+"""Observations of surface points of a posed body in images: inside the silhouette or not, and colour.
 
 Local letters: N points, J joints.
 """
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.human.avatar.posing import BodyPose, Skeleton
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
 
@@ -47,9 +47,9 @@ class PointObservations:
     """Observations of N points.
 
     Attributes:
-        inside: (N,) share of the pictures in whose silhouette a point lies, of those that have it in the frame; 1 where
-            none has. Without alpha the whole frame is silhouette.
-        rgb: (N, 3) mean colour, weighted towards frontal views; grey for points that no picture faces.
+        inside: (N,) fraction of the images in whose silhouette a point lies, of those that have it in the frame; 1
+            where none has. Without alpha the whole frame is silhouette.
+        rgb: (N, 3) mean colour, weighted towards frontal views; grey for points that no image faces.
     """
 
     inside: Tensor
@@ -58,25 +58,25 @@ class PointObservations:
 
 @torch.no_grad()
 def observe_points(
-    surface: SurfacePoints, skeleton: Skeleton, pictures: Iterable[tuple[Picture, BodyPose]]
+    surface: SurfacePoints, skeleton: Skeleton, images: Iterable[tuple[Image, BodyPose]]
 ) -> PointObservations:
-    """Return the observations of the points in the pictures, each with its body pose; occlusion is ignored."""
+    """Return the observations of the points in the images, each with its body pose; occlusion is ignored."""
     count, device = len(surface.points), surface.points.device
     inside, in_frames, weight = (torch.zeros(count, device=device) for _ in range(3))
     colour = torch.zeros(count, 3, device=device)
-    for picture, pose in pictures:
+    for image, pose in images:
         transforms = blend_transforms(
             surface.weights, joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
         )
         world = pose.scale * apply_transforms(transforms, surface.at_rest(pose)) + pose.trans
         normals = (transforms[..., :3] * surface.normals[:, None]).sum(-1)
-        column, row, in_frame = _nearest_pixels(world, picture.cameras)
-        covered = in_frame.float() if picture.alpha is None else picture.alpha[row, column] * in_frame
+        column, row, in_frame = _nearest_pixels(world, image.cameras)
+        covered = in_frame.float() if image.alpha is None else image.alpha[row, column] * in_frame
         inside += (covered > 0.5).float()
         in_frames += in_frame
-        towards = torch.nn.functional.normalize(picture.cameras.centers[0] - world, dim=1)
+        towards = torch.nn.functional.normalize(image.cameras.centers[0] - world, dim=1)
         facing = (towards * torch.nn.functional.normalize(normals, dim=1)).sum(1).clamp_min(0) ** FACING_EXPONENT
-        colour += facing[:, None] * in_frame[:, None] * picture.rgb_premultiplied[row, column]
+        colour += facing[:, None] * in_frame[:, None] * image.rgb_premultiplied[row, column]
         weight += facing * covered
     seen = weight > 1e-3
     rgb = torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5)

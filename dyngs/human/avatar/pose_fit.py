@@ -1,8 +1,8 @@
-"""Body poses fitted to pictures: the poses in which an avatar, which stays as it is, looks most like them.
+"""Body poses fitted to images: the poses in which an avatar, which stays as it is, looks most like them.
 
-Either the whole pictures count, or their silhouettes alone (``dyngs.human.avatar.pose_comparison``). GART (Lei et al.
-2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test pictures like this before they score new poses.
-Local letters: F moments, J joints, V pictures of a moment.
+Either the whole images count, or their silhouettes alone (``dyngs.human.avatar.pose_comparison``). GART (Lei et al.
+2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test images like this before they score new poses.
+Local letters: F moments, J joints, V images of a moment.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
+from dyngs.gaussians.rendering import Rendering, RenderOptions
+from dyngs.gaussians.scene import Moment
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
-from dyngs.human.avatar.pose_comparison import PICTURES, Comparison
+from dyngs.human.avatar.pose_comparison import IMAGES, Comparison
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.ops.adam import adam_step_
-from dyngs.rendering import Rendering, RenderOptions
-from dyngs.scene import Moment
 
 COARSE_PX = 40
 """Height of the person, px, in the coarsest of the three rounds."""
@@ -33,7 +33,7 @@ SHIFT_RATE = 0.5
 """Learning rate of the translation, m, over that of rotations, rad."""
 BETAS = (0.9, 0.99)
 WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
-"""After so many updates (at least one for each picture) the rate is halved unless the mean loss fell by that share; a
+"""After so many updates (at least one for each image) the rate is halved unless the mean loss fell by that share; a
 round ends below the last rate, or after so many windows."""
 
 
@@ -51,7 +51,7 @@ class Correction:
 
 @dataclass(frozen=True)
 class FittedPoses:
-    """Poses fitted to pictures.
+    """Poses fitted to images.
 
     Attributes:
         scene: the same person, playing them.
@@ -62,28 +62,28 @@ class FittedPoses:
     updates: tuple[int, ...]
 
 
-def fitted_to_pictures(
+def fitted_to_images(
     scene: HumanScene,
-    pictures: PictureLoader,
+    images: ImageLoader,
     background: Tensor,
     options: RenderOptions,
-    comparison: Comparison = PICTURES,
+    comparison: Comparison = IMAGES,
 ) -> FittedPoses:
-    """Return the person in the poses in which it looks most like ``pictures``: rotations of joints and translation.
+    """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
-    All pictures of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with
+    All images of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with
     that corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are.
     No random numbers are drawn.
 
     Args:
         scene: playing the clip that is to be corrected.
-        pictures: of a split.
+        images: of a split.
         background: (3,) behind both.
         options: as in training.
-        comparison: what of the pictures counts.
+        comparison: what of the images counts.
     """
     groups: dict[float, list[int]] = {}
-    for index, time in enumerate(pictures.times):
+    for index, time in enumerate(images.times):
         groups.setdefault(0.0 if time is None else time, []).append(index)
     times = sorted(groups)
     starts = _moments(scene.moves_as, times)
@@ -91,7 +91,7 @@ def fitted_to_pictures(
     counts: list[int] = []
     for row, time in enumerate(times):
         start = starts.select(torch.tensor([row], device="cpu"))
-        fit = _Fit(scene, start, time, background, options, tuple(pictures[i] for i in groups[time]), comparison)
+        fit = _Fit(scene, start, time, background, options, tuple(images[i] for i in groups[time]), comparison)
         correction, count = fit.fitted(found[-1] if found else None)
         found.append(correction)
         counts.append(count)
@@ -121,9 +121,9 @@ class _Fit:
     Attributes:
         scene: the person.
         start: the pose to begin with, a clip of one frame.
-        time: of the pictures.
+        time: of the images.
         background, options: to draw with.
-        pictures: V.
+        images: V.
         comparison: what of these counts.
     """
 
@@ -132,7 +132,7 @@ class _Fit:
     time: float
     background: Tensor
     options: RenderOptions
-    pictures: tuple[Picture, ...]
+    images: tuple[Image, ...]
     comparison: Comparison
 
     def fitted(self, guess: Correction | None) -> tuple[Correction, int]:
@@ -143,7 +143,7 @@ class _Fit:
         """
         joints = self.scene.skeleton.joints
         none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))
-        shrinks = _shrinks(self.pictures)
+        shrinks = _shrinks(self.images)
         found = none if guess is None else self._better(none, guess, shrinks[0])
         count = 0
         for shrink, first, last in zip(shrinks, FIRST_RATES, LAST_RATES, strict=True):
@@ -152,16 +152,16 @@ class _Fit:
         return self._better(none, found, 1), count
 
     def _better(self, a: Correction, b: Correction, shrink: int) -> Correction:
-        """Return the one that looks more like the pictures, ``a`` if neither does."""
+        """Return the one that looks more like the images, ``a`` if neither does."""
         with torch.no_grad():
-            losses = [float(self._loss(x, self.pictures, shrink)) for x in (a, b)]
+            losses = [float(self._loss(x, self.images, shrink)) for x in (a, b)]
         return b if losses[1] < losses[0] else a
 
     def _round(self, start: Correction, shrink: int, rate: float, last: float) -> tuple[Correction, int]:
-        """Return the correction after one round, and its number of updates; each is for one picture, in turn."""
+        """Return the correction after one round, and its number of updates; each is for one image, in turn."""
         now = Correction(start.turns.clone(), start.shift.clone())
         moments = [torch.zeros_like(x) for x in (now.turns, now.turns, now.shift, now.shift)]
-        window = len(self.pictures) * math.ceil(WINDOW / len(self.pictures))
+        window = len(self.images) * math.ceil(WINDOW / len(self.images))
         before, update = math.inf, 0
         for _ in range(MOST_WINDOWS):
             total = 0.0
@@ -169,10 +169,10 @@ class _Fit:
                 update += 1
                 leaves = now.leaves()
                 with torch.enable_grad():
-                    loss = self._loss(leaves, (self.pictures[update % len(self.pictures)],), shrink)
+                    loss = self._loss(leaves, (self.images[update % len(self.images)],), shrink)
                     by_turns, by_shift = torch.autograd.grad(loss, [leaves.turns, leaves.shift])
                 total += float(loss.detach())
-                if len(self.pictures) >= self.comparison.views_to_turn:
+                if len(self.images) >= self.comparison.views_to_turn:
                     adam_step_(now.turns, by_turns, *moments[:2], lr=rate, step=update, betas=BETAS)
                 adam_step_(now.shift, by_shift, *moments[2:], lr=SHIFT_RATE * rate, step=update, betas=BETAS)
             if total > (1 - LEAST_GAIN) * before:
@@ -182,8 +182,8 @@ class _Fit:
             before = total
         return now, update
 
-    def _loss(self, correction: Correction, pictures: Sequence[Picture], shrink: int) -> Tensor:
-        """Return the loss () of a correction: the mean over ``pictures``, compared after shrinking, and its size."""
+    def _loss(self, correction: Correction, images: Sequence[Image], shrink: int) -> Tensor:
+        """Return the loss () of a correction: the mean over ``images``, compared after shrinking, and its size."""
         start, how = self.start, self.comparison
         posing = BodyPose(
             axis_angle_to_matrix(start.poses[0]) @ axis_angle_to_matrix(correction.turns),
@@ -191,17 +191,17 @@ class _Fit:
             start.scale[0],
         )
         moment = self.scene.in_pose(posing, self.time)
-        losses = [how.difference(self._drawn(x, moment), x, self.background, shrink) for x in pictures]
+        losses = [how.difference(self._drawn(x, moment), x, self.background, shrink) for x in images]
         size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
         return torch.stack(losses).mean() + size
 
-    def _drawn(self, picture: Picture, moment: Moment) -> Rendering:
-        """Return the person at ``moment`` as the camera of a picture sees it."""
-        return self.scene.render(picture.cameras, moment, options=self.options, background=self.background)
+    def _drawn(self, image: Image, moment: Moment) -> Rendering:
+        """Return the person at ``moment`` as the camera of an image sees it."""
+        return self.scene.render(image.cameras, moment, options=self.options, background=self.background)
 
 
-def _shrinks(pictures: Sequence[Picture]) -> tuple[int, int, int]:
-    """Return the factors by which pictures are shrunk in the three rounds."""
-    heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in pictures]
+def _shrinks(images: Sequence[Image]) -> tuple[int, int, int]:
+    """Return the factors by which images are shrunk in the three rounds."""
+    heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in images]
     coarse = max(1, round(max(heights) / COARSE_PX))
     return coarse, round(math.sqrt(coarse)), 1

@@ -8,9 +8,11 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from dyngs.colour.network import Frame
 from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import Frame
+from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.scene import Moment, Scene, clamped_time
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.corrections import (
     SharedCorrection,
@@ -32,8 +34,6 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.avatar.validation import require_avatar, require_shapes
 from dyngs.human.motion.clip import MotionClip
-from dyngs.parameters import Parameters
-from dyngs.scene import Moment, Scene, clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed, with_role
 
 
@@ -89,7 +89,7 @@ class HumanScene(Scene):
         return tuple(self.moves_as.times.tolist())
 
     @property
-    def is_still(self) -> bool:
+    def is_static(self) -> bool:
         """Whether the clip that is played has one pose."""
         return len(self.clip if self.played is None else self.played) == 1
 
@@ -153,7 +153,7 @@ class HumanScene(Scene):
 
         Who keeps one pose is posed once, but for gradients.
         """
-        if not self.is_still or torch.is_grad_enabled():
+        if not self.is_static or torch.is_grad_enabled():
             return self._posed(time)
         if "posed" not in self._derived:
             self._derived["posed"] = self._posed(None)
@@ -200,7 +200,7 @@ class HumanScene(Scene):
 
     def part(self, which: str) -> HumanScene:
         """Return all of it, or nothing: a person moves as a whole."""
-        count = len(self) if (which == "still") == self.is_still else 0
+        count = len(self) if (which == "still") == self.is_static else 0
         return self.select(torch.arange(count, device=self.gaussians.means.device))
 
     def playing(self, clip: MotionClip) -> HumanScene:
@@ -215,8 +215,8 @@ class HumanScene(Scene):
         state = super().drawing_state()
         corrections = state.pop("model.learned.weights").tensor
         if bool(corrections.any()):
-            shares = self.anchors.weights * corrections.exp()
-            weights = StateTensor(shares / shares.sum(1, keepdim=True), Role.PER_GAUSSIAN)
+            fractions = self.anchors.weights * corrections.exp()
+            weights = StateTensor(fractions / fractions.sum(1, keepdim=True), Role.PER_GAUSSIAN)
             state["model.anchors.weights"] = weights
         return state
 

@@ -1,4 +1,4 @@
-"""The person that is filmed, and the first Gaussians on its template: in the colours and silhouettes of pictures."""
+"""The person that is filmed, and the first Gaussians on its template: in the colours and silhouettes of images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from dyngs.conventions import SH_C0
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.observations import SurfacePoints, observe_points
@@ -18,7 +18,7 @@ from dyngs.human.motion.captured import CapturedMotion
 
 @dataclass(frozen=True)
 class Subject:
-    """A person in a capture: the template's skeleton, the anchors of the first N Gaussians, the poses of the pictures.
+    """A person in a capture: the template's skeleton, the anchors of the first N Gaussians, the poses of the images.
 
     ``shapes`` are the template's pose blend shapes, None where it has none.
     """
@@ -30,21 +30,21 @@ class Subject:
 
 
 def first_look(
-    gaussians: Gaussians, normals: Tensor, subject: Subject, pictures: Iterable[Picture], carve: float
+    gaussians: Gaussians, normals: Tensor, subject: Subject, images: Iterable[Image], carve: float
 ) -> tuple[Gaussians, Subject]:
-    """Return the first Gaussians that lie inside the silhouettes, in the colours of the pictures.
+    """Return the first Gaussians that lie inside the silhouettes, in the colours of the images.
 
-    Gaussians above the lowest scaffold are kept if they lie inside the silhouette of a share ``carve`` of the pictures.
+    Gaussians above the lowest scaffold are kept if they lie inside the silhouette of a share ``carve`` of the images.
 
     Args:
         gaussians: N, on the scaffolds.
         normals: (N, 3) of the surface below them at rest.
         subject: whose anchors are those of ``gaussians``.
-        pictures: some of those to train on.
+        images: some of those to train on.
     """
     clip, anchors, skeleton = subject.footage.clip, subject.anchors, subject.skeleton
     rows = subject.footage.rows
-    shown = ((picture, frame_pose(clip, rows[picture.frame or 0])) for picture in pictures)
+    shown = ((image, frame_pose(clip, rows[image.frame or 0])) for image in images)
     weights = skinning_weights(anchors, len(skeleton.joints))
 
     def offsets(posing: BodyPose) -> Tensor | None:

@@ -1,4 +1,4 @@
-"""How an avatar is trained: in the pose of every picture, with the fit of its body refined."""
+"""How an avatar is trained: in the pose of every image, with the fit of its body refined."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.colour.network import Frame
 from dyngs.config import HumanModel
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import Frame
+from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.scene import Moment, Scene
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
 from dyngs.human.avatar.light import difference_of_sides
 from dyngs.human.avatar.neighbours import linked_neighbours
@@ -23,8 +25,6 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.subject import Subject
 from dyngs.human.avatar.unseen import HARDLY, filled, mirror_images, sightings, trust_in
 from dyngs.ops.adam import Count
-from dyngs.parameters import Parameters
-from dyngs.scene import Moment, Scene
 from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates
 
@@ -35,7 +35,7 @@ SIDES_WEIGHT = 0.1
 LOOKS = 100
 """Number of training views, at most, in which it is counted how much they show of each Gaussian."""
 WORTH_TELLING = 0.01
-"""Least share of Gaussians that are hardly seen at which a line says so."""
+"""Least fraction of Gaussians that are hardly seen at which a line says so."""
 
 
 class HumanTraining:
@@ -75,7 +75,7 @@ class HumanTraining:
         )
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return true: every picture, always."""
+        """Return true: every image, always."""
         return True
 
     def window(self, step: int) -> tuple[float, float]:
@@ -85,15 +85,15 @@ class HumanTraining:
     def extend(self, scene: HumanScene, seen: tuple[float, float], step: int) -> None:
         """Do nothing: all times are trained on."""
 
-    def moment(self, scene: HumanScene, picture: Picture, step: int) -> Moment:
-        """Return the Gaussians in the pose of ``picture``, and the regularizers.
+    def moment(self, scene: HumanScene, image: Image, step: int) -> Moment:
+        """Return the Gaussians in the pose of ``image``, and the regularizers.
 
         Raises:
-            DyngsError: the picture's frame has no pose.
+            DyngsError: the image's frame has no pose.
         """
-        row = self._rows.get(-1 if picture.frame is None else picture.frame)
+        row = self._rows.get(-1 if image.frame is None else image.frame)
         if row is None:
-            raise DyngsError(f"view {picture.name!r}: no body parameters for frame {picture.frame}")
+            raise DyngsError(f"view {image.name!r}: no body parameters for frame {image.frame}")
         penalties = self._penalties(scene)
         row = min(row, len(scene.clip) - 1)  # who never moves has one row
         gaussians, posing = self._in_frame(scene, row, step)
@@ -103,7 +103,7 @@ class HumanTraining:
                 penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
         frame = Frame(scene.gaussians.means, posing.rotations[0])
-        return Moment(gaussians, picture.time, frame, penalties)
+        return Moment(gaussians, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
         """Update the corrections."""
@@ -124,7 +124,7 @@ class HumanTraining:
         return scene
 
     def grown(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
-        """Return the scene as it is, and after the last step new values for what the pictures hardly show."""
+        """Return the scene as it is, and after the last step new values for what the images hardly show."""
         if step != self.rates.steps or not self.options.fill_unseen or not self.views or not len(scene):
             return None
         shown = [self.views[i] for i in evenly_spaced(len(self.views), LOOKS)]

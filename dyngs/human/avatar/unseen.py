@@ -1,4 +1,4 @@
-"""Gaussians that the pictures hardly show: filled from the other side of the body, and from around them.
+"""Gaussians that the images hardly show: filled from the other side of the body, and from around them.
 
 Adam's steps do not shrink with the gradient, so that what is seen through gaps only ends with colours of chance.
 Local letters: N Gaussians, J joints, K neighbours.
@@ -14,9 +14,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions, contributions
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.neighbours import linked_neighbours
-from dyngs.rendering import RenderOptions, contributions
 
 ENOUGH = 1.0
 """Sightings (see ``sightings``) at which a Gaussian's own values count as much as what is around it."""
@@ -39,11 +39,11 @@ _RESIDUAL, _MAX_ROUNDS = 1e-5, 1000
 def sightings(
     drawn: Iterable[tuple[Gaussians, Cameras]], sizes: Tensor, scale: float, options: RenderOptions
 ) -> Tensor:
-    """Return (N,) sums over views of the squared share of each Gaussian's texel that is seen there.
+    """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen there.
 
     A view counts as 1 where the texel is in full view, and hardly at all where little of it shines through others: a
-    hundred views that see a hundredth of it tell less than one that sees all. Independent of the size of the pictures.
-    Gaussians too faint to be drawn have infinity: the pictures made them so.
+    hundred views that see a hundredth of it tell less than one that sees all. Independent of the size of the images.
+    Gaussians too faint to be drawn have infinity: the images made them so.
 
     Args:
         drawn: the N Gaussians in the pose of each view, and its camera.
@@ -83,18 +83,18 @@ def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: floa
     other, is_image = mirror_images(anchors, middle)
     borrowed = (1 - trust) * trust[other] * is_image * MIRRORED
     known = trust + borrowed
-    share = (borrowed / known.clamp_min(_OWN))[:, None]
+    fraction = (borrowed / known.clamp_min(_OWN))[:, None]
     away = gaussians.means - anchors.points
     flipped = away[other] * away.new_tensor([-1.0, 1.0, 1.0])
     opacity = gaussians.logit_opacities[:, None]
     sh = gaussians.sh.clone()
-    colour = torch.lerp(sh[:, 0], sh[other, 0], share)
+    colour = torch.lerp(sh[:, 0], sh[other, 0], fraction)
     sh[:, 0] = smoothed(colour, known, anchors, weights)
     sh[:, 1:] *= trust[:, None, None]
     return {
         "sh": sh,
-        "means": anchors.points + torch.lerp(away, flipped, share),
-        "logit_opacities": torch.lerp(opacity, opacity[other], share)[:, 0],
+        "means": anchors.points + torch.lerp(away, flipped, fraction),
+        "logit_opacities": torch.lerp(opacity, opacity[other], fraction)[:, 0],
     }
 
 

@@ -6,9 +6,9 @@ import hashlib
 import re
 from collections.abc import Callable
 
+from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.prepare.photos import digest_of
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
 from dyngs.files.cache import cache_folder
@@ -16,7 +16,7 @@ from dyngs.human.fit.fitted_capture import write_fit
 from dyngs.human.fit.inputs import FitInputs
 
 KEYPOINTS = "keypoints"
-"""Folder of a capture with key points of its pictures, as OpenPose writes them."""
+"""Folder of a capture with key points of its images, as OpenPose writes them."""
 _LARGEST = 100_000_000
 """Files of a capture larger than this many bytes, such as videos, are not what it says about bodies and cameras."""
 

@@ -15,8 +15,9 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, View
 from dyngs.data.fitted_body import numbered
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError
+from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit.joints3d import Joints3D
 from dyngs.human.fit.keypoints import Keypoints
 from dyngs.human.fit.lens_fit import LensFit, fit_lens
@@ -30,10 +31,9 @@ from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.captured import CapturedMotion, captured_motion
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.body import BodyTemplate
-from dyngs.parameters import Parameters
 
-PICTURE_SIDE = 512
-"""Longest side of the pictures that are read, px."""
+IMAGE_SIDE = 512
+"""Longest side of the images that are read, px."""
 RESOLUTION = 48
 """Texels per side of the atlas whose discs are drawn."""
 MOST_VIEWS = 8
@@ -71,7 +71,7 @@ class FitEffort:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known beside pictures and given poses.
+    """What is known beside images and given poses.
 
     Attributes:
         joints: in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without.
@@ -121,7 +121,7 @@ class CaptureFit:
         tried: all candidates; the first one has the poses as given.
         held_out: views left out of the fit, on which the candidates were measured; 0: measured on those fitted to.
         from_silhouettes: no poses were given.
-        lens: the focal length of one standing camera that was guessed; None where cameras are known.
+        lens: the focal length of one fixed camera that was guessed; None where cameras are known.
     """
 
     fit: BodyFit
@@ -170,7 +170,7 @@ def fit_capture(
 
     Args:
         capture: with alpha.
-        options: how its pictures are read.
+        options: how its images are read.
         body: with a shape space.
         report: of progress.
         keypoints: of the training views, see ``dyngs.human.fit.keypoints``; None without.
@@ -181,7 +181,7 @@ def fit_capture(
         DyngsError: no silhouettes, or nobody in them.
     """
     if not capture.has_alpha:
-        raise DyngsError(f"{capture.root}: the pictures have no silhouettes; add masks of the person (docs/human.md)")
+        raise DyngsError(f"{capture.root}: the images have no silhouettes; add masks of the person (docs/human.md)")
     capture = capture.replace(splits=numbered(capture.splits))
     views = capture.splits["train"]
     given = capture.body is not None
@@ -263,29 +263,29 @@ def look_at(
         DyngsError: nobody is seen.
     """
     views = capture.splits["train"]
-    pictures = PictureLoader(views, options.model_copy(update={"longest_side": PICTURE_SIDE, "downscale": 1}))
+    images = ImageLoader(views, options.model_copy(update={"longest_side": IMAGE_SIDE, "downscale": 1}))
     used, left_out = split_views(views, motion)
     shown = [i for rows in (used, left_out) for own in rows.values() for i in own]
-    side = longest_box_side(pictures[i] for i in shown)
+    side = longest_box_side(images[i] for i in shown)
     if side < 8:
         raise DyngsError(f"{capture.root}: nobody is seen in the silhouettes; check the masks (docs/human.md)")
     size = min(effort.side, 2 * (side // 2))
-    marked = _marked(views, pictures, shown, keypoints)
+    marked = _marked(views, images, shown, keypoints)
 
     def frames(rows: dict[int, list[int]]) -> dict[int, ObservedFrame | None]:
-        return {row: observed_frame([pictures[i] for i in own], side, size, marked) for row, own in rows.items()}
+        return {row: observed_frame([images[i] for i in own], side, size, marked) for row, own in rows.items()}
 
     held_out, seen = sum(map(len, left_out.values())), frames(used)
     return Seen(seen, frames(left_out) if held_out else seen, held_out)
 
 
-def _marked(views: Sequence[View], pictures: PictureLoader, shown: Sequence[int], points: Keypoints) -> Keypoints:
-    """Return the key points (55, 3) in the pixels of the pictures, of those of the stored pictures."""
+def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], points: Keypoints) -> Keypoints:
+    """Return the key points (55, 3) in the pixels of the images, of those of the stored images."""
     found: Keypoints = {}
     for i in shown if points else ():
         view = views[i]
         if view.name in points:
-            camera = pictures[i].cameras
+            camera = images[i].cameras
             scale = points[view.name].new_tensor([camera.width / view.width, camera.height / view.height, 1.0])
             found[view.name] = points[view.name] * scale
     return found
@@ -383,7 +383,7 @@ def measured(name: str, learned: Parameters, clip: MotionClip, surface: Surface,
 
 
 def _iou(drawn: Tensor, seen: ObservedFrame) -> Tensor:
-    """Return the IoU (V,) of coverages above a half, where pictures are known."""
+    """Return the IoU (V,) of coverages above a half, where images are known."""
     known = seen.known > 0
     ours, theirs = (drawn > 0.5) & known, (seen.alpha > 0.5) & known
     return (ours & theirs).sum((1, 2)) / (ours | theirs).sum((1, 2)).clamp_min(1)

@@ -17,7 +17,7 @@ from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, Split
 from dyngs.data.fitted_body import numbered
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import write_image, write_text
@@ -87,16 +87,16 @@ def write_fitted_capture(
     Raises:
         DyngsError: see ``fit_capture``; ``out`` is not empty.
     """
-    return _fitted(options, out, report, given, with_pictures=True)
+    return _fitted(options, out, report, given, with_images=True)
 
 
 def write_fit(options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE) -> FittedCapture:
-    """As ``write_fitted_capture``, but without pictures and cameras: for ``data.body``."""
-    return _fitted(options, out, report, given, with_pictures=False)
+    """As ``write_fitted_capture``, but without images and cameras: for ``data.body``."""
+    return _fitted(options, out, report, given, with_images=False)
 
 
 def _fitted(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs, *, with_pictures: bool
+    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs, *, with_images: bool
 ) -> FittedCapture:
     require_new_folder(out)
     person = None if given.person is None else known_shape(given.person)
@@ -115,8 +115,8 @@ def _fitted(
         new_poses = placed_clip(capture, options, shaped, found, report)
         clips = fitted_clips(capture, shaped, found, new_poses)
         by_avatar = () if given.avatar is None else _posed(given.avatar, capture, options, clips)
-        if with_pictures:
-            _write_pictures(folder, capture, options, clips)
+        if with_images:
+            _write_images(folder, capture, options, clips)
             for split, clip in clips.items():
                 clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
         _write_bodies(folder, capture, clips, found.fit.betas)
@@ -147,27 +147,27 @@ def _write_bodies(out: Path, capture: Capture, clips: Mapping[Split, FittedClip]
         write_body(path, found.clip, betas.numpy(), capture.world_offset, found.frames, capture.fps)
 
 
-def _write_pictures(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, FittedClip]) -> None:
-    """Write the pictures and cameras of all splits."""
+def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, FittedClip]) -> None:
+    """Write the images and cameras of all splits."""
     full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
     for split, views in capture.splits.items():
         if views:
-            pictures, found = PictureLoader(views, full), clips["pose" if split == "pose" else "train"]
-            shown = ((view, pictures[i]) for i, view in enumerate(views))
+            images, found = ImageLoader(views, full), clips["pose" if split == "pose" else "train"]
+            shown = ((view, images[i]) for i, view in enumerate(views))
             write_split(out, split, shown, found.rows, capture.world_offset)
 
 
 def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:
-    """Return pictures of the training views with the body's outline as given (red) and as fitted (green)."""
+    """Return images of the training views with the body's outline as given (red) and as fitted (green)."""
     views = capture.splits["train"]
-    pictures = PictureLoader(views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1}))
+    images = ImageLoader(views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1}))
     given, fitted, rows = found.motion.clip, found.fit.fitted(found.motion.clip), found.motion.rows
     surface, sheets = surface_of(body, _SHOWN_RESOLUTION), []
     for i in evenly_spaced(len(views), _SHOWN):
         row = rows[-1 if views[i].frame is None else views[i].frame or 0]
         mean = torch.zeros_like(found.fit.betas)
         before, after = frame_pose(given, row), frame_pose(fitted, row)
-        sheets.append(overlay(pictures[i], surface, [(mean, before, GIVEN), (found.fit.betas, after, FITTED)]))
+        sheets.append(overlay(images[i], surface, [(mean, before, GIVEN), (found.fit.betas, after, FITTED)]))
     return side_by_side(sheets, _COLUMNS)
 
 

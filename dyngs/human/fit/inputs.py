@@ -1,4 +1,4 @@
-"""The inputs of ``dyngs data fit``: captures, plain clips of one standing camera, masks made from the background."""
+"""The inputs of ``dyngs data fit``: captures, plain clips of one fixed camera, masks made from the background."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dyngs.capture.background_masks import with_background_masks
+from dyngs.capture.fixed_camera import FORMAT, is_plain_clip, read_fixed_camera, silhouettes_of, zoomed
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View
-from dyngs.data.loader import PictureLoader
-from dyngs.data.prepare.background_masks import with_background_masks
-from dyngs.data.prepare.standing_camera import FORMAT, is_plain_clip, read_standing_camera, silhouettes_of, zoomed
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
@@ -20,12 +20,12 @@ from dyngs.human.template.body_reader import read_body
 from dyngs.human.template.load import default_template
 
 _LOOKED_AT, _PRESENT = 128, 0.2
-"""Longest side of the pictures in which somebody is looked for, and the least share of the usual area that counts."""
+"""Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""
 
 
 @dataclass(frozen=True)
 class KnownAvatar:
-    """The avatar of a person, and the longest side of the pictures it was trained on, px; None: as they are."""
+    """The avatar of a person, and the longest side of the images it was trained on, px; None: as they are."""
 
     scene: HumanScene
     longest_side: int | None
@@ -38,7 +38,7 @@ class FitInputs:
     Attributes:
         keypoints: folder or file of 2D key points.
         masks: folder of masks, white = the person.
-        background: picture of the place without the person, or a folder of one for each camera.
+        background: image of the place without the person, or a folder of one for each camera.
         joints: file or folder of 3D joints or posed vertices, see ``read_joints``.
         body: body file whose vertices these are; None: the free template.
         person: capture or run of the same person, whose shape is kept.
@@ -67,7 +67,7 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
     """Return a capture of a person with silhouettes.
 
     Args:
-        options: ``root`` is a capture, or a video or a folder of pictures of one standing camera.
+        options: ``root`` is a capture, or a video or a folder of images of one fixed camera.
         given: masks are taken in place of those of the capture; without any the person is told from the background.
         work: masks that are made are written to this folder.
         say: is told in lines what was taken, and how good masks are.
@@ -77,7 +77,7 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
     """
     source = options.root
     if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
-        capture = read_standing_camera(options, given.masks)
+        capture = read_fixed_camera(options, given.masks)
         for line in capture.warnings:
             say(line)
     else:
@@ -116,7 +116,7 @@ def _with_masks(capture: Capture, masks: Path) -> Capture:
     """Return the capture with the masks of a folder as silhouettes.
 
     Raises:
-        DyngsError: a picture without one.
+        DyngsError: an image without one.
     """
     splits = {}
     for split, views in capture.splits.items():
@@ -132,7 +132,7 @@ def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[
         DyngsError: nobody is seen in any.
     """
     views = capture.splits["train"]
-    small = PictureLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
+    small = ImageLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
     areas = []
     for i in range(len(views)):
         alpha = small[i].alpha

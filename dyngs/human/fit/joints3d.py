@@ -44,9 +44,9 @@ class _Found:
     """Joints as a file has them.
 
     Attributes:
-        joints: key of a frame (its number, or the name of a picture) to (K, 4), with confidence.
+        joints: key of a frame (its number, or the name of an image) to (K, 4), with confidence.
         order: name of their order, in ``ORDERS``.
-        space: of their axes: the capture's world, or OpenCV's camera of the picture.
+        space: of their axes: the capture's world, or OpenCV's camera of the image.
     """
 
     joints: Mapping[int | str, np.ndarray]
@@ -59,8 +59,8 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
 
     ``.npz``: ``joints`` (F, K, 3 or 4: with confidence), or ``vertices`` (F, N, 3) of ``body``; ``frames`` (F,)
     numbers, else 0, 1, ...; ``order`` and ``space`` as text. ``.json``: an object of ``order``, ``space`` and
-    ``joints``, which maps pictures or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body,
-    ``PICTURE.npz`` with ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck
+    ``joints``, which maps images or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body,
+    ``IMAGE.npz`` with ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck
     et al. (2018), whose vertices are those of SMPL.
 
     Args:
@@ -77,7 +77,7 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
     frames = _by_frame(path, found, views)
     if not frames:
         raise DyngsError(
-            f"{path}: no joints for any frame of the capture; name them by their numbers or by the names of pictures "
+            f"{path}: no joints for any frame of the capture; name them by their numbers or by the names of images "
             f"({first_few(sorted(map(str, found.joints)))} in the file, {views[0].name} in the capture)"
         )
     offset = capture.world_offset
@@ -129,7 +129,7 @@ def _of_npz(path: Path, body: BodyTemplate) -> _Found:
 
 
 def _of_sam_3d_body(folder: Path) -> _Found:
-    """Read a folder of the dictionaries that SAM 3D Body returns, one file per picture."""
+    """Read a folder of the dictionaries that SAM 3D Body returns, one file per image."""
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise DyngsError(f"{folder}: no .npz files of SAM 3D Body there")
@@ -220,7 +220,7 @@ def _by_frame(path: Path, found: _Found, views: Sequence[View]) -> dict[int, tup
         if view is None:
             continue
         if found.space == "camera" and isinstance(key, int) and len({view.camera_id for view in views}) > 1:
-            raise DyngsError(f"{path}: joints of a camera need the names of pictures, not frame numbers")
+            raise DyngsError(f"{path}: joints of a camera need the names of images, not frame numbers")
         frames[-1 if view.frame is None else view.frame] = (joints, view)
     return frames
 

@@ -1,4 +1,4 @@
-"""2D key points of a person in pictures, as detectors write them: OpenPose and COCO.
+"""2D key points of a person in images, as detectors write them: OpenPose and COCO.
 
 Local letters: J joints of SMPL-X, K key points of a format, V views.
 """
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.data.capture import View
-from dyngs.data.pictures.lens import undistorted_points
+from dyngs.data.images.lens import undistorted_points
 from dyngs.errors import DyngsError, reading
 from dyngs.files.fields import numbers_of
 from dyngs.files.json_files import read_json_object
@@ -33,14 +33,14 @@ _ORDERS = {17: COCO, 133: COCO, 25: BODY_25, 18: COCO_18}
 """Number of key points of a format to the names of the first ones, as published."""
 
 Keypoints = dict[str, Tensor]
-"""Name of a view to (55, 3): column, row and confidence of joints in its stored picture, undistorted; confidence 0
+"""Name of a view to (55, 3): column, row and confidence of joints in its stored image, undistorted; confidence 0
 where a joint is not marked."""
 
 
 def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     """Return the key points of the views: of a folder of OpenPose files, or of one COCO file.
 
-    OpenPose: ``NAME_keypoints.json`` or ``NAME.json``, NAME being the picture's name without suffix; ``people`` with
+    OpenPose: ``NAME_keypoints.json`` or ``NAME.json``, NAME being the image's name without suffix; ``people`` with
     ``pose_keypoints_2d`` of 25 or 18 points. COCO: ``images`` (id, file_name) and
     ``annotations`` (image_id, keypoints of 17 or 133 points). Of several people the most confident one is taken.
 
@@ -51,15 +51,15 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     rows = _openpose(path, stems) if path.is_dir() else _coco(path, stems)
     if not rows:
         raise DyngsError(
-            f"{path}: no key points for any picture of the capture; files of OpenPose are called "
-            "PICTURE_keypoints.json, and COCO's images have the pictures' names as file_name"
+            f"{path}: no key points for any image of the capture; files of OpenPose are called "
+            "IMAGE_keypoints.json, and COCO's images have the images' names as file_name"
         )
     by_name = {view.name: view for view in views}
     return {name: _placed(by_name[name], joints) for name, joints in rows.items()}
 
 
 def by_stem(views: Sequence[View]) -> dict[str, str]:
-    """Return picture name without folder and suffix to name of the view, and with the folder, too."""
+    """Return image name without folder and suffix to name of the view, and with the folder, too."""
     found: dict[str, str] = {}
     twice: set[str] = set()
     for view in views:

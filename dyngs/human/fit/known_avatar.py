@@ -15,17 +15,17 @@ from torch import Tensor
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.human.avatar.pose_comparison import SILHOUETTES
-from dyngs.human.avatar.pose_fit import fitted_to_pictures
+from dyngs.human.avatar.pose_fit import fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.fit.clips import FittedClip
 from dyngs.human.fit.inputs import KnownAvatar
 from dyngs.human.motion.clip import MotionClip
 
 LONGEST_SIDE = 320
-"""Of the pictures whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
-size, since its edges are those of its pictures."""
+"""Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
+size, since its edges are those of its images."""
 CHECKED = 3
 """Moments, at most, at which a view is left out to see what the fit is worth."""
 _FEWEST_VIEWS = 3
@@ -63,30 +63,30 @@ class AvatarPoses:
 
 
 def posed_by_avatar(avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: FittedClip) -> AvatarPoses:
-    """Return the poses of a clip in which the avatar has the silhouettes of its pictures, where that is better.
+    """Return the poses of a clip in which the avatar has the silhouettes of its images, where that is better.
 
     The size is that of ``start``, or that of the clip of training where the silhouettes show that the world has the
     same unit.
 
     Args:
         avatar: of the person; plays ``start`` as it plays the clip of training.
-        views: the pictures of the clip, with silhouettes.
-        options: how pictures are read.
-        start: poses of the frames to begin with; frames without a picture keep them.
+        views: the images of the clip, with silhouettes.
+        options: how images are read.
+        start: poses of the frames to begin with; frames without an image keep them.
     """
     times = start.clip.times.tolist()
     shown = [replace(x, time=times[start.rows[-1 if x.frame is None else x.frame]]) for x in views]
     side = min(LONGEST_SIDE, options.longest_side or LONGEST_SIDE, avatar.longest_side or LONGEST_SIDE)
     small = options.model_copy(update={"longest_side": side, "downscale": 1})
     left_out, others = _left_out(shown)
-    tested, pictures = PictureLoader(left_out or others, small), PictureLoader(others, small)
+    tested, images = ImageLoader(left_out or others, small), ImageLoader(others, small)
     scene = avatar.scene
     players = [scene.playing(start.clip), scene.playing(_in_size(scene, start.clip))]
-    tried = [(_overlap(_fitted(player, pictures), tested), player) for player in players]
+    tried = [(_overlap(_fitted(player, images), tested), player) for player in players]
     before, (after, best) = _overlap(players[0], tested), max(tried, key=lambda x: x[0])
     clip = start.clip
     if after > before:
-        found = _fitted(best, PictureLoader(shown, small)).played
+        found = _fitted(best, ImageLoader(shown, small)).played
         clip = clip if found is None else _with_rows(best.played or clip, found)
     return AvatarPoses(replace(start, clip=clip), before, after, len(left_out))
 
@@ -97,10 +97,10 @@ def _in_size(avatar: HumanScene, clip: MotionClip) -> MotionClip:
     return replace(clip, scale=scale, trans=clip.trans + (clip.scale - scale)[:, None] * avatar.skeleton.joints[0])
 
 
-def _fitted(player: HumanScene, pictures: PictureLoader) -> HumanScene:
-    """Return the person in the poses that have the silhouettes of ``pictures``."""
+def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:
+    """Return the person in the poses that have the silhouettes of ``images``."""
     nothing = player.gaussians.means.new_zeros(3)
-    return fitted_to_pictures(player, pictures, nothing, player.options, SILHOUETTES).scene
+    return fitted_to_images(player, images, nothing, player.options, SILHOUETTES).scene
 
 
 def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
@@ -119,12 +119,12 @@ def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
 
 
 @torch.no_grad()
-def _overlap(scene: HumanScene, pictures: PictureLoader) -> float:
-    """Return the mean intersection over union of the silhouettes of the person and of pictures."""
+def _overlap(scene: HumanScene, images: ImageLoader) -> float:
+    """Return the mean intersection over union of the silhouettes of the person and of images."""
     found = []
-    for picture in (pictures[i] for i in range(len(pictures))):
-        drawn = scene.render(picture.cameras, picture.time, options=scene.options).alpha[0] > 0.5
-        truth = drawn if picture.alpha is None else picture.alpha > 0.5
+    for image in (images[i] for i in range(len(images))):
+        drawn = scene.render(image.cameras, image.time, options=scene.options).alpha[0] > 0.5
+        truth = drawn if image.alpha is None else image.alpha > 0.5
         found.append(float((drawn & truth).sum() / (drawn | truth).sum().clamp_min(1)))
     return fmean(found)
 

@@ -1,4 +1,4 @@
-"""The focal length of one standing camera that was guessed: refined with the body, judged on frames left out."""
+"""The focal length of one fixed camera that was guessed: refined with the body, judged on frames left out."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import torch
 
+from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import PosePrior
 from dyngs.human.fit.solve import Observations, Stage, frame_error, run_stage, with_lens
 from dyngs.human.fit.surface import Surface
 from dyngs.human.motion.clip import MotionClip
-from dyngs.parameters import Parameters
 
 EVERY = 4
 """Each so many-th frame is left out: of those only poses are fitted."""
@@ -26,7 +26,7 @@ class LensFit:
 
     Attributes:
         factor: on the guessed focal length.
-        distance: from the camera at which the size in the pictures is kept, in units of the world.
+        distance: from the camera at which the size in the images is kept, in units of the world.
         error: on the frames left out, with the focal length as guessed and as refined.
         taken: the refined one is better.
     """
@@ -41,7 +41,7 @@ class LensFit:
         guessed, refined = self.error
         return (
             f"focal length: {self.factor:.2f} times the guess, error on frames left out {guessed:.4f} -> {refined:.4f}"
-            + (", taken" if self.taken else ": the guess stays, as the pictures do not tell")
+            + (", taken" if self.taken else ": the guess stays, as the images do not tell")
         )
 
 

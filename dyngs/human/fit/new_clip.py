@@ -63,7 +63,7 @@ def placed_clip(
 
     Args:
         capture: all views with frame numbers.
-        options: how its pictures are read.
+        options: how its images are read.
         body: the template.
         found: the fit of the views of training.
         report: of progress.

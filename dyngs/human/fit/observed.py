@@ -1,4 +1,4 @@
-"""The observations that a body is fitted to: squares around the person, cut out of the pictures of each frame.
+"""The observations that a body is fitted to: squares around the person, cut out of the images of each frame.
 
 Local letters: F frames, V views of one frame, S side of a square in pixels.
 """
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
-from dyngs.data.pictures.images import area_downscale
-from dyngs.data.pictures.silhouettes import silhouette_box
+from dyngs.data.images.images import area_downscale
+from dyngs.data.images.silhouettes import silhouette_box
+from dyngs.data.loader import Image
 from dyngs.human.template.joints import JOINT_NAMES
 
 _MARGIN = 1.25
@@ -28,8 +28,8 @@ class ObservedFrame:
     Attributes:
         cameras: V, of squares of S px.
         alpha: (V, S, S) float32 in [0, 1]: coverage by the person.
-        known: (V, S, S) float32, 1 inside the picture that the square was cut out of and where its mask counts, else 0.
-        joints: (V, 55, 3) column and row in the square, as shares of its side, and confidence of joints that were
+        known: (V, S, S) float32, 1 inside the image that the square was cut out of and where its mask counts, else 0.
+        joints: (V, 55, 3) column and row in the square, as fractions of its side, and confidence of joints that were
             marked as key points; None without any.
         places: (55, 4) places in the world and confidence of joints that are given in 3D; None without any.
     """
@@ -52,28 +52,28 @@ class ObservedFrame:
         return ObservedFrame(cameras, _resized(self.alpha, size), known, self.joints, self.places)
 
 
-def longest_box_side(pictures: Iterable[Picture]) -> int:
-    """Return the longest side of the person's box in the pictures (with alpha), px; 0 if nobody is seen."""
+def longest_box_side(images: Iterable[Image]) -> int:
+    """Return the longest side of the person's box in the images (with alpha), px; 0 if nobody is seen."""
     longest = 0
-    for picture in pictures:
-        box = _box(picture)
+    for image in images:
+        box = _box(image)
         longest = longest if box is None else max(longest, box[1] - box[0], box[3] - box[2])
     return longest
 
 
 def observed_frame(
-    pictures: Sequence[Picture], box_side: int, size: int, marked: Mapping[str, Tensor] | None = None
+    images: Sequence[Image], box_side: int, size: int, marked: Mapping[str, Tensor] | None = None
 ) -> ObservedFrame | None:
-    """Return the squares around the person in the pictures of one frame; None if no picture shows anybody.
+    """Return the squares around the person in the images of one frame; None if no image shows anybody.
 
     Args:
-        pictures: with alpha.
-        box_side: ``longest_box_side`` of all pictures of the capture, so that all squares show the same scale.
+        images: with alpha.
+        box_side: ``longest_box_side`` of all images of the capture, so that all squares show the same scale.
         size: S.
-        marked: name of a picture to key points (55, 3) in its pixels, see ``dyngs.human.fit.keypoints``; None without.
+        marked: name of an image to key points (55, 3) in its pixels, see ``dyngs.human.fit.keypoints``; None without.
     """
     side = max(round(_MARGIN * box_side), 1)
-    squares = [square for picture in pictures if (square := _square(picture, side, size, marked or {})) is not None]
+    squares = [square for image in images if (square := _square(image, side, size, marked or {})) is not None]
     if not squares:
         return None
     poses, intrinsics, alphas, known, joints = (torch.cat(parts) for parts in zip(*squares, strict=True))
@@ -81,21 +81,21 @@ def observed_frame(
 
 
 def _square(
-    picture: Picture, side: int, size: int, marked: Mapping[str, Tensor]
+    image: Image, side: int, size: int, marked: Mapping[str, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None:
     """Return pose (1, 4, 4), intrinsics (1, 3, 3), alpha and known (1, S, S) and joints (1, 55, 3) of the square."""
-    box = _box(picture)
-    if box is None or picture.alpha is None:
+    box = _box(image)
+    if box is None or image.alpha is None:
         return None
     top, left = ((box[i] + box[i + 1] - side) // 2 for i in (0, 2))
-    weights = torch.ones_like(picture.alpha) if picture.mask is None else picture.mask
-    shift = picture.cameras.intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
-    scale = picture.cameras.intrinsics.new_tensor([size / side, size / side, 1.0])
-    cut = [_resized(_cut(x, top, left, side)[None], size) for x in (picture.alpha, weights)]
-    intrinsics = scale[:, None] * (picture.cameras.intrinsics - shift)
-    joints = marked.get(picture.name, torch.zeros(len(JOINT_NAMES), 3, device="cpu")).clone()
+    weights = torch.ones_like(image.alpha) if image.mask is None else image.mask
+    shift = image.cameras.intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    scale = image.cameras.intrinsics.new_tensor([size / side, size / side, 1.0])
+    cut = [_resized(_cut(x, top, left, side)[None], size) for x in (image.alpha, weights)]
+    intrinsics = scale[:, None] * (image.cameras.intrinsics - shift)
+    joints = marked.get(image.name, torch.zeros(len(JOINT_NAMES), 3, device="cpu")).clone()
     joints[:, :2] = (joints[:, :2] - joints.new_tensor([left, top])) / side
-    return picture.cameras.cam_from_world, intrinsics, cut[0], (cut[1] > 0.999).float(), joints[None]
+    return image.cameras.cam_from_world, intrinsics, cut[0], (cut[1] > 0.999).float(), joints[None]
 
 
 def _cut(values: Tensor, top: int, left: int, side: int) -> Tensor:
@@ -113,7 +113,7 @@ def _resized(values: Tensor, size: int) -> Tensor:
     return area_downscale(values.permute(1, 2, 0), size, size).permute(2, 0, 1).contiguous()
 
 
-def _box(picture: Picture) -> tuple[int, int, int, int] | None:
+def _box(image: Image) -> tuple[int, int, int, int] | None:
     """Return first and last + 1 row, first and last + 1 column of the person; None if nobody is seen."""
-    box = None if picture.alpha is None else silhouette_box(picture.alpha, 0.5)
+    box = None if image.alpha is None else silhouette_box(image.alpha, 0.5)
     return None if box is None else (box[0].start, box[0].stop, box[1].start, box[1].stop)

@@ -1,4 +1,4 @@
-"""Pictures of a fit: outlines of the body, as given and as fitted, over some of the pictures."""
+"""Images of a fit: outlines of the body, as given and as fitted, over some of the images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.fit.surface import Surface, drawn_silhouettes
 
@@ -18,24 +18,24 @@ GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)
 
 @torch.no_grad()
 def overlay(
-    picture: Picture, surface: Surface, bodies: Sequence[tuple[Tensor, BodyPose, tuple[float, float, float]]]
+    image: Image, surface: Surface, bodies: Sequence[tuple[Tensor, BodyPose, tuple[float, float, float]]]
 ) -> np.ndarray:
-    """Return the picture (H, W, 3) in [0, 1] over white with the outlines of bodies.
+    """Return the image (H, W, 3) in [0, 1] over white with the outlines of bodies.
 
     Args:
-        picture: of one view.
+        image: of one view.
         surface: of the template.
         bodies: shape parameters, pose and colour of each, drawn one over the other.
     """
-    sheet = picture.composite(torch.ones_like(picture.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
+    sheet = image.composite(torch.ones_like(image.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
     for betas, pose, colour in bodies:
         discs = surface.in_pose(betas, torch.zeros_like(surface.weights[:, 0]), pose)
-        sheet[_outline(drawn_silhouettes(discs, picture.cameras)[0] > 0.5)] = sheet.new_tensor(colour)
+        sheet[_outline(drawn_silhouettes(discs, image.cameras)[0] > 0.5)] = sheet.new_tensor(colour)
     return sheet.cpu().numpy()
 
 
 def side_by_side(sheets: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Return one picture of several, white where they are smaller than the largest."""
+    """Return one image of several, white where they are smaller than the largest."""
     height, width = (max(sheet.shape[axis] for sheet in sheets) for axis in (0, 1))
     rows = -(-len(sheets) // columns)
     whole = np.ones((rows * height, min(columns, len(sheets)) * width, 3), np.float32)

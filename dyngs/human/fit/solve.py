@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import NUM_TURNED, PosePrior
@@ -21,7 +22,6 @@ from dyngs.human.fit.surface import Surface, drawn_silhouettes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.bone_shapes import NUM_BONE_SHAPES
-from dyngs.parameters import Parameters
 
 LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
     "offset": 3e-3,
@@ -40,7 +40,7 @@ steps where these are much smaller: renders of new poses then lose 1 to 3 dB, wh
 LIMIT_WEIGHT = 2e-2
 """Of the mean square of what lies beyond the limit of a joint, in standard deviations."""
 KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
-"""Expected error of a key point, as a share of the square's side, and the weight of their robust mean."""
+"""Expected error of a key point, as a fraction of the square's side, and the weight of their robust mean."""
 PLACE, PLACE_WEIGHT = 0.03, 0.1
 """Expected error of a joint given in 3D, metres of the person, and the weight of their robust mean."""
 FOCAL, FOCAL_WEIGHT = 0.35, 1e-3

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.pictures.silhouettes import silhouette_box
+from dyngs.data.images.silhouettes import silhouette_box
 from dyngs.human.fit.headings import (
     MOST_ANCHORS,
     NUM_HEADINGS,
@@ -41,10 +41,10 @@ ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -9
 _WITHOUT_PATH = 2
 """Headings of the first frame from which clips without key points are followed without the path, too."""
 MOMENTUM = 0.8
-"""Share of the last rotation that is expected again, so that legs which pass each other are not exchanged."""
+"""Fraction of the last rotation that is expected again, so that legs which pass each other are not exchanged."""
 STATURE = 1.70
 """Height of a person in a usual pose, m, where a single camera leaves it open."""
-PELVIS_SHARE = 0.53
+PELVIS_FRACTION = 0.53
 """Height of the pelvis, of that of the person."""
 
 
@@ -137,7 +137,7 @@ def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> Mo
 
 
 def up_of(seen: ObservedFrame) -> Tensor:
-    """Return the unit vector (3,) that points up in the pictures, a mean over cameras."""
+    """Return the unit vector (3,) that points up in the images, a mean over cameras."""
     up = -seen.cameras.cam_from_world[:, 1, :3].mean(0)
     return up / up.norm()
 
@@ -156,7 +156,7 @@ def place_and_height(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | N
         across = torch.eye(3, device="cpu") - directions[:, :, None] * directions[:, None]
         middle = torch.linalg.lstsq(across.sum(0), (across @ starts[..., None]).sum(0)).solution[:, 0]
         height = float((angles * (middle - starts).norm(dim=1)).median())
-    return middle + up * (PELVIS_SHARE - 0.5) * (height or STATURE), height
+    return middle + up * (PELVIS_FRACTION - 0.5) * (height or STATURE), height
 
 
 def turned(clip: MotionClip, angle: float, up: Tensor) -> MotionClip:
@@ -170,7 +170,7 @@ def turned(clip: MotionClip, angle: float, up: Tensor) -> MotionClip:
 def _ray(camera: Cameras, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     """Return start and unit direction (3,) of the ray through the middle of a silhouette, and its height as an angle.
 
-    The angle is the height over the distance, for a person who stands upright in the picture. None if nobody is seen.
+    The angle is the height over the distance, for a person who stands upright in the image. None if nobody is seen.
     """
     box = silhouette_box(alpha, 0.5)
     if box is None:

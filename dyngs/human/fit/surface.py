@@ -13,11 +13,11 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import RasterizeMode
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar.anchors import skinning_weights, texel_gaussians
 from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_gaussians
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.rendering import RenderOptions, render
 
 _WIDTH, _THICKNESS, _INSET = 0.4, 0.075, 0.2
 """Standard deviations of a disc in the tangent plane and along the normal, and its depth below the skin, in sides of
@@ -91,5 +91,5 @@ def surface_of(body: BodyTemplate, resolution: int) -> Surface:
 
 
 def drawn_silhouettes(discs: Gaussians, cameras: Cameras) -> Tensor:
-    """Return coverage (V, H, W) in [0, 1] of posed discs in the pictures of V cameras; differentiable."""
+    """Return coverage (V, H, W) in [0, 1] of posed discs in the images of V cameras; differentiable."""
     return render(discs, cameras, _OPTIONS).alpha

@@ -14,8 +14,8 @@ import torch
 
 from dyngs.data.capture import Split, View
 from dyngs.data.geometry.poses import opengl_from_cam
-from dyngs.data.loader import Picture
-from dyngs.data.pictures.images import straight_uint8
+from dyngs.data.images.images import straight_uint8
+from dyngs.data.loader import Image
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.motion.clip import MotionClip
 
@@ -53,25 +53,25 @@ def write_body(
 def write_split(
     out: Path,
     split: Split,
-    shown: Iterator[tuple[View, Picture]],
+    shown: Iterator[tuple[View, Image]],
     rows: Mapping[int, int],
     world_offset: np.ndarray,
 ) -> None:
-    """Write ``transforms_SPLIT.json`` and the pictures of a split as PNG with straight alpha, undistorted.
+    """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
 
     Args:
         out: folder.
         split: name.
-        shown: the views with their pictures.
+        shown: the views with their images.
         rows: frame number to row of the body parameters.
         world_offset: (3,) added to all positions: where the capture was recentred from.
     """
     frames: list[dict[str, object]] = []
-    for view, picture in shown:
+    for view, image in shown:
         row = rows[-1 if view.frame is None else view.frame]
         name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
-        write_image(out / name, _straight(picture))
-        camera = picture.cameras
+        write_image(out / name, _straight(image))
+        camera = image.cameras
         intrinsics = camera.intrinsics[0].double().numpy()
         pose = opengl_from_cam(view.cam_from_world).copy()
         pose[:3, 3] += world_offset
@@ -82,7 +82,7 @@ def write_split(
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
 
 
-def _straight(picture: Picture) -> np.ndarray:
+def _straight(image: Image) -> np.ndarray:
     """Return straight colours, with alpha if there is one, (H, W, 3 or 4) uint8."""
-    parts = [picture.rgb_premultiplied] + ([] if picture.alpha is None else [picture.alpha[..., None]])
+    parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
     return straight_uint8(torch.cat(parts, dim=-1)).numpy()

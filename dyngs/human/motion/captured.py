@@ -1,4 +1,4 @@
-"""The motion of a captured person: body parameters of the frames that have pictures.
+"""The motion of a captured person: body parameters of the frames that have images.
 
 Local letters: F frames, J joints, V views.
 """
@@ -21,7 +21,7 @@ from dyngs.human.motion.motion import poses_for_joints
 
 @dataclass(frozen=True)
 class CapturedMotion:
-    """A clip of the frames that have pictures.
+    """A clip of the frames that have images.
 
     Attributes:
         clip: of F frames, or of one where the person keeps one pose in one place: nothing moves.

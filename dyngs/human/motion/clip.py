@@ -55,12 +55,12 @@ class MotionClip:
         if abs(float(times[after]) - moment) <= _SAME_TIME:
             return self.select(torch.tensor([after], device="cpu"))
         before = after - 1
-        share = (moment - float(times[before])) / float(times[after] - times[before])
+        fraction = (moment - float(times[before])) / float(times[after] - times[before])
         return MotionClip(
             times=torch.tensor([moment], dtype=times.dtype, device=times.device),
-            poses=interpolate_rotations(self.poses[before:after], self.poses[after : after + 1], np.array([share])),
-            trans=torch.lerp(self.trans[before], self.trans[after], share)[None],
-            scale=torch.lerp(self.scale[before], self.scale[after], share)[None],
+            poses=interpolate_rotations(self.poses[before:after], self.poses[after : after + 1], np.array([fraction])),
+            trans=torch.lerp(self.trans[before], self.trans[after], fraction)[None],
+            scale=torch.lerp(self.scale[before], self.scale[after], fraction)[None],
         )
 
 

@@ -265,19 +265,21 @@ def _sampled(file: GltfFile, curve: _Curve, times: np.ndarray) -> np.ndarray:
     after = np.searchsorted(curve.times, times + slack, side="right")
     before, after = np.maximum(after - 1, 0), np.minimum(after, len(curve.times) - 1)
     span = curve.times[after] - curve.times[before]
-    share = ((times - curve.times[before]) / np.where(span > 0, span, 1.0))[:, None]
+    fraction = ((times - curve.times[before]) / np.where(span > 0, span, 1.0))[:, None]
     if curve.interpolation == "CUBICSPLINE":
         arriving, keys, leaving = curve.values.reshape(len(curve.times), 3, -1).transpose(1, 0, 2)
-        ease = share * share * (3 - 2 * share)
-        bend = span[:, None] * share * (1 - share) * ((1 - share) * leaving[before] - share * arriving[after])
+        ease = fraction * fraction * (3 - 2 * fraction)
+        bend = (
+            span[:, None] * fraction * (1 - fraction) * ((1 - fraction) * leaving[before] - fraction * arriving[after])
+        )
         return keys[before] + ease * (keys[after] - keys[before]) + bend
     if curve.interpolation == "STEP":
         return curve.values[before]
     start, end = curve.values[before], curve.values[after]
     if start.shape[1] == 3:
-        return start + share * (end - start)
+        return start + fraction * (end - start)
     turned = _rotations(file, start)
-    return (turned * Rotation.from_rotvec(share * (turned.inv() * _rotations(file, end)).as_rotvec())).as_quat()
+    return (turned * Rotation.from_rotvec(fraction * (turned.inv() * _rotations(file, end)).as_rotvec())).as_quat()
 
 
 def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:

@@ -82,10 +82,10 @@ class Motion:
         """Return the motion at ``times`` (F,), in units of its frames."""
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
         after = np.minimum(before + 1, len(self) - 1)
-        share = torch.from_numpy(times - before).to(self.trans)
+        fraction = torch.from_numpy(times - before).to(self.trans)
 
         def linear(values: Tensor) -> Tensor:
-            weight = share.reshape(-1, *[1] * (values.dim() - 1))
+            weight = fraction.reshape(-1, *[1] * (values.dim() - 1))
             return torch.lerp(values[before], values[after], weight)
 
         poses = interpolate_rotations(self.poses[before], self.poses[after], times - before)
@@ -161,11 +161,11 @@ def poses_for_joints(poses: Tensor, count: int) -> Tensor:
     return wanted
 
 
-def interpolate_rotations(before: Tensor, after: Tensor, share: np.ndarray) -> Tensor:
+def interpolate_rotations(before: Tensor, after: Tensor, fraction: np.ndarray) -> Tensor:
     """Return axis-angle vectors (F, J, 3) at ``share`` (F,) of the way between two: R_a exp(s log(R_a^T R_b))."""
     from scipy.spatial.transform import Rotation
 
     start = Rotation.from_rotvec(before.reshape(-1, 3).double().cpu().numpy())
     turn = start.inv() * Rotation.from_rotvec(after.reshape(-1, 3).double().cpu().numpy())
-    part = Rotation.from_rotvec(turn.as_rotvec() * np.repeat(share, before.shape[1])[:, None])
+    part = Rotation.from_rotvec(turn.as_rotvec() * np.repeat(fraction, before.shape[1])[:, None])
     return torch.from_numpy((start * part).as_rotvec()).to(before).reshape(before.shape)

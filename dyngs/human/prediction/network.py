@@ -1,4 +1,4 @@
-"""The network over the atlas: a UNet on maps of observations in a few pictures (GHG, Kwon et al. 2024).
+"""The network over the atlas: a UNet on maps of observations in a few images (GHG, Kwon et al. 2024).
 
 Local letters: D input channels, K scaffolds, S texels per side.
 """
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from dyngs.errors import DyngsError
 
-HEADS = {"rotation": 4, "scale": 3, "opacity": 1, "height": 1, "colour": 3, "picture_weight": 1, "guess": 3}
+HEADS = {"rotation": 4, "scale": 3, "opacity": 1, "height": 1, "colour": 3, "image_weight": 1, "guess": 3}
 """Outputs per texel of a scaffold and their number of channels; see ``dyngs.human.prediction.predict``."""
 
 _GROUPS = 8

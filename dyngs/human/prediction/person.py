@@ -28,7 +28,7 @@ from dyngs.human.template.mesh import vertex_normals
 
 @dataclass(frozen=True)
 class CapturedPerson:
-    """A person with pictures, as input of a prediction.
+    """A person with images, as input of a prediction.
 
     Attributes:
         name: of the capture, for messages.
@@ -39,7 +39,7 @@ class CapturedPerson:
         heights: (K,) of the scaffolds, m, ascending.
         gaussians: K P grey discs, ordered by scaffold.
         subject: skeleton, poses, and the anchors of ``gaussians``.
-        views: with pictures, in the order of the split ``train``.
+        views: with images, in the order of the split ``train``.
     """
 
     name: str
@@ -67,7 +67,7 @@ def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> 
     if capture.body is None:
         raise DyngsError(f"{capture.root}: has no body parameters, which a prediction needs; see docs/human.md")
     if not capture.has_alpha:
-        raise DyngsError(f"{capture.root}: the pictures have no silhouettes; give them alpha, see docs/human.md")
+        raise DyngsError(f"{capture.root}: the images have no silhouettes; give them alpha, see docs/human.md")
     given, views = capture.body["train"], capture.splits["train"]
     vertices, joints = rest_shape(body, given)
     texels = atlas_texels(body, model.resolution, vertices)
@@ -124,7 +124,7 @@ def spread_views(person: CapturedPerson, count: int, first: int | None = None) -
 
 
 def named_views(person: CapturedPerson, names: Sequence[str]) -> list[int]:
-    """Return the indices of the views with these names, or with pictures of these file names.
+    """Return the indices of the views with these names, or with images of these file names.
 
     Raises:
         DyngsError: an unknown name, or the same view twice.

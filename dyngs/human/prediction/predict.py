@@ -22,11 +22,11 @@ from dyngs.ops.quaternions import unit_quats
 _MAX_LOG_SCALE = 1.5
 """Limit on the difference of log scales from those of the initial Gaussian."""
 
-_PICTURE_LOGIT = 4.0
-"""Logit of the weight of the pictures' colours in an untrained network, against predicted colours."""
+_IMAGE_LOGIT = 4.0
+"""Logit of the weight of the images' colours in an untrained network, against predicted colours."""
 
 _GUESS_LOGITS = (0.0, 2.0, 0.0)
-"""Logits of the shares of the three ``guessed_colours`` in an untrained network."""
+"""Logits of the fractions of the three ``guessed_colours`` in an untrained network."""
 
 _MAX_HEIGHT = 0.01
 """Limit on the offset along the normal with a single scaffold, m; with several: half their distance."""
@@ -50,7 +50,7 @@ def network_inputs(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Ten
 
     Args:
         person: the captured person.
-        maps: of the pictures.
+        maps: of the images.
         mean: (3, S, S) mean colours of the training people.
     """
     measured = torch.stack([maps.seen, maps.inside, maps.hull / HULL_LIMIT], dim=-1)
@@ -62,30 +62,30 @@ def network_inputs(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Ten
 
 
 def guessed_colours(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return three guesses (P, 3) of the colours of texels that no picture shows: the mean colours of the training
+    """Return three guesses (P, 3) of the colours of texels that no image shows: the mean colours of the training
     people, those of seen texels nearby, and those of the other side where it is seen, else as nearby."""
     is_seen = maps.seen[0][person.mirror, None] > 0
     return from_atlas(mean, person.texels), maps.nearby, torch.where(is_seen, maps.rgb[0][person.mirror], maps.nearby)
 
 
 def predict_gaussians(
-    person: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork | None, min_silhouette_share: float
+    person: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork | None, min_silhouette_fraction: float
 ) -> PredictedAvatar:
     """Return the avatar that ``network`` predicts, differentiable in its weights; None: discs in observed colours.
 
     All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they lie inside at
-    least the share ``min_silhouette_share`` of the silhouettes. Rotations are relative to the tangent frame, scales to
-    the initial Gaussian, means move along the normal. Colours are a weighted mean of those of the pictures and those of
-    the network, which mixes and corrects the ``guessed_colours``; without a network those of the pictures, else nearby.
+    least the share ``min_silhouette_fraction`` of the silhouettes. Rotations are relative to the tangent frame, scales
+    to the initial Gaussian, means move along the normal. Colours are a weighted mean of those of the images and those
+    of the network, which mixes and corrects the ``guessed_colours``; without a network those of the images.
 
     Args:
         person: the captured person.
-        maps: of the pictures.
+        maps: of the images.
         mean: (3, S, S) as in ``network_inputs``.
         network: or None.
-        min_silhouette_share: in [0, 1].
+        min_silhouette_fraction: in [0, 1].
     """
-    kept = (maps.inside >= min_silhouette_share) & (maps.seen > 0)
+    kept = (maps.inside >= min_silhouette_fraction) & (maps.seen > 0)
     kept[0] = True
     rows = kept.flatten().nonzero()[:, 0]
     first, subject = person.gaussians.select(rows), replace(person.subject, anchors=person.subject.anchors.select(rows))
@@ -97,9 +97,9 @@ def predict_gaussians(
     raw = network(network_inputs(person, maps, mean))
     raw = torch.cat([from_atlas(level, person.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))
-    weight = (part["picture_weight"] + _PICTURE_LOGIT).sigmoid() * (seen[:, None] > 0)
-    shares = (part["guess"] + part["guess"].new_tensor(_GUESS_LOGITS)).softmax(dim=1)
-    guess = (shares.T[..., None] * guesses).sum(0) + part["colour"]
+    weight = (part["image_weight"] + _IMAGE_LOGIT).sigmoid() * (seen[:, None] > 0)
+    fractions = (part["guess"] + part["guess"].new_tensor(_GUESS_LOGITS)).softmax(dim=1)
+    guess = (fractions.T[..., None] * guesses).sum(0) + part["colour"]
     rgb = weight * observed + (1 - weight) * guess
     normals = person.texels.normals[rows % len(person.texels)]
     gaussians = Gaussians(

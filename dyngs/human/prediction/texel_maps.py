@@ -1,6 +1,6 @@
-"""Observations of a posed template in a few pictures, per texel: colours, visibility, silhouettes, directions.
+"""Observations of a posed template in a few images, per texel: colours, visibility, silhouettes, directions.
 
-The pictures of a person become maps over the atlas (GHG, Kwon et al. 2024): each scaffold is rasterized as a mesh into
+The images of a person become maps over the atlas (GHG, Kwon et al. 2024): each scaffold is rasterized as a mesh into
 each view, and a texel counts as seen where no part of that mesh is in front of it.
 
 Local letters: P texels, K scaffolds, M vertices.
@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
@@ -38,12 +38,12 @@ _TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
 
 @dataclass(frozen=True)
 class TexelMaps:
-    """Observations in a few pictures, per texel.
+    """Observations in a few images, per texel.
 
     Attributes:
         rgb: (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel.
         seen: (K, P) largest cosine between normal and view direction, 0 where a texel is hidden.
-        inside: (K, P) share of the views in whose silhouette a texel lies, of those that have it in the frame.
+        inside: (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the frame.
         hull: (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m in the
             body's size, at most ``HULL_LIMIT`` and at least its negative.
         offsets: (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the pelvis.
@@ -61,11 +61,11 @@ class TexelMaps:
 
 
 @torch.no_grad()
-def observe_texels(person: CapturedPerson, pictures: Iterable[tuple[Picture, BodyPose]]) -> TexelMaps:
-    """Return the maps of at least one picture, each with its body pose.
+def observe_texels(person: CapturedPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
+    """Return the maps of at least one image, each with its body pose.
 
     Raises:
-        ValueError: no picture.
+        ValueError: no image.
     """
     shape, device = (len(person.heights), len(person.texels)), person.texels.points.device
     colour = torch.zeros(*shape, 3, device=device)
@@ -73,15 +73,15 @@ def observe_texels(person: CapturedPerson, pictures: Iterable[tuple[Picture, Bod
     hull = torch.full(shape, HULL_LIMIT, device=device)
     offsets: Tensor | None = None
     count = 0
-    for picture, pose in pictures:
-        distances, count = _edge_distances(picture), count + 1
+    for image, pose in images:
+        distances, count = _edge_distances(image), count + 1
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
         normals = _at_texels(person, vertex_normals(scaffolds[0], person.body.faces.cpu().numpy()))
         normals = torch.nn.functional.normalize(normals, dim=1)
         if offsets is None:
             offsets = normals @ pose.rotations[0]
         for level, vertices in enumerate(scaffolds):
-            view = _scaffold_view(person, picture, distances, vertices, normals, float(pose.scale))
+            view = _scaffold_view(person, image, distances, vertices, normals, float(pose.scale))
             cosine = view.cosine * (view.alpha > 0.5)
             colour[level] += cosine[:, None] ** FACING_EXPONENT * view.rgb
             weight[level] += cosine**FACING_EXPONENT * view.alpha
@@ -90,11 +90,11 @@ def observe_texels(person: CapturedPerson, pictures: Iterable[tuple[Picture, Bod
             in_frames[level] += view.in_frame
             hull[level] = torch.minimum(hull[level], torch.where(view.in_frame > 0, view.to_edge, HULL_LIMIT))
     if offsets is None:
-        raise ValueError("there must be a picture")
+        raise ValueError("there must be an image")
     rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
-    share = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
+    fraction = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
     nearby = colours_nearby(person.texels, rgb[0], seen[0])
-    return TexelMaps(rgb, seen, share, hull.clamp_min(-HULL_LIMIT), offsets, nearby, count)
+    return TexelMaps(rgb, seen, fraction, hull.clamp_min(-HULL_LIMIT), offsets, nearby, count)
 
 
 def to_atlas(values: Tensor, texels: Texels) -> Tensor:
@@ -122,18 +122,18 @@ class _ScaffoldView:
 
 
 def _scaffold_view(
-    person: CapturedPerson, picture: Picture, distances: Tensor, vertices: np.ndarray, normals: Tensor, scale: float
+    person: CapturedPerson, image: Image, distances: Tensor, vertices: np.ndarray, normals: Tensor, scale: float
 ) -> _ScaffoldView:
-    """Return one picture's view of the scaffold with ``vertices`` (M, 3) and ``normals`` (P, 3).
+    """Return one image's view of the scaffold with ``vertices`` (M, 3) and ``normals`` (P, 3).
 
     ``distances`` are those of ``_edge_distances``, ``scale`` is the length of a metre in world units.
     """
-    camera = picture.cameras
+    camera = image.cameras
     world = _at_texels(person, vertices)
     at, depth, in_frame = project_points(world, camera)
     cosine = (torch.nn.functional.normalize(camera.centers[0] - world, dim=1) * normals).sum(1)
-    alpha = torch.ones_like(picture.rgb_premultiplied[..., 0]) if picture.alpha is None else picture.alpha
-    planes = torch.cat([picture.rgb_premultiplied, alpha[..., None], distances[..., None]], dim=-1)
+    alpha = torch.ones_like(image.rgb_premultiplied[..., 0]) if image.alpha is None else image.alpha
+    planes = torch.cat([image.rgb_premultiplied, alpha[..., None], distances[..., None]], dim=-1)
     found = _sampled(planes, at) * in_frame[:, None]
     # On a slanted surface the pixels around a texel see nearer points, by their width over the cosine.
     slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / camera.intrinsics[0, 0, 0] / cosine.clamp_min(_GRAZING)
@@ -147,20 +147,20 @@ def _scaffold_view(
     )
 
 
-def _edge_distances(picture: Picture) -> Tensor:
+def _edge_distances(image: Image) -> Tensor:
     """Return the signed distances (H, W) of pixels to the edge of the silhouette, positive inside, in pixels.
 
     Next to the edge they are the alpha less a half, which is exact for an upright edge.
     """
-    if picture.alpha is None:
-        return torch.full_like(picture.rgb_premultiplied[..., 0], float(max(picture.rgb_premultiplied.shape)))
-    alpha = picture.alpha.double().cpu().numpy()
+    if image.alpha is None:
+        return torch.full_like(image.rgb_premultiplied[..., 0], float(max(image.rgb_premultiplied.shape)))
+    alpha = image.alpha.double().cpu().numpy()
     is_inside = np.pad(alpha > 0.5, 1)
     within = np.asarray(distance_transform_edt(is_inside))[1:-1, 1:-1] - 0.5
     beyond = np.asarray(distance_transform_edt(~is_inside))[1:-1, 1:-1] - 0.5
     signed = np.where(alpha > 0.5, within, -beyond)
     signed = np.where(np.abs(signed) <= 0.5, alpha - 0.5, signed)
-    return torch.from_numpy(signed).to(picture.rgb_premultiplied)
+    return torch.from_numpy(signed).to(image.rgb_premultiplied)
 
 
 def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:
@@ -182,11 +182,11 @@ def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at:
     return torch.from_numpy(least)[row.cpu(), column.cpu()].float().to(at.device)
 
 
-def _sampled(picture: Tensor, at: Tensor) -> Tensor:
-    """Return values (P, D) of a picture (H, W, D) at columns and rows ``at`` (P, 2), bilinear between pixel centres."""
-    size = at.new_tensor([picture.shape[1], picture.shape[0]])
+def _sampled(image: Tensor, at: Tensor) -> Tensor:
+    """Return values (P, D) of an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear between pixel centres."""
+    size = at.new_tensor([image.shape[1], image.shape[0]])
     grid = (2 * at / size - 1).nan_to_num().clamp(-2, 2)[None, None]
-    planes = picture.permute(2, 0, 1)[None]
+    planes = image.permute(2, 0, 1)[None]
     found = torch.nn.functional.grid_sample(planes, grid, padding_mode="border", align_corners=False)
     return found[0, :, 0].T
 

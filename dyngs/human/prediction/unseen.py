@@ -1,4 +1,4 @@
-"""Colours of texels that no picture shows, guessed from those that are seen: the nearest ones, and the other side.
+"""Colours of texels that no image shows, guessed from those that are seen: the nearest ones, and the other side.
 
 Local letters: P texels.
 """

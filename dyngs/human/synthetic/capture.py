@@ -1,6 +1,6 @@
 """A synthetic capture of a person: the dressed template in motion, from many cameras, with exact body parameters.
 
-Pictures are rasterized with a depth buffer in numpy, independently of the rasterizer of Gaussians, as ground truth.
+Images are rasterized with a depth buffer in numpy, independently of the rasterizer of Gaussians, as ground truth.
 
 Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H fragments, S texels per side.
 """
@@ -110,7 +110,7 @@ class PosedMesh:
 
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
-    """Write pictures of a walking person in the layout that ``dyngs.data.readers.body_json`` reads; returns ``out``.
+    """Write images of a walking person in the layout that ``dyngs.data.readers.body_json`` reads; returns ``out``.
 
     Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m,
     y up, floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``.
@@ -180,7 +180,7 @@ def render_mesh(
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
     Lambertian: the texture's value times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1; no shadows.
-    Alpha is the share of samples that hit the mesh, whose colours are averaged.
+    Alpha is the fraction of samples that hit the mesh, whose colours are averaged.
 
     Args:
         mesh: visible from both sides.
@@ -212,7 +212,7 @@ def render_mesh(
 def _write_split(
     out: Path, split: str, meshes: list[PosedMesh], cameras: dict[int, np.ndarray], options: HumanOptions
 ) -> None:
-    """Write the pictures of one split and its JSON; nothing without cameras."""
+    """Write the images of one split and its JSON; nothing without cameras."""
     if not cameras:
         return
     frames, light = [], random_light(options.light_seed)
@@ -238,14 +238,14 @@ def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> It
 
 def _ring(count: int) -> np.ndarray:
     """Return OpenGL camera-to-world poses (count, 4, 4) on a ring, the first in front, alternately low and high."""
-    share = np.arange(count) / max(count, 1)
-    return _look_at_target(2 * np.pi * share, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
+    fraction = np.arange(count) / max(count, 1)
+    return _look_at_target(2 * np.pi * fraction, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
 
 
 def _ring_between(count: int, others: int) -> np.ndarray:
     """Return poses (count, 4, 4) on the ring of ``others`` cameras, each midway between two of them."""
-    share = (np.arange(count) * others // max(count, 1) + 0.5) / others
-    return _look_at_target(2 * np.pi * share, np.full(count, 1.3))
+    fraction = (np.arange(count) * others // max(count, 1) + 0.5) / others
+    return _look_at_target(2 * np.pi * fraction, np.full(count, 1.3))
 
 
 def _look_at_target(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:

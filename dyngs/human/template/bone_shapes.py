@@ -63,10 +63,10 @@ def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...
         rows = np.flatnonzero(weights[:, joint])
         ends = [joint, *(child for child, parent in enumerate(parents) if parent == joint)]
         bones = [child for child in ends[1:] if np.linalg.norm(joints[child] - joints[joint]) > 1e-6]
-        share = _along_bone(vertices[rows], joints[joint], joints[bones[0]]) if len(bones) == 1 else None
-        if share is not None:
-            follow[rows, joint] += weights[rows, joint] * (1 - share)
-            follow[rows, bones[0]] += weights[rows, joint] * share
+        fraction = _along_bone(vertices[rows], joints[joint], joints[bones[0]]) if len(bones) == 1 else None
+        if fraction is not None:
+            follow[rows, joint] += weights[rows, joint] * (1 - fraction)
+            follow[rows, bones[0]] += weights[rows, joint] * fraction
         elif len(bones) > 1 and len(bones) <= 3:  # pelvis, chest; the wrist has five fingers and moves as a whole
             ends = [joint, *bones]
             away = np.linalg.norm(vertices[rows, None] - joints[ends], axis=-1) + _NEAREST

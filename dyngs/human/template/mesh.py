@@ -30,7 +30,7 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     """Return the nearest triangle at every covered grid point (whole numbers of column and row).
 
     Args:
-        corners: (T, 3, 3) column, row and inverse depth of the corners; inverse depth is linear in the picture, and 1
+        corners: (T, 3, 3) column, row and inverse depth of the corners; inverse depth is linear in the image, and 1
             without perspective. Triangles without area cover nothing; edges belong to both sides.
         width: of the grid.
         height: of the grid.

@@ -1,1 +1,1 @@
-"""Priors that a user gives with a capture, as losses in training; each is first compared with the pictures."""
+"""Priors that a user gives with a capture, as losses in training; each is first compared with the images."""

@@ -1,4 +1,4 @@
-"""Priors compared with the pictures before any training: each must explain them better than its simplest substitute."""
+"""Priors compared with the images before any training: each must explain them better than its simplest substitute."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.training.priors.depth_maps import Kind, values_of
 
 PAIRS = 12
-"""Pairs of pictures that are compared."""
+"""Pairs of images that are compared."""
 MARGIN = 0.97
-"""A prior must lower the error at least to this share of its substitute's."""
+"""A prior must lower the error at least to this fraction of its substitute's."""
 _CHANGED = 0.1
-"""Flow is judged at this share of the pixels: those that change most."""
+"""Flow is judged at this fraction of the pixels: those that change most."""
 _SIDE = 96
-"""Pictures are shrunk to about this for depth: hundreds of guesses are compared."""
+"""Images are shrunk to about this for depth: hundreds of guesses are compared."""
 _DEPTHS = 14
 _RANGE = 6.0
 """Nearest and farthest guess, as a factor of the distance to what the cameras look at."""
@@ -29,7 +29,7 @@ _RANGE = 6.0
 
 @dataclass(frozen=True)
 class Agreement:
-    """Mean photometric errors (0 to 1) over pairs of pictures.
+    """Mean photometric errors (0 to 1) over pairs of images.
 
     Attributes:
         error: with the prior.
@@ -43,18 +43,18 @@ class Agreement:
 
     @property
     def holds(self) -> bool:
-        """Return whether the prior explains the pictures better; not where nothing could be compared."""
+        """Return whether the prior explains the images better; not where nothing could be compared."""
         return self.pairs > 0 and self.error < MARGIN * self.without
 
 
-def flow_agreement(pairs: Sequence[tuple[Picture, Picture]]) -> Agreement:
+def flow_agreement(pairs: Sequence[tuple[Image, Image]]) -> Agreement:
     """Compare flow with no motion, with its reverse, and with the same displacements at other places.
 
-    Only where pictures change most: elsewhere no motion is always right. There, displacements at random help a little,
+    Only where images change most: elsewhere no motion is always right. There, displacements at random help a little,
     too, which is why they are a substitute.
 
     Args:
-        pairs: pictures with flow, and those that it leads to.
+        pairs: images with flow, and those that it leads to.
     """
     sums = torch.zeros(4, device="cpu")
     count = 0
@@ -77,11 +77,11 @@ def flow_agreement(pairs: Sequence[tuple[Picture, Picture]]) -> Agreement:
     return Agreement(given, min(others), count)
 
 
-def track_agreement(pairs: Sequence[tuple[Picture, Picture, Tensor, Tensor]]) -> Agreement:
+def track_agreement(pairs: Sequence[tuple[Image, Image, Tensor, Tensor]]) -> Agreement:
     """Compare colours at both ends of tracks with those at the ends of other tracks.
 
     Args:
-        pairs: two pictures, and (P, 2) px of points in each.
+        pairs: two images, and (P, 2) px of points in each.
     """
     given = shuffled = 0.0
     for first, second, start, end in pairs:
@@ -93,14 +93,14 @@ def track_agreement(pairs: Sequence[tuple[Picture, Picture, Tensor, Tensor]]) ->
     return Agreement(given / count, shuffled / count, len(pairs))
 
 
-def depth_agreement(triples: Sequence[tuple[Picture, Picture, Picture]], distance: float) -> tuple[Kind, Agreement]:
-    """Compare depth maps with one depth for a whole picture; return what they are affine in, and the agreement.
+def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: float) -> tuple[Kind, Agreement]:
+    """Compare depth maps with one depth for a whole image; return what they are affine in, and the agreement.
 
-    Scale and shift, and the one depth, are those that warp the first picture's second neighbour onto it best; the
+    Scale and shift, and the one depth, are those that warp the first image's second neighbour onto it best; the
     third one then judges them.
 
     Args:
-        triples: pictures with depth, each with two others that see the same from elsewhere at about its time.
+        triples: images with depth, each with two others that see the same from elsewhere at about its time.
         distance: of cameras from what they look at, world units.
     """
     sums = torch.zeros(3, device="cpu")
@@ -121,14 +121,14 @@ def depth_agreement(triples: Sequence[tuple[Picture, Picture, Picture]], distanc
     return kind, Agreement(min(plain, inverse), constant_error, count)
 
 
-def mask_agreement(pairs: Sequence[tuple[Picture, Picture]], distance: float) -> Agreement:
-    """Compare what masks call still with what they call moving: how far a still world explains another picture of it.
+def mask_agreement(pairs: Sequence[tuple[Image, Image]], distance: float) -> Agreement:
+    """Compare what masks call still with what they call moving: how far a still world explains another image of it.
 
-    Each pixel may choose its depth. What stands is found on its epipolar line in the other picture; from a camera that
+    Each pixel may choose its depth. What stands is found on its epipolar line in the other image; from a camera that
     stands, too, at its own place.
 
     Args:
-        pairs: pictures with masks, and others of another time.
+        pairs: images with masks, and others of another time.
         distance: of cameras from what they look at, world units.
     """
     still = moving = 0.0
@@ -159,21 +159,21 @@ def _aligned_guesses(given: Tensor, kind: Kind, distance: float) -> Iterator[Ten
     known = given > 0
     values = values_of(given, kind)
     low, high = (float(values[known].quantile(q)) for q in (0.05, 0.95))
-    share = (values - low) / max(high - low, 1e-12)
+    fraction = (values - low) / max(high - low, 1e-12)
     ends = sorted(values_of(torch.tensor(_depths(distance), device="cpu"), kind).tolist())
     for i, begin in enumerate(ends):
         for end in ends[i + 1 :]:
-            at = (begin + share * (end - begin)).clamp(0.3 * begin, 3 * end)
+            at = (begin + fraction * (end - begin)).clamp(0.3 * begin, 3 * end)
             yield torch.where(known, at if kind == "depth" else 1 / at, 0.0)
 
 
-def _warp_error(first: Picture, second: Picture, depth: Tensor) -> float:
+def _warp_error(first: Image, second: Image, depth: Tensor) -> float:
     """Return the mean of ``_warp_errors``."""
     return float(_warp_errors(first, second, depth).mean())
 
 
-def _warp_errors(first: Picture, second: Picture, depth: Tensor) -> Tensor:
-    """Return differences of a picture from another one that is warped to it by ``depth`` (H, W), where that is known.
+def _warp_errors(first: Image, second: Image, depth: Tensor) -> Tensor:
+    """Return differences of an image from another one that is warped to it by ``depth`` (H, W), where that is known.
 
     (P,) means over channels, for the pixels with a depth, row by row.
     """
@@ -189,13 +189,13 @@ def _warp_errors(first: Picture, second: Picture, depth: Tensor) -> Tensor:
     size = places.new_tensor([there.width, there.height])
     inside = (moved[:, 2] > 0) & ((places > 0) & (places < size)).all(1)
     error = (_sampled(second.rgb_premultiplied, places) - first.rgb_premultiplied.reshape(-1, 3)[known]).abs().mean(1)
-    # What leaves the picture costs as much as a mean pixel: otherwise the best warp would show nothing.
+    # What leaves the image costs as much as a mean pixel: otherwise the best warp would show nothing.
     outside = (first.rgb_premultiplied - first.rgb_premultiplied.mean((0, 1))).abs().mean()
     return torch.where(inside, error, outside)
 
 
-def _small(picture: Picture) -> Picture:
-    return picture.shrunk(max(1, math.ceil(max(picture.cameras.width, picture.cameras.height) / _SIDE)))
+def _small(image: Image) -> Image:
+    return image.shrunk(max(1, math.ceil(max(image.cameras.width, image.cameras.height) / _SIDE)))
 
 
 def _centers(pixels: Tensor) -> Tensor:

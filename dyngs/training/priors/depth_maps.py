@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 Kind = Literal["depth", "inverse"]
-"""Form of the map that is affine in the true depth: the map as it is, or its inverse (the nets of single pictures)."""
+"""Form of the map that is affine in the true depth: the map as it is, or its inverse (the nets of single images)."""
 
 _ROUNDS = 4
 _SOLID = 0.5

@@ -1,4 +1,4 @@
-"""From a capture and its pictures to the priors that are used: each is compared with the pictures first."""
+"""From a capture and its images to the priors that are used: each is compared with the images first."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 
 from dyngs.config import Config
 from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.loader import PictureLoader
-from dyngs.data.pictures.lens import undistorted_points
+from dyngs.data.images.lens import undistorted_points
+from dyngs.data.loader import ImageLoader
 from dyngs.data.tracks import Tracks, read_tracks
 from dyngs.training.priors.agreement import (
     Agreement,
@@ -27,43 +27,43 @@ from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
 from dyngs.training.views import training_cameras
 
 _NEAR_TIME = 0.1
-"""Depth is judged by pictures whose times differ by less; the less, the less has moved."""
+"""Depth is judged by images whose times differ by less; the less, the less has moved."""
 _BASELINE = 0.1
-"""Best distance between the cameras of two pictures for that, as a share of their distance from the scene."""
+"""Best distance between the cameras of two images for that, as a fraction of their distance from the scene."""
 
 
-def used_priors(config: Config, capture: Capture, pictures: PictureLoader, *, moves: bool) -> UsedPriors:
-    """Return the priors of a capture that agree with its pictures; nothing is read where it has none.
+def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves: bool) -> UsedPriors:
+    """Return the priors of a capture that agree with its images; nothing is read where it has none.
 
     Args:
         config: whose weights of 0 leave a prior out.
         capture: of the run.
-        pictures: of its training views, with maps.
+        images: of its training views, with maps.
         moves: whether anything may move in the model: without that, depth alone is of use.
 
     Raises:
         DyngsError: a file that is damaged.
     """
-    options, views, lines = config.train, pictures.views, list[str]()
+    options, views, lines = config.train, images.views, list[str]()
     weights = {"depth": options.depth_weight, "flow": options.flow_weight, "tracks": options.tracks_weight}
     kind: Kind | None = None
     flow_to: dict[int, Glance] = {}
     tracks: PointTracks | None = None
     if options.depth_weight > 0 and any(view.depth_path for view in views):
-        kind, agreement = _judged_depth(config, pictures)
-        lines.append(_line(f"depth maps (aligned in {_NAMES[kind]})", agreement, "one depth for a whole picture"))
+        kind, agreement = _judged_depth(config, images)
+        lines.append(_line(f"depth maps (aligned in {_NAMES[kind]})", agreement, "one depth for a whole image"))
         kind = kind if agreement.holds else None
     if moves and options.flow_weight > 0 and any(view.flow_path for view in views):
-        flow_to, agreement = _judged_flow(config, capture, pictures)
+        flow_to, agreement = _judged_flow(config, capture, images)
         lines.append(_line("optical flow", agreement, "no motion, its reverse or flow of other places"))
         flow_to = flow_to if agreement.holds else {}
     if moves and options.tracks_weight > 0 and capture.tracks_path is not None:
-        tracks, agreement = _judged_tracks(config, read_tracks(capture.tracks_path), pictures)
+        tracks, agreement = _judged_tracks(config, read_tracks(capture.tracks_path), images)
         lines.append(_line("tracks", agreement, "tracks at random"))
         tracks = tracks if agreement.holds else None
     masks = moves and options.motion_masks and any(view.motion_mask_path for view in views)
     if masks:
-        agreement = _judged_masks(config, pictures)
+        agreement = _judged_masks(config, images)
         lines.append(_line("motion masks", agreement, "the same masks the other way round"))
         masks = agreement.holds
     return UsedPriors(kind, flow_to, tracks, masks, weights, lines)
@@ -74,14 +74,14 @@ _NAMES: dict[Kind, str] = {"depth": "depth", "inverse": "inverse depth"}
 
 def _line(what: str, found: Agreement, substitute: str) -> str:
     if not found.pairs:
-        return f"{what}: ignored, no two training pictures can be compared by them"
-    verdict = "used" if found.holds else "ignored, they disagree with the pictures"
-    errors = f"error {found.error:.4f} in {found.pairs} pairs of pictures, {found.without:.4f} by {substitute}"
+        return f"{what}: ignored, no two training images can be compared by them"
+    verdict = "used" if found.holds else "ignored, they disagree with the images"
+    errors = f"error {found.error:.4f} in {found.pairs} pairs of images, {found.without:.4f} by {substitute}"
     return f"{what}: {verdict} ({errors})"
 
 
-def _judged_depth(config: Config, pictures: PictureLoader) -> tuple[Kind, Agreement]:
-    views = pictures.views
+def _judged_depth(config: Config, images: ImageLoader) -> tuple[Kind, Agreement]:
+    views = images.views
     cameras = training_cameras(views, config.data)
     distance = distance_to_scene(cameras)
     if distance is None:
@@ -95,13 +95,13 @@ def _judged_depth(config: Config, pictures: PictureLoader) -> tuple[Kind, Agreem
         cost = (apart / _BASELINE).log().abs() + (times - times[i]).abs() / _NEAR_TIME
         nearest = [int(j) for j in cost.argsort() if usable[j]][:2]
         if len(nearest) == 2:
-            triples.append(tuple(pictures[j] for j in (i, *nearest)))
+            triples.append(tuple(images[j] for j in (i, *nearest)))
     return depth_agreement(triples, distance)
 
 
-def _judged_masks(config: Config, pictures: PictureLoader) -> Agreement:
-    """Compare each of some pictures with the one from the nearest camera at another, not the next, time."""
-    views = pictures.views
+def _judged_masks(config: Config, images: ImageLoader) -> Agreement:
+    """Compare each of some images with the one from the nearest camera at another, not the next, time."""
+    views = images.views
     cameras = training_cameras(views, config.data)
     centers = torch.cat([c.centers for c in cameras])
     times = torch.tensor([view.time or 0.0 for view in views], device="cpu")
@@ -112,31 +112,31 @@ def _judged_masks(config: Config, pictures: PictureLoader) -> Agreement:
         cost = (centers - centers[i]).norm(dim=1) / max(distance, 1e-9) + (apart - _NEAR_TIME).abs()
         other = int(torch.where(apart > 0, cost, torch.inf).argmin())
         if other != i:
-            pairs.append((pictures[i], pictures[other]))
+            pairs.append((images[i], images[other]))
     return mask_agreement(pairs, distance)
 
 
-def _judged_flow(config: Config, capture: Capture, pictures: PictureLoader) -> tuple[dict[int, Glance], Agreement]:
+def _judged_flow(config: Config, capture: Capture, images: ImageLoader) -> tuple[dict[int, Glance], Agreement]:
     named = {view.name: view for view in all_views(capture.splits)}
-    place = {view.name: i for i, view in enumerate(pictures.views)}
+    place = {view.name: i for i, view in enumerate(images.views)}
     flow_to = {
         i: _glance(named[view.flow_to], config)
-        for i, view in enumerate(pictures.views)
+        for i, view in enumerate(images.views)
         if view.flow_path is not None and view.flow_to in named and view.time is not None
     }
-    seen = [i for i in flow_to if pictures.views[i].flow_to in place]
-    pairs = [(pictures[i], pictures[place[pictures.views[i].flow_to or ""]]) for i in spread_pairs(seen)]
+    seen = [i for i in flow_to if images.views[i].flow_to in place]
+    pairs = [(images[i], images[place[images.views[i].flow_to or ""]]) for i in spread_pairs(seen)]
     return flow_to, flow_agreement(pairs)
 
 
-def _judged_tracks(config: Config, tracks: Tracks, pictures: PictureLoader) -> tuple[PointTracks, Agreement]:
-    points = _point_tracks(config, tracks, pictures.views)
+def _judged_tracks(config: Config, tracks: Tracks, images: ImageLoader) -> tuple[PointTracks, Agreement]:
+    points = _point_tracks(config, tracks, images.views)
     pairs = []
-    order = sorted(range(len(pictures)), key=lambda i: (points.glances[i].time, i))
+    order = sorted(range(len(images)), key=lambda i: (points.glances[i].time, i))
     seen = [i for i in order if bool(points.visible[i].any())]
     for i, j in _shared_pairs(points, seen):
         both = points.visible[i] & points.visible[j]
-        pairs.append((pictures[i], pictures[j], points.xy[i][both], points.xy[j][both]))
+        pairs.append((images[i], images[j], points.xy[i][both], points.xy[j][both]))
     return points, track_agreement(pairs)
 
 
@@ -154,7 +154,7 @@ def _shared_pairs(points: PointTracks, seen: Sequence[int]) -> list[tuple[int, i
 
 
 def _point_tracks(config: Config, tracks: Tracks, views: Sequence[View]) -> PointTracks:
-    """Return tracks in the px of training pictures, undistorted; what cannot be undistorted is not visible."""
+    """Return tracks in the px of training images, undistorted; what cannot be undistorted is not visible."""
     rows, (_, count) = tracks.rows_of(views), tracks.visible.shape
     xy = torch.zeros(len(views), count, 2, device="cpu")
     visible = torch.zeros(len(views), count, dtype=torch.bool, device="cpu")

@@ -1,6 +1,6 @@
-"""Motion of a model in pictures, compared with optical flow and 2D tracks.
+"""Motion of a model in images, compared with optical flow and 2D tracks.
 
-Gaussians carry where they go in the other picture as their colour; what is drawn is the displacement of each pixel,
+Gaussians carry where they go in the other image as their colour; what is drawn is the displacement of each pixel,
 with the weights of its colours. Both train the field of motion alone, not the canonical Gaussians.
 """
 
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
-from dyngs.rendering import RenderOptions, render
+from dyngs.gaussians.rendering import RenderOptions, render
 
 _SOLID = 0.5
 _SOFT_PX = 0.5
@@ -23,22 +23,22 @@ _SOFT_PX = 0.5
 
 @dataclass(frozen=True)
 class Glance:
-    """The camera and time of another picture of the same scene."""
+    """The camera and time of another image of the same scene."""
 
     cameras: Cameras
     time: float
 
 
 def displacements(start: Gaussians, end: Gaussians, here: Cameras, there: Cameras, options: RenderOptions) -> Tensor:
-    """Return (H, W, 3): mean displacement (x, y) in px of the pictures' size, and the sum of weights it stands for.
+    """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights it stands for.
 
     Differentiable in the means of both, not in how much each Gaussian covers.
 
     Args:
-        start: N Gaussians at the time of this picture.
-        end: the same ones at the time of the other picture.
-        here: camera of this picture.
-        there: camera of the other picture.
+        start: N Gaussians at the time of this image.
+        end: the same ones at the time of the other image.
+        here: camera of this image.
+        there: camera of the other image.
         options: how to draw.
     """
     (from_px, from_z), (to_px, to_z) = _projected(start.means, here), _projected(end.means, there)
@@ -51,17 +51,17 @@ def displacements(start: Gaussians, end: Gaussians, here: Cameras, there: Camera
     return torch.cat([drawn[..., :2] / total.detach().clamp_min(0.1), total], dim=-1)
 
 
-def flow_error(drawn: Tensor, picture: Picture) -> Tensor | None:
-    """Return the mean Charbonnier error of ``drawn`` (see ``displacements``) in the flow of a picture.
+def flow_error(drawn: Tensor, image: Image) -> Tensor | None:
+    """Return the mean Charbonnier error of ``drawn`` (see ``displacements``) in the flow of an image.
 
-    In shares of the picture's longer side, over pixels whose flow is known; None without any.
+    In fractions of the image's longer side, over pixels whose flow is known; None without any.
     """
-    flow = picture.flow
+    flow = image.flow
     if flow is None:
         return None
     counts = flow.isfinite().all(-1) & (drawn[..., 2].detach() > _SOLID)
-    if picture.mask is not None:
-        counts = counts & (picture.mask > 0)
+    if image.mask is not None:
+        counts = counts & (image.mask > 0)
     if not bool(counts.any()):
         return None
     return _charbonnier(drawn[..., :2][counts] - flow[counts]).mean() / max(counts.shape)
@@ -70,7 +70,7 @@ def flow_error(drawn: Tensor, picture: Picture) -> Tensor | None:
 def track_error(drawn: Tensor, start: Tensor, end: Tensor) -> Tensor | None:
     """Return the mean Charbonnier error of ``drawn`` at the points ``start`` (P, 2) px, which are at ``end`` (P, 2).
 
-    In shares of the picture's longer side; None where no point lies on anything drawn.
+    In fractions of the image's longer side; None where no point lies on anything drawn.
     """
     height, width = drawn.shape[:2]
     grid = (2 * start / start.new_tensor([width, height]) - 1)[None, None]

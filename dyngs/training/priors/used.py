@@ -9,24 +9,24 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
-from dyngs.rendering import Rendering, RenderOptions
-from dyngs.scene import Scene
+from dyngs.data.loader import Image
+from dyngs.gaussians.rendering import Rendering, RenderOptions
+from dyngs.gaussians.scene import Scene
 from dyngs.training.priors.depth_maps import Kind, depth_error
 from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
 
 MIN_POINTS = 4
-"""Fewest points that two pictures must share for their tracks to be compared."""
+"""Fewest points that two images must share for their tracks to be compared."""
 _NEAREST = 8
-"""The other picture of tracks is one of so many nearest in time."""
+"""The other image of tracks is one of so many nearest in time."""
 
 
 @dataclass(frozen=True)
 class PointTracks:
-    """2D tracks in the training pictures.
+    """2D tracks in the training images.
 
     Attributes:
-        xy: (V, P, 2) px of the full training pictures.
+        xy: (V, P, 2) px of the full training images.
         visible: (V, P) bool; a view without tracks has none.
         glances: camera and time of the V views.
     """
@@ -62,7 +62,7 @@ class PointTracks:
 
 @dataclass(frozen=True)
 class UsedPriors:
-    """Priors that agree with the pictures, with their weights.
+    """Priors that agree with the images, with their weights.
 
     Attributes:
         depth: what the depth maps are affine in; None: none are used.
@@ -80,9 +80,9 @@ class UsedPriors:
     weights: Mapping[str, float] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
 
-    def options(self, options: RenderOptions, picture: Picture) -> RenderOptions:
-        """Return how a picture is drawn: with depth where it has a map that is used."""
-        return options if self.depth is None or picture.depth is None else replace(options, depth="expected")
+    def options(self, options: RenderOptions, image: Image) -> RenderOptions:
+        """Return how an image is drawn: with depth where it has a map that is used."""
+        return options if self.depth is None or image.depth is None else replace(options, depth="expected")
 
     def told(self, finding: str | None) -> str | None:
         """Return the lines that have not been told yet, then ``finding``, and forget them; None: there are none."""
@@ -91,35 +91,35 @@ class UsedPriors:
         return "\n".join(lines) or None
 
     def terms(
-        self, scene: Scene, picture: Picture, rendering: Rendering, view: StepView, generator: torch.Generator
+        self, scene: Scene, image: Image, rendering: Rendering, view: StepView, generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Return the weighted losses by name.
 
         Args:
             scene: what is trained.
-            picture: a training picture, perhaps shrunk.
+            image: a training image, perhaps shrunk.
             rendering: of the scene, with ``options``.
             view: which view that is, and what may be looked at.
-            generator: chooses the other picture of tracks.
+            generator: chooses the other image of tracks.
         """
         found: dict[str, Tensor | None] = {}
-        if self.depth is not None and picture.depth is not None and rendering.depth is not None:
+        if self.depth is not None and image.depth is not None and rendering.depth is not None:
             drawn, alpha = rendering.depth[0], rendering.alpha[0]
-            found["depth"] = depth_error(drawn, alpha, picture.depth, self.depth, picture.mask)
-        if not scene.is_still and picture.time is not None:
-            found |= self._motion(scene, picture, view, generator)
+            found["depth"] = depth_error(drawn, alpha, image.depth, self.depth, image.mask)
+        if not scene.is_static and image.time is not None:
+            found |= self._motion(scene, image, view, generator)
         return {name: self.weights[name] * x for name, x in found.items() if x is not None}
 
     def _motion(
-        self, scene: Scene, picture: Picture, view: StepView, generator: torch.Generator
+        self, scene: Scene, image: Image, view: StepView, generator: torch.Generator
     ) -> dict[str, Tensor | None]:
         target = self.flow_to.get(view.index)
-        by_flow = target is not None and picture.flow is not None and view.may_use(target.time)
+        by_flow = target is not None and image.flow is not None and view.may_use(target.time)
         pair = None if self.tracks is None else self.tracks.pair(view.index, view.may_use, generator)
         if not by_flow and pair is None:
             return {}
         canonical = scene.with_gaussians(scene.gaussians.detach())
-        start, here = canonical.moment(picture.time).gaussians, picture.cameras
+        start, here = canonical.moment(image.time).gaussians, image.cameras
 
         def drawn(glance: Glance) -> Tensor:
             there = _sized_as(here, glance.cameras)
@@ -127,7 +127,7 @@ class UsedPriors:
 
         found: dict[str, Tensor | None] = {}
         if by_flow and target is not None:
-            found["flow"] = flow_error(drawn(target), picture)
+            found["flow"] = flow_error(drawn(target), image)
         if pair is not None and self.tracks is not None:
             glance, begin, end = pair
             own = self.tracks.glances[view.index].cameras
@@ -143,7 +143,7 @@ class StepView:
     Attributes:
         index: among the training views.
         may_use: whether a time may be looked at in this step.
-        options: how pictures are drawn.
+        options: how images are drawn.
     """
 
     index: int
@@ -152,11 +152,11 @@ class StepView:
 
 
 def _scale(cameras: Cameras, here: Cameras) -> Tensor:
-    """Return the (2,) factors from px of one camera's pictures to those of another."""
+    """Return the (2,) factors from px of one camera's images to those of another."""
     return here.intrinsics.new_tensor([here.width / cameras.width, here.height / cameras.height])
 
 
 def _sized_as(here: Cameras, cameras: Cameras) -> Cameras:
-    """Return ``cameras`` for pictures as large as those of ``here``."""
+    """Return ``cameras`` for images as large as those of ``here``."""
     scale = torch.cat([_scale(cameras, here), here.intrinsics.new_ones(1)])
     return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, here.width, here.height)

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.data.geometry.focus import focus_point, share_in_front
+from dyngs.data.geometry.focus import focus_point, fraction_in_front
 from dyngs.output.aim import look_at
 
 
@@ -23,7 +23,7 @@ def test_finds_the_common_target(center: tuple[float, float, float], count: int)
     point = focus_point(poses)
     assert point is not None
     np.testing.assert_allclose(point, center, atol=1e-9 * 1e3)
-    assert share_in_front(poses, point) == 1.0
+    assert fraction_in_front(poses, point) == 1.0
 
 
 def test_parallel_cameras_have_none() -> None:
@@ -36,4 +36,4 @@ def test_cameras_that_look_outward_have_it_behind() -> None:
     poses = _ring(np.zeros(3), 6) @ np.diag([1.0, -1.0, -1.0, 1.0])
     point = focus_point(poses)
     assert point is not None
-    assert share_in_front(poses, point) == 0.0
+    assert fraction_in_front(poses, point) == 0.0

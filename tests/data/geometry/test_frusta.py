@@ -29,7 +29,7 @@ def circle(offset: tuple[float, float, float] = (0.0, 0.0, 0.0), scale: float = 
 def test_the_cube_is_seen_or_not() -> None:
     assert outside_of_cube(circle(), 1.3) is None
     assert "look at (7, -3, 11)" in (outside_of_cube(circle((7.0, -3.0, 11.0)), 1.3) or "")
-    # Far too near: only a few points of the cube are in two pictures.
+    # Far too near: only a few points of the cube are in two images.
     assert "of the cube of half side 1.3" in (outside_of_cube(circle(scale=0.2, count=2), 1.3) or "")
 
 
@@ -62,7 +62,7 @@ def test_candidates_lie_in_their_view_between_the_bounds() -> None:
     assert fits.any(axis=0).all()
 
 
-def test_places_in_a_picture() -> None:
+def test_places_in_a_image() -> None:
     view = View("a", Path("a.png"), np.eye(4), pinhole_matrix(10.0, 10.0, 20.0, 15.0), 40, 30)
     places, inside = projected(np.array([[0.0, 0, 1], [1, 0, 1], [0, 0, -1], [3, 0, 1]]), view)
     np.testing.assert_allclose(places[:2], [[0.5, 0.5], [0.75, 0.5]])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_captures import edit_json, opengl_pose, random_pixels, write_frames, write_picture
+from tiny_captures import edit_json, opengl_pose, random_pixels, write_frames, write_image
 
 from dyngs.data.readers.blender import is_blender, read_blender
 from dyngs.data.readers.shared.transforms import view_name
@@ -58,7 +58,7 @@ def test_val_and_test_may_be_absent(blender_root: Path) -> None:
 def test_time_camera_and_frame_are_carried(tmp_path: Path) -> None:
     files = [f"cam{c:02d}/f_{t}.jpg" for t in range(2) for c in range(3)]
     for name in files:
-        write_picture(tmp_path / name, random_pixels(8, 8, 3))
+        write_image(tmp_path / name, random_pixels(8, 8, 3))
     write_frames(tmp_path / "transforms_train.json", files, {"camera_angle_x": 0.7})
 
     def change(content: dict) -> None:
@@ -130,8 +130,8 @@ def test_broken_json_names_line_and_column(blender_root: Path) -> None:
         read_blender(blender_root)
 
 
-def test_pictures_of_two_sizes_need_intrinsics_of_their_own(blender_root: Path) -> None:
-    write_picture(blender_root / "train/r_7.png", random_pixels(4, 6, 4))
+def test_images_of_two_sizes_need_intrinsics_of_their_own(blender_root: Path) -> None:
+    write_image(blender_root / "train/r_7.png", random_pixels(4, 6, 4))
     with pytest.raises(DyngsError, match=r"different sizes.*r_7\.png"):
         read_blender(blender_root)
     edit_json(blender_root / "transforms_train.json", lambda c: [f.update(camera_angle_x=0.7) for f in c["frames"]])
@@ -140,7 +140,7 @@ def test_pictures_of_two_sizes_need_intrinsics_of_their_own(blender_root: Path) 
     assert view.intrinsics[0, 0] == pytest.approx(3 / np.tan(0.35))
 
 
-def test_missing_picture_takes_the_size_of_the_others(blender_root: Path) -> None:
+def test_missing_image_takes_the_size_of_the_others(blender_root: Path) -> None:
     (blender_root / "train/r_3.png").unlink()
     assert read_blender(blender_root).splits["train"][3].width == 12
 

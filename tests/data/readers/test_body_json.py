@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_captures import edit_json, pixel_of, random_pixels, write_frames, write_picture
+from tiny_captures import edit_json, pixel_of, random_pixels, write_frames, write_image
 
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, Capture, View
-from dyngs.data.pictures.images import read_picture
+from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.readers.body_json import is_body_json, read_body_json
 from dyngs.errors import DyngsError
@@ -37,7 +37,7 @@ def root(tmp_path: Path) -> Path:
         write_frames(path, names, LENS)
         edit_json(path, lambda c, n=count, k=cameras: number_frames(c, n, k))
         for i, name in enumerate(names):
-            write_picture(tmp_path / name, random_pixels(3, 4, 4, seed=i))
+            write_image(tmp_path / name, random_pixels(3, 4, 4, seed=i))
     write_body(tmp_path / "body_train.npz", 3)
     write_body(tmp_path / "body_pose.npz", 2, first=10)
     return tmp_path
@@ -121,7 +121,7 @@ def test_bad_parameters(root: Path, change: dict[str, Any], line: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_pictures_need_frame_numbers(root: Path) -> None:
+def test_images_need_frame_numbers(root: Path) -> None:
     edit_json(root / "transforms_test.json", lambda content: content["frames"][1].pop("frame"))
     with pytest.raises(DyngsError, match=r"body_train\.npz: .*f1_c2\.png has no frame number"):
         read_body_json(root)
@@ -141,7 +141,7 @@ def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
         places = about_pelvis(body, pelvis)
         for view, row in zip(views, rows_of(capture.root, body, views), strict=True):
             x, y = pixel_of(view, places.scale[row] * pelvis + places.trans[row])
-            assert read_picture(view.image_path)[int(y), int(x), 3] == 255, view.name
+            assert read_image(view.image_path)[int(y), int(x), 3] == 255, view.name
 
 
 def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
@@ -157,7 +157,7 @@ def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
 
 
 def test_times_that_are_not_given_follow_from_frame_numbers(root: Path) -> None:
-    """Or else every picture would be compared with the first pose."""
+    """Or else every image would be compared with the first pose."""
     timed = read_capture(DataConfig(root=root))
     for split in ("train", "test", "pose"):
         edit_json(root / f"transforms_{split}.json", lambda content: [own.pop("time") for own in content["frames"]])

@@ -17,13 +17,13 @@ from tiny_captures import (
     random_pixels,
     write_cameras_json,
     write_folder,
-    write_picture,
+    write_image,
     write_video,
 )
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
-from dyngs.data.pictures.images import read_picture
+from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.readers.camera_folders import read_camera_folders
 from dyngs.data.readers.shared.camera_sequences import find_cameras
@@ -90,7 +90,7 @@ def test_lens_is_read(root: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_names_of_folders_and_frames_are_free(tmp_path: Path, suffix: str) -> None:
-    """The last number in the name counts; numbers need not start at 0; pictures may lie in ``images``."""
+    """The last number in the name counts; numbers need not start at 0; images may lie in ``images``."""
     write_cameras_json(tmp_path, ("left eye", "right"))
     write_folder(tmp_path / "left eye", (10, 20, 40), prefix="take2 img", suffix=suffix)
     write_folder(tmp_path / "right" / "images", (10, 20, 40), prefix="", suffix=suffix)
@@ -113,7 +113,7 @@ def test_without_test_cameras(tmp_path: Path) -> None:
     assert capture.warnings == ("cameras.json names no 'test' cameras: the first one, cam00, is held out",)
     write_cameras_json(tmp_path, NAMES[:2])
     capture = read(tmp_path)
-    assert len(capture.splits["test"]) == 1, "two cameras are too few to lose one: every n-th picture"
+    assert len(capture.splits["test"]) == 1, "two cameras are too few to lose one: every n-th image"
     assert "no calibration for cam02" in capture.warnings[0]
 
 
@@ -158,7 +158,7 @@ def test_videos(tmp_path: Path, described: tuple[int, int] | None) -> None:
     assert len(cached()) == 2 * 3
     for view in capture.splits["train"][:3]:
         level = level_of(view.frame or 0)
-        assert np.abs(read_picture(view.image_path).numpy().astype(int) - level).max() <= 6
+        assert np.abs(read_image(view.image_path).numpy().astype(int) - level).max() <= 6
 
 
 def test_other_rates_and_lengths_of_videos(tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_all_cameras_for_testing(root: Path) -> None:
         read(root)
 
 
-def test_a_camera_without_pictures_is_left_out(root: Path) -> None:
+def test_a_camera_without_images_is_left_out(root: Path) -> None:
     for path in (root / "cam00").iterdir():
         path.unlink()
     capture = read(root)
@@ -243,7 +243,7 @@ def test_a_camera_without_pictures_is_left_out(root: Path) -> None:
 
 
 def test_numbers_of_frames_must_be_clear(root: Path) -> None:
-    write_picture(root / "cam00" / "frame_01.png", random_pixels(12, 16, 3))
+    write_image(root / "cam00" / "frame_01.png", random_pixels(12, 16, 3))
     with pytest.raises(DyngsError, match=r"frame_0001\.png and frame_01\.png have the same frame number"):
         read_camera_folders(root)
     (root / "cam00" / "frame_01.png").rename(root / "cam00" / "first.png")
@@ -259,7 +259,7 @@ def test_the_documented_example_can_be_read(tmp_path: Path) -> None:
     for name, camera in json.loads(block)["cameras"].items():
         for number in range(2):
             pixels = np.zeros((camera["h"], camera["w"], 3), np.uint8)
-            write_picture(tmp_path / name / f"frame_{number:04d}.png", pixels)
+            write_image(tmp_path / name / f"frame_{number:04d}.png", pixels)
     capture = read(tmp_path)
     assert capture.warnings == ()
     assert len(capture.splits["train"]) == 2

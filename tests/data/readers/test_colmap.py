@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_captures import opengl_pose, random_pixels, write_colmap, write_picture
+from tiny_captures import opengl_pose, random_pixels, write_colmap, write_image
 
 from dyngs.config import DataConfig
-from dyngs.data.pictures.lens import distort
+from dyngs.data.images.lens import distort
 from dyngs.data.read import read_capture
 from dyngs.data.readers.colmap import find_model, is_colmap, pinhole_and_lens, read_colmap
 from dyngs.data.readers.shared.colmap_check import check_model_file
@@ -95,12 +95,12 @@ def test_model_may_lie_in_sparse_or_at_the_root(colmap_root: Path, folder: str) 
 
 @pytest.mark.parametrize("name", ["right/00.jpg.png", "right/00.png", "right/00.jpg"])
 def test_masks_are_found_by_any_usual_name(colmap_root: Path, name: str) -> None:
-    write_picture(colmap_root / "masks" / name, random_pixels(8, 12, 1))
+    write_image(colmap_root / "masks" / name, random_pixels(8, 12, 1))
     capture = read_colmap(colmap_root)
     found = {view.name: view.mask_path for view in capture.splits["train"]}
     assert found.pop("right/00") == colmap_root / "masks" / name
     assert set(found.values()) == {None}
-    assert any("8 pictures have no mask" in warning for warning in capture.warnings)
+    assert any("8 images have no mask" in warning for warning in capture.warnings)
 
 
 def assert_refused(root: Path, path: Path) -> None:
@@ -161,18 +161,18 @@ def test_missing_images_folder(colmap_root: Path) -> None:
         read_colmap(colmap_root)
 
 
-def test_smaller_pictures_rescale_other_shapes_are_errors(colmap_root: Path) -> None:
-    write_picture(colmap_root / "images/left/01.jpg", random_pixels(4, 6, 3))
+def test_smaller_images_rescale_other_shapes_are_errors(colmap_root: Path) -> None:
+    write_image(colmap_root / "images/left/01.jpg", random_pixels(4, 6, 3))
     capture = read_colmap(colmap_root)
     np.testing.assert_allclose(capture.splits["train"][0].intrinsics, [[5, 0, 3], [0, 5.5, 2], [0, 0, 1]])
     assert any("rescaled" in warning for warning in capture.warnings)
-    write_picture(colmap_root / "images/left/01.jpg", random_pixels(8, 8, 3))
-    with pytest.raises(DyngsError, match=r"left/01\.jpg: the picture is 8x8"):
+    write_image(colmap_root / "images/left/01.jpg", random_pixels(8, 8, 3))
+    with pytest.raises(DyngsError, match=r"left/01\.jpg: the image is 8x8"):
         read_colmap(colmap_root)
 
 
 def test_cup(shared: Path) -> None:
-    """The real model: every point, projected into a picture that shows it, is found near its observation."""
+    """The real model: every point, projected into an image that shows it, is found near its observation."""
     import pycolmap
 
     capture = read_colmap(shared / "colmap_small")
@@ -209,7 +209,7 @@ def test_counts_that_no_file_has(colmap_root: Path, name: str) -> None:
             read_colmap(colmap_root)
 
 
-def test_listed_pictures_are_for_testing(tmp_path: Path) -> None:
+def test_listed_images_are_for_testing(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     images = tmp_path / "images"
     names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
@@ -219,4 +219,4 @@ def test_listed_pictures_are_for_testing(tmp_path: Path) -> None:
     capture = read_capture(tmp_path)
     assert [view.image_path for view in capture.splits["test"]] == [images / names[1]]
     assert len(capture.splits["train"]) == len(names) - 1
-    assert any("1 listed pictures have no pose, first nowhere.png" in line for line in capture.warnings)
+    assert any("1 listed images have no pose, first nowhere.png" in line for line in capture.warnings)

@@ -40,11 +40,11 @@ def test_folders(root: Path) -> None:
         assert pixel_of(capture.splits["test"][0], point) == pytest.approx(pixel)
 
 
-def test_smaller_pictures_scale_the_intrinsics(root: Path) -> None:
+def test_smaller_images_scale_the_intrinsics(root: Path) -> None:
     write_poses_bounds(root, 3, size=(64, 48))
     capture = read(root)
     assert len(capture.warnings) == 3, "one for each camera"
-    assert "5 pictures have another size" in capture.warnings[0]
+    assert "5 images have another size" in capture.warnings[0]
     for point, pixel in SIDE_PIXELS:
         assert pixel_of(capture.splits["test"][0], point) == pytest.approx(pixel)
 

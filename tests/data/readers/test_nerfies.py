@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny_captures import SIDE_PIXELS, edit_json, pixel_of, random_pixels, write_nerfies, write_picture
+from tiny_captures import SIDE_PIXELS, edit_json, pixel_of, random_pixels, write_image, write_nerfies
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
-from dyngs.data.pictures.lens import distort
+from dyngs.data.images.lens import distort
 from dyngs.data.read import read_capture
 from dyngs.data.readers.nerfies import read_nerfies
 from dyngs.errors import DyngsError
@@ -44,7 +44,7 @@ def test_views_times_and_splits(root: Path) -> None:
 
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_known_points_at_known_pixels(tmp_path: Path, factor: int) -> None:
-    """In the scaled frame of scene.json, with intrinsics for the pictures that are there."""
+    """In the scaled frame of scene.json, with intrinsics for the images that are there."""
     capture = read(write_nerfies(tmp_path, factor=factor))
     view = capture.splits["train"][0]
     assert (view.width, view.height, capture.warnings) == (16, 12, ())
@@ -53,11 +53,11 @@ def test_known_points_at_known_pixels(tmp_path: Path, factor: int) -> None:
         assert pixel_of(view, point) == pytest.approx(pixel)
 
 
-def test_the_largest_pictures_are_taken(tmp_path: Path) -> None:
+def test_the_largest_images_are_taken(tmp_path: Path) -> None:
     write_nerfies(tmp_path, factor=2)
     (tmp_path / "rgb" / "1x").mkdir()
     for i in range(6):
-        write_picture(tmp_path / f"rgb/16x/{i:06d}.png", random_pixels(2, 1, 3))
+        write_image(tmp_path / f"rgb/16x/{i:06d}.png", random_pixels(2, 1, 3))
     assert {view.width for view in read(tmp_path).splits["train"]} == {16}
 
 
@@ -122,7 +122,7 @@ def test_one_time_is_a_still_scene(root: Path) -> None:
     edit_json(root / "metadata.json", lambda c: [m.update(warp_id=0) for m in c.values()])
     capture = read(root)
     assert {view.time for view in capture.splits["train"]} == {None}
-    assert "treated as a still scene" in capture.warnings[0]
+    assert "treated as a static scene" in capture.warnings[0]
 
 
 def test_frames_are_chosen(root: Path) -> None:
@@ -171,13 +171,13 @@ def test_broken_files(root: Path, file: str, text: str) -> None:
 
 def test_missing_files(root: Path) -> None:
     (root / "rgb/1x/000002.png").unlink()
-    assert "1 of 6 pictures are missing" in read(root).warnings[0]
+    assert "1 of 6 images are missing" in read(root).warnings[0]
     (root / "camera" / "000002.json").unlink()
     with pytest.raises(DyngsError, match=r"000002\.json: no such camera file"):
         read_nerfies(root)
     for path in (root / "rgb/1x").iterdir():
         path.unlink()
-    with pytest.raises(DyngsError, match="no pictures in 1x, 2x, 4x"):
+    with pytest.raises(DyngsError, match="no images in 1x, 2x, 4x"):
         read_nerfies(root)
 
 

@@ -85,8 +85,8 @@ def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [24, 6])
-def test_resized_pictures_rescale_the_intrinsics(nerfstudio_root: Path, width: int) -> None:
-    """The JSON speaks of pictures of another size but the same shape."""
+def test_resized_images_rescale_the_intrinsics(nerfstudio_root: Path, width: int) -> None:
+    """The JSON speaks of images of another size but the same shape."""
     scale = 12 / width
     edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(w=width, h=width * 8 / 12))
     capture = read_nerfstudio(nerfstudio_root)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tiny_captures import write_colmap, write_picture
+from tiny_captures import write_colmap, write_image
 
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
@@ -62,10 +62,10 @@ def write_aligned(root: Path, **changes: Any) -> None:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Nine pictures of 12x8."""
+    """Nine images of 12x8."""
     write_colmap(tmp_path, extension="txt")
     for name in NAMES:
-        write_picture(tmp_path / "segmentations" / name, np.zeros((8, 12, 1), np.uint8))
+        write_image(tmp_path / "segmentations" / name, np.zeros((8, 12, 1), np.uint8))
     write_fit(tmp_path, {1: fit()}, matrices())
     return tmp_path
 
@@ -124,7 +124,7 @@ def test_splits(root: Path) -> None:
     capture = read_neuman(root)
     frames = {name: [view.frame for view in views] for name, views in capture.splits.items()}
     assert frames == {"train": [0, 2, 3], "val": [4], "test": [1]}
-    assert capture.warnings == ("1 pictures of the splits have no pose and are left out: 99.jpg",)
+    assert capture.warnings == ("1 images of the splits have no pose and are left out: 99.jpg",)
     (root / "train_split.txt").unlink()
     assert [view.frame for view in read_neuman(root).splits["train"]] == [0, 2, 3, 5, 6, 7, 8]
     (root / "test_split.txt").write_bytes(b"\xff\xfe")
@@ -134,7 +134,7 @@ def test_splits(root: Path) -> None:
 
 def test_missing_masks_are_counted(root: Path) -> None:
     (root / "segmentations/02.jpg").unlink()
-    assert read_neuman(root).warnings == ("1 pictures have no mask in segmentations, first 02.jpg",)
+    assert read_neuman(root).warnings == ("1 images have no mask in segmentations, first 02.jpg",)
 
 
 def test_missing_files(root: Path) -> None:
@@ -158,7 +158,7 @@ def test_missing_files(root: Path) -> None:
         ([fit()], "must hold the body parameters of one person, got 0"),
         ({1: 5}, "must be a dictionary with the key 'pose'"),
         ({1: {"pose": fit()["pose"]}}, "the key 'betas' is missing"),
-        ({1: {**fit(), "pose": np.zeros((4, 72))}}, "'pose' has 4 rows, but the COLMAP model has 9 posed pictures"),
+        ({1: {**fit(), "pose": np.zeros((4, 72))}}, "'pose' has 4 rows, but the COLMAP model has 9 posed images"),
         ({1: {**fit(), "pose": [1, [2]]}}, "'pose' has 0 rows"),
         ({1: {**fit(), "pose": np.full((9, 72), np.nan)}}, "'poses' of frame 0 holds NaN"),
         ({1: {**fit(), "pose": np.zeros((9, 70))}}, "'poses' has 70 numbers per frame"),
@@ -194,7 +194,7 @@ def test_bad_alignments(root: Path, matrix: np.ndarray | None, line: str) -> Non
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"body_pose": np.zeros((COUNT - 1, 69))}, "'body_pose' has 8 rows, but the COLMAP model has 9 posed pictures"),
+        ({"body_pose": np.zeros((COUNT - 1, 69))}, "'body_pose' has 8 rows, but the COLMAP model has 9 posed images"),
         ({"body_pose": np.zeros((COUNT, 66))}, "'poses' has 69 numbers per frame"),
         ({"scale": np.zeros(COUNT)}, "'scale' must be positive"),
         ({"transl": np.zeros((COUNT, 2))}, "'trans' has 2 numbers per frame instead of 3"),

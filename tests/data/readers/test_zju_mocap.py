@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tiny_captures import pixel_of, random_pixels, side_poses, write_picture
+from tiny_captures import pixel_of, random_pixels, side_poses, write_image
 
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
@@ -52,10 +52,10 @@ def write_annots(root: Path, cameras: int = 4, frames: tuple[int, ...] = (0, 1, 
     ims = [{"ims": [f"Camera_B{c + 1}/{f:06d}.jpg" for c in range(cameras)]} for f in frames]
     for own in ims:
         for name in own["ims"]:
-            write_picture(root / name, random_pixels(12, 16, 3))
+            write_image(root / name, random_pixels(12, 16, 3))
             labels = np.zeros((12, 16, 1), np.uint8)
             labels[4:8, 4:8] = 5
-            write_picture((root / "mask_cihp" / name).with_suffix(".png"), labels)
+            write_image((root / "mask_cihp" / name).with_suffix(".png"), labels)
     for frame in frames:
         save(root / "new_params" / f"{frame}.npy", params(frame))
     annots = {"cams": cams, "ims": ims}
@@ -73,8 +73,8 @@ def write_single(root: Path, frames: int = 3) -> tuple[dict[str, Any], dict[str,
         cameras[name] = {"intrinsics": K, "extrinsics": cam_from_world(0), "distortions": LENS[:, 0]}
         own = {key: value[0] for key, value in params(frame).items() if key != "shapes"}
         meshes[name] = {**own, "joints": joints + 1, "tpose_joints": joints}
-        write_picture(root / "images" / f"{name}.png", random_pixels(12, 16, 3))
-        write_picture(root / "masks" / f"{name}.png", np.full((12, 16, 3), 255, np.uint8))
+        write_image(root / "images" / f"{name}.png", random_pixels(12, 16, 3))
+        write_image(root / "masks" / f"{name}.png", np.full((12, 16, 3), 255, np.uint8))
     dump(root, cameras, meshes)
     return cameras, meshes
 
@@ -195,7 +195,7 @@ def test_missing_masks_are_counted(tmp_path: Path) -> None:
     write_annots(tmp_path)
     (tmp_path / "mask_cihp/Camera_B2/000001.png").unlink()
     note = read_zju_mocap(tmp_path).warnings[0]
-    assert note == "1 pictures have no mask in mask_cihp or mask or masks, first Camera_B2/000001"
+    assert note == "1 images have no mask in mask_cihp or mask or masks, first Camera_B2/000001"
 
 
 def test_lenses_of_other_lengths(tmp_path: Path) -> None:
@@ -235,10 +235,10 @@ def test_missing_files(tmp_path: Path) -> None:
         (lambda a: a["cams"]["D"].__setitem__(2, ["x"]), "camera 2: the distortion must hold finite numbers"),
         (lambda a: a["cams"]["R"].__setitem__(0, np.diag([1.0, 1, -1])), "camera 0: the pose is mirrored"),
         (lambda a: a["cams"]["T"].__setitem__(3, np.full(3, np.nan)), "camera 3: 'T' must hold 3 finite numbers"),
-        (lambda a: a["ims"][1]["ims"].pop(), "ims 1: must name one picture for each of the 4 cameras, got 3"),
-        (lambda a: a["ims"][1].update(ims=[1, 2, 3, 4]), "ims 1: must name one picture"),
+        (lambda a: a["ims"][1]["ims"].pop(), "ims 1: must name one image for each of the 4 cameras, got 3"),
+        (lambda a: a["ims"][1].update(ims=[1, 2, 3, 4]), "ims 1: must name one image"),
         (lambda a: a["ims"][1].update(ims=["a.jpg"] * 4), "no frame number in the name 'a.jpg'"),
-        (lambda a: a.update(ims=[]), "lists no pictures"),
+        (lambda a: a.update(ims=[]), "lists no images"),
     ],
 )
 def test_bad_annotations(tmp_path: Path, change: Callable[[dict[str, Any]], object], line: str) -> None:
@@ -279,10 +279,10 @@ def test_bad_pickles_of_one_camera(tmp_path: Path) -> None:
     short = {name: own for name, own in meshes.items() if name != "frame_000001"}
     first = dict(meshes["frame_000000"])
     cases = [
-        (cameras, short, r"mesh_infos\.pkl: no body parameters for 1 frames that have pictures \(1\)"),
-        (cameras, {}, r"mesh_infos\.pkl: must be a dictionary from picture names"),
-        (cameras, [meshes], r"mesh_infos\.pkl: must be a dictionary from picture names"),
-        ({"../x_1": cameras["frame_000000"]}, meshes, r"cameras\.pkl: '\.\./x_1' is no name of a picture"),
+        (cameras, short, r"mesh_infos\.pkl: no body parameters for 1 frames that have images \(1\)"),
+        (cameras, {}, r"mesh_infos\.pkl: must be a dictionary from image names"),
+        (cameras, [meshes], r"mesh_infos\.pkl: must be a dictionary from image names"),
+        ({"../x_1": cameras["frame_000000"]}, meshes, r"cameras\.pkl: '\.\./x_1' is no name of an image"),
         ({"a_1": {"intrinsics": K}}, meshes, r"cameras\.pkl, a_1: the key 'extrinsics' is missing"),
         (cameras, {**meshes, "frame_000000": {}}, r"mesh_infos\.pkl, frame_000000: the key 'poses' is missing"),
         (cameras, {**meshes, "frame_0": first}, r"mesh_infos\.pkl: frame 0 has body parameters twice"),

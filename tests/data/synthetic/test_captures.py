@@ -10,12 +10,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from dyngs.capture.inspection.report import inspect_capture
 from dyngs.cli import main
 from dyngs.cli.data import SYNTHETIC_SCENES
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.geometry.poses import camera_center
-from dyngs.data.inspection.report import inspect_capture
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
     CAMERA_ANGLE_X,
@@ -128,7 +128,7 @@ def test_the_room_is_filmed_by_fixed_cameras_of_which_one_is_for_testing(tmp_pat
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_picture_shows_its_scene_at_its_time(name: SceneName, tmp_path: Path) -> None:
+def test_each_image_shows_its_scene_at_its_time(name: SceneName, tmp_path: Path) -> None:
     root = write_dynamic_capture(name, tmp_path / "out", TINY)
     for split in ("train", "val", "test"):
         frame = json.loads((root / f"transforms_{split}.json").read_text())["frames"][-1]
@@ -139,7 +139,7 @@ def test_each_picture_shows_its_scene_at_its_time(name: SceneName, tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_held_out_pictures_have_masks_of_what_moves(name: SceneName, tmp_path: Path) -> None:
+def test_held_out_images_have_masks_of_what_moves(name: SceneName, tmp_path: Path) -> None:
     root = write_dynamic_capture(name, tmp_path / "out", TINY)
     for split in ("train", "val", "test"):
         frames = json.loads((root / f"transforms_{split}.json").read_text())["frames"]
@@ -153,13 +153,13 @@ def test_held_out_pictures_have_masks_of_what_moves(name: SceneName, tmp_path: P
 
 @pytest.mark.parametrize("name", NAMES)
 def test_inspection_finds_nothing_suspicious(name: SceneName, tmp_path: Path) -> None:
-    """But that so few pictures, each of a time of its own, show what moves from one side only; the room has cameras."""
+    """But that so few images, each of a time of its own, show what moves from one side only; the room has cameras."""
     problems = inspect_capture(write_dynamic_capture(name, tmp_path / "out", TINY), deep=True).problems
     assert len(problems) == (name != "room")
     assert all(line.endswith("expect a still result") for line in problems)
 
 
-def test_one_time_and_many_test_pictures_are_allowed(tmp_path: Path) -> None:
+def test_one_time_and_many_test_images_are_allowed(tmp_path: Path) -> None:
     options = DynamicOptions(size=4, num_times=1, num_test=4, samples=1)
     capture = _read(write_dynamic_capture("spin", tmp_path / "out", options))
     assert [view.time for view in capture.splits["train"]] == [0.0]
@@ -187,17 +187,17 @@ def test_the_command_knows_all_scenes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "pictures", "preset"),
+    ("words", "images", "preset"),
     [(["spin", "--views", "3"], 3, "dynamic"), (["room", "--views", "2", "--cameras", "3"], 6, "dynamic")],
 )
 def test_command_writes_and_says_what_is_next(
-    words: list[str], pictures: int, preset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], images: int, preset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name, *options = words
     assert main(["data", "synth", name, str(tmp_path / "new"), "--size", "8", *options]) == 0
     assert f"dyngs train configs/{preset}.yaml data.root={tmp_path / 'new'}" in capsys.readouterr().out
     capture = _read(tmp_path / "new")
-    assert len(capture.splits["train"]) == pictures
+    assert len(capture.splits["train"]) == images
     assert {(view.width, view.height) for view in capture.splits["train"]} == {(8, 8)}
 
 

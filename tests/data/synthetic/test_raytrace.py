@@ -153,9 +153,9 @@ def test_a_sheet_is_seen_from_both_sides_and_throws_a_shadow() -> None:
     above = orbit_cameras(1, 4.0, elevation_deg=80.0, start_deg=0.0)[0]
     below = orbit_cameras(1, 4.0, elevation_deg=-80.0, start_deg=0.0)[0]
     top, bottom = (render_scene(Scene((sheet,)), pose, 48, 2) for pose in (above, below))
-    sizes = [int((picture[..., 3] == 255).sum()) for picture in (top, bottom)]
+    sizes = [int((image[..., 3] == 255).sum()) for image in (top, bottom)]
     assert abs(sizes[0] / sizes[1] - 1) < 0.1
-    lit, dark = (picture[picture[..., 3] == 255][:, :3].mean() for picture in (top, bottom))
+    lit, dark = (image[image[..., 3] == 255][:, :3].mean() for image in (top, bottom))
     assert lit > dark + 40, "the lamp is above"
     plate = Box((0.0, 0.0, -0.9), (1.5, 1.5, 0.1), _grey)
     free, under = (render_scene(Scene(things), above, 48, 2)[..., :3] for things in ((plate,), (plate, sheet)))

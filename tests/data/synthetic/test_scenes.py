@@ -18,12 +18,12 @@ from dyngs.errors import DyngsError
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
 NUM_STILL: dict[SceneName, int] = {"spin": 2, "wave": 4, "merge": 2, "room": 7}
 FOCAL = 0.5 / np.tan(0.5 * CAMERA_ANGLE_X)
-"""Of a picture of one pixel."""
+"""Of an image of one pixel."""
 
 times = st.floats(0.0, 1.0)
 
 
-def test_the_still_life_is_on_white_and_fills_the_picture() -> None:
+def test_the_still_life_is_on_white_and_fills_the_image() -> None:
     for pose in hemisphere_cameras(6, 4.0, 0):
         alpha = render_scene(still_life(), pose, 32, samples=2)[..., 3]
         assert alpha[0].max() == 0
@@ -31,7 +31,7 @@ def test_the_still_life_is_on_white_and_fills_the_picture() -> None:
 
 
 @pytest.mark.parametrize("name", ["spin", "wave", "merge"])
-def test_moving_things_stay_inside_the_picture(name: SceneName) -> None:
+def test_moving_things_stay_inside_the_image(name: SceneName) -> None:
     poses = hemisphere_cameras(7, 4.0, seed=1)
     for time, pose in zip(np.linspace(0, 1, 7), poses, strict=True):
         alpha = render_scene(scene_at(name, float(time)), pose, 32, samples=2)[..., 3]
@@ -165,8 +165,8 @@ def test_a_mark_on_the_cloth_is_seen_where_its_material_point_is(time: float) ->
     size, u, v = 128, 0.31, -0.22
     sheet = replace(_cloth(time), paint=_spot(u / 0.74, v / 0.56))
     pose = orbit_cameras(1, 4.0, elevation_deg=50.0, start_deg=-60.0)[0]
-    picture = render_scene(Scene((sheet,)), pose, size, samples=3).astype(float)
-    red = ((picture[..., 3] == 255) & (picture[..., 0] > 2 * picture[..., 1])).astype(float)
+    image = render_scene(Scene((sheet,)), pose, size, samples=3).astype(float)
+    red = ((image[..., 3] == 255) & (image[..., 0] > 2 * image[..., 1])).astype(float)
     rows, columns = np.mgrid[:size, :size] + 0.5
     found = np.array([(red * columns).sum(), (red * rows).sum()]) / red.sum()
     height = 0.16 + 0.115 * np.sin(5.2 * u + 1.6 * v - 2 * np.pi * time)

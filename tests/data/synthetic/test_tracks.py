@@ -10,7 +10,7 @@ import pytest
 from dyngs.data.synthetic.captures import orbit_cameras
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, render_movers
 from dyngs.data.synthetic.scenes import SceneName, scene_at
-from dyngs.data.synthetic.tracks import POINTS_PER_THING, is_in_picture, true_tracks
+from dyngs.data.synthetic.tracks import POINTS_PER_THING, is_in_image, true_tracks
 
 SIZE = 64
 CAMERAS = ((16.0, -70.0), (34.0, -45.0), (22.0, -20.0), (45.0, -60.0), (28.0, -30.0))
@@ -19,7 +19,7 @@ NAMES: tuple[SceneName, ...] = get_args(SceneName)
 
 
 def projected(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """(P, 2) pixels of a picture of ``SIZE``."""
+    """(P, 2) pixels of an image of ``SIZE``."""
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
     return np.stack([focal * x / -z, focal * y / z], axis=1) + 0.5 * SIZE
@@ -56,6 +56,6 @@ def test_points_are_missing_before_their_thing_appears() -> None:
     assert not tracks.visible[0, -POINTS_PER_THING:].any()
 
 
-def test_points_outside_the_picture_or_behind_the_camera_are_not_in_it() -> None:
+def test_points_outside_the_image_or_behind_the_camera_are_not_in_it() -> None:
     points = np.array([[0, 0, -1], [0.35, 0, -1], [0.37, 0, -1], [0, 0, 1], [np.nan, 0, -1]])
-    assert is_in_picture(points, np.eye(4)).tolist() == [True, True, False, False, False]
+    assert is_in_image(points, np.eye(4)).tolist() == [True, True, False, False, False]

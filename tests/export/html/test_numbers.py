@@ -14,7 +14,7 @@ def test_every_kind_has_the_lists_that_it_needs(kind: str) -> None:
     scene, lists = scene_of_kind(kind), Lists()
     told = add_scene(scene, lists, 0.01)
     layout = lists.layout
-    assert (told["count"], told["moves"]) == (len(scene), not scene.is_still)
+    assert (told["count"], told["moves"]) == (len(scene), not scene.is_static)
     for name, columns in {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "base": 3}.items():
         assert (layout[name]["rows"], layout[name]["columns"]) == (len(scene), columns)
     assert ("boned" in layout, "bones" in told) == (kind == "human",) * 2

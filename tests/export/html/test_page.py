@@ -30,10 +30,10 @@ from dyngs.deform.rigid_groups import ALONE, fitted_splines
 from dyngs.deform.scene import DynamicScene
 from dyngs.export.html.page import SCRIPTS, SHADERS, Staging, WrittenPage, write_page
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Scene
 from dyngs.metrics import psnr, ssim
 from dyngs.ops.quaternions import rotate
-from dyngs.rendering import RenderOptions
-from dyngs.scene import Scene
 from dyngs.static.scene import StaticScene
 
 WHITE = (1.0, 1.0, 1.0)
@@ -65,8 +65,8 @@ def shown(page: Page, view: Cameras, time: float) -> torch.Tensor:
     asked = {"camFromWorld": view.cam_from_world[0].flatten().tolist(), "intrinsics": [fx, fy, cx, cy]}
     asked |= {"width": view.width, "height": view.height, "time": time}
     address: str = page.evaluate("view => dyngs.show(view)", asked)
-    picture = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB")
-    return torch.from_numpy(np.asarray(picture).astype(np.float32) / 255)
+    image = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB")
+    return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
 
 
 def assert_alike(page: Page, scene: Scene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:

@@ -47,7 +47,7 @@ def test_a_motion_becomes_an_animation(tmp_path: Path) -> None:
     assert animation["name"] == "dance"
     np.testing.assert_allclose(found.numbers(animation["samplers"][0]["input"])[:, 0], [0, 0.1, 0.2, 0.3], atol=1e-6)
     assert abs(min(found.posed(frame)[:, 1].min() for frame in range(4))) < 1e-5
-    assert found.picture().shape == (96, 96, 3)
+    assert found.image().shape == (96, 96, 3)
     assert found.json["extensionsUsed"] == ["KHR_materials_unlit"]
     write_mesh(run, tmp_path / "again.glb", Played("dance", 10.0))
     assert (tmp_path / "again.glb").read_bytes() == (tmp_path / "ann.glb").read_bytes()

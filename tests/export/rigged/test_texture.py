@@ -37,7 +37,7 @@ def test_a_texel_has_the_colour_of_its_place() -> None:
     assert float((found.alpha > 0.5).float().mean()) > 0.97
 
 
-def test_the_picture_is_upside_up_and_not_mirrored() -> None:
+def test_the_image_is_upside_up_and_not_mirrored() -> None:
     """Read as renderers do, row = (1 - v) H: at each vertex of the head and hands its own colour."""
     body, texels = template(), atlas_texels(template(), 128)
     assert body.uv is not None

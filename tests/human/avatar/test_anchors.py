@@ -45,12 +45,12 @@ def test_corrections_act_only_where_parts_meet() -> None:
 
 def test_the_heaviest_joints_are_kept_and_normalised() -> None:
     weights = torch.tensor([[0.05] * 8 + [0.3, 0.3], [0.0] * 9 + [1.0]])
-    joints, shares = heaviest_joints(weights)
+    joints, fractions = heaviest_joints(weights)
     assert joints.shape == (2, 8)
     assert joints[0, :2].tolist() == [8, 9]
     assert joints[1, 0] == 9
-    torch.testing.assert_close(shares.sum(1), torch.ones(2))
-    torch.testing.assert_close(shares[0, 0], torch.tensor(0.3 / 0.9))
+    torch.testing.assert_close(fractions.sum(1), torch.ones(2))
+    torch.testing.assert_close(fractions[0, 0], torch.tensor(0.3 / 0.9))
 
 
 def test_first_gaussians_lie_flat_on_their_scaffolds() -> None:

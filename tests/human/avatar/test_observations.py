@@ -1,11 +1,11 @@
-"""Silhouettes and colours of places against what the pictures were painted with."""
+"""Silhouettes and colours of places against what the images were painted with."""
 
 from __future__ import annotations
 
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.human.avatar.observations import SurfacePoints, observe_points
 from dyngs.human.avatar.posing import BodyPose, Skeleton
 
@@ -13,7 +13,7 @@ STILL = BodyPose(torch.eye(3)[None], torch.zeros(3), torch.tensor(1.0))
 SKELETON = Skeleton(torch.zeros(1, 3), (-1,))
 
 
-def picture(rgb: tuple[float, float, float], half: float, with_alpha: bool = True, turned: bool = False) -> Picture:
+def image(rgb: tuple[float, float, float], half: float, with_alpha: bool = True, turned: bool = False) -> Image:
     """A disc of colour ``rgb`` and radius ``half`` m around the origin, seen from z = -2 or, ``turned``, from 2."""
     pose = torch.eye(4)
     pose[2, 3] = 2.0
@@ -22,7 +22,7 @@ def picture(rgb: tuple[float, float, float], half: float, with_alpha: bool = Tru
     cameras = Cameras(pose[None], torch.tensor([[[40.0, 0, 20], [0, 40.0, 20], [0, 0, 1]]]), 40, 40)
     grid = (torch.arange(40) + 0.5 - 20) / 20
     alpha = ((grid[:, None] ** 2 + grid**2).sqrt() < half).float()
-    return Picture("disc", cameras, alpha[..., None] * torch.tensor(rgb), alpha if with_alpha else None, None, 0.0, 0)
+    return Image("disc", cameras, alpha[..., None] * torch.tensor(rgb), alpha if with_alpha else None, None, 0.0, 0)
 
 
 def places(points: list[list[float]], normal: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> SurfacePoints:
@@ -31,19 +31,19 @@ def places(points: list[list[float]], normal: tuple[float, float, float] = (0.0,
 
 
 def test_the_share_of_silhouettes_counts() -> None:
-    shown = [(picture((1, 0, 0), half), STILL) for half in (0.5, 0.5, 0.1, 0.5)]
+    shown = [(image((1, 0, 0), half), STILL) for half in (0.5, 0.5, 0.1, 0.5)]
     found = observe_points(places([[0.0, 0, 0], [0.3, 0, 0], [0.8, 0, 0], [50.0, 0, 0]]), SKELETON, shown)
     assert found.inside.tolist() == [1.0, 0.75, 0.0, 1.0]
 
 
-def test_places_are_looked_up_in_the_pose_of_the_picture() -> None:
+def test_places_are_looked_up_in_the_pose_of_the_image() -> None:
     moved = BodyPose(torch.eye(3)[None], torch.tensor([-0.6, 0.0, 0.0]), torch.tensor(2.0))
-    found = observe_points(places([[0.3, 0, 0], [0.0, 0, 0]]), SKELETON, [(picture((1, 0, 0), 0.3), moved)])
+    found = observe_points(places([[0.3, 0, 0], [0.0, 0, 0]]), SKELETON, [(image((1, 0, 0), 0.3), moved)])
     assert found.inside.tolist() == [1.0, 0.0]
 
 
 def test_colours_are_those_of_the_cameras_in_front() -> None:
-    shown = [(picture((1.0, 0.2, 0.0), 0.5), STILL), (picture((0.0, 0.0, 1.0), 0.5, turned=True), STILL)]
+    shown = [(image((1.0, 0.2, 0.0), 0.5), STILL), (image((0.0, 0.0, 1.0), 0.5, turned=True), STILL)]
     front = observe_points(places([[0.0, 0, 0]]), SKELETON, shown).rgb[0]
     back = observe_points(places([[0.0, 0, 0]], (0.0, 0.0, 1.0)), SKELETON, shown).rgb[0]
     torch.testing.assert_close(front, torch.tensor([1.0, 0.2, 0.0]))
@@ -51,7 +51,7 @@ def test_colours_are_those_of_the_cameras_in_front() -> None:
 
 
 def test_what_nobody_sees_is_grey_and_without_alpha_nothing_is_carved() -> None:
-    aside = observe_points(places([[0.0, 0, 0]], (1.0, 0.0, 0.0)), SKELETON, [(picture((1, 0, 0), 0.5), STILL)])
+    aside = observe_points(places([[0.0, 0, 0]], (1.0, 0.0, 0.0)), SKELETON, [(image((1, 0, 0), 0.5), STILL)])
     torch.testing.assert_close(aside.rgb[0], torch.full((3,), 0.5))
-    opaque = observe_points(places([[0.8, 0, 0]]), SKELETON, [(picture((1, 0, 0), 0.5, with_alpha=False), STILL)])
+    opaque = observe_points(places([[0.8, 0, 0]]), SKELETON, [(image((1, 0, 0), 0.5, with_alpha=False), STILL)])
     assert opaque.inside.tolist() == [1.0]

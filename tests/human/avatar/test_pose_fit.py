@@ -1,4 +1,4 @@
-"""Poses fitted to pictures: those that are off are found again, and nothing but poses changes."""
+"""Poses fitted to images: those that are off are found again, and nothing but poses changes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch import Tensor
 from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
-from dyngs.data.loader import Picture, PictureLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.human.avatar import pose_fit
-from dyngs.human.avatar.pose_comparison import PICTURES, SILHOUETTES, Comparison
-from dyngs.human.avatar.pose_fit import FittedPoses, fitted_to_pictures
+from dyngs.human.avatar.pose_comparison import IMAGES, SILHOUETTES, Comparison
+from dyngs.human.avatar.pose_fit import FittedPoses, fitted_to_images
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
@@ -30,14 +30,14 @@ MOVED = ("pelvis", "left_hip", "right_knee", "spine2", "left_shoulder", "right_s
 
 
 class Shown:
-    """Pictures in memory, as a loader has them."""
+    """Images in memory, as a loader has them."""
 
-    def __init__(self, pictures: list[Picture]) -> None:
-        self._pictures = pictures
-        self.times = tuple(picture.time for picture in pictures)
+    def __init__(self, images: list[Image]) -> None:
+        self._images = images
+        self.times = tuple(image.time for image in images)
 
-    def __getitem__(self, index: int) -> Picture:
-        return self._pictures[index]
+    def __getitem__(self, index: int) -> Image:
+        return self._images[index]
 
 
 @pytest.fixture(scope="module")
@@ -45,34 +45,32 @@ def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
     """A person of a few hundred Gaussians, which was not trained, and three cameras."""
     config = Config(
         data=DataConfig(root=person),
-        model=HumanModel(resolution=24, scaffold_heights=(0.0,), min_silhouette_share=0.0, sh_degree=0),
+        model=HumanModel(resolution=24, scaffold_heights=(0.0,), min_silhouette_fraction=0.0, sh_degree=0),
         optim=OptimConfig(),
         train=TrainConfig(steps=10),
         run=RunConfig(threads=1),
     )
     trainer = assemble(config)
     assert isinstance(trainer.scene, HumanScene)
-    cameras = {tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.pictures)}
+    cameras = {tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.images)}
     grow = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None]
     larger = [Cameras(x.cam_from_world, grow * x.intrinsics, SIZE, SIZE) for x in cameras.values()]
     return trainer.scene, larger
 
 
-def pictures_of(
-    scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None
-) -> list[Picture]:
+def images_of(scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None) -> list[Image]:
     found = []
     for time in times:
         for i, camera in enumerate(cameras):
             with torch.no_grad():
                 drawn = scene.render(camera, time, background=torch.zeros(3))
             rgb = drawn.rgb[0].clamp(0, 1)
-            found.append(Picture(f"{time}_{i}", camera, rgb, drawn.alpha[0], mask, time))
+            found.append(Image(f"{time}_{i}", camera, rgb, drawn.alpha[0], mask, time))
     return found
 
 
-def fitted(scene: HumanScene, pictures: list[Picture], comparison: Comparison = PICTURES) -> FittedPoses:
-    return fitted_to_pictures(scene, cast(PictureLoader, Shown(pictures)), WHITE, scene.options, comparison)
+def fitted(scene: HumanScene, images: list[Image], comparison: Comparison = IMAGES) -> FittedPoses:
+    return fitted_to_images(scene, cast(ImageLoader, Shown(images)), WHITE, scene.options, comparison)
 
 
 def disturbed(scene: HumanScene) -> HumanScene:
@@ -91,10 +89,10 @@ def joints_of(scene: HumanScene, clip: MotionClip, row: int) -> Tensor:
     return posing.scale * apply_transforms(moved, skeleton.joints)[:22] + posing.trans
 
 
-def mean_psnr(scene: HumanScene, pictures: list[Picture]) -> float:
+def mean_psnr(scene: HumanScene, images: list[Image]) -> float:
     with torch.no_grad():
-        drawn = [scene.render(x.cameras, x.time, background=WHITE).rgb[0] for x in pictures]
-    return sum(psnr(a, x.composite(WHITE)) for a, x in zip(drawn, pictures, strict=True)) / len(pictures)
+        drawn = [scene.render(x.cameras, x.time, background=WHITE).rgb[0] for x in images]
+    return sum(psnr(a, x.composite(WHITE)) for a, x in zip(drawn, images, strict=True)) / len(images)
 
 
 def test_disturbed_poses_are_found_again(
@@ -102,10 +100,10 @@ def test_disturbed_poses_are_found_again(
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 4)
     scene, cameras = truth
-    pictures = pictures_of(scene, cameras, list(scene.times[:2]))
+    images = images_of(scene, cameras, list(scene.times[:2]))
     start = disturbed(scene)
-    fit = fitted(start, pictures)
-    assert mean_psnr(fit.scene, pictures) > mean_psnr(start, pictures) + 5
+    fit = fitted(start, images)
+    assert mean_psnr(fit.scene, images) > mean_psnr(start, images) + 5
     assert len(fit.updates) == 2
     for row in range(2):
         true = joints_of(scene, scene.moves_as, row)
@@ -120,8 +118,8 @@ def test_disturbed_poses_are_found_again(
 def test_what_fits_already_stays(truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
     scene, cameras = truth
-    pictures = pictures_of(scene, cameras[:1], [0.0])
-    fit = fitted(scene, pictures)
+    images = images_of(scene, cameras[:1], [0.0])
+    fit = fitted(scene, images)
     torch.testing.assert_close(fit.scene.moves_as.poses, scene.moves_as.poses[:1], rtol=0, atol=1e-5)
     torch.testing.assert_close(fit.scene.moves_as.trans, scene.moves_as.trans[:1], rtol=0, atol=1e-6)
 
@@ -131,15 +129,15 @@ def test_silhouettes_alone_find_poses_again(
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 6)
     scene, cameras = truth
-    pictures = pictures_of(scene, cameras, list(scene.times[:1]))
+    images = images_of(scene, cameras, list(scene.times[:1]))
     start = disturbed(scene)
-    without_colours = [replace(x, rgb_premultiplied=torch.rand_like(x.rgb_premultiplied)) for x in pictures]
+    without_colours = [replace(x, rgb_premultiplied=torch.rand_like(x.rgb_premultiplied)) for x in images]
     fit = fitted(start, without_colours, SILHOUETTES)
     true = joints_of(scene, scene.moves_as, 0)
     before, after = (joints_of(x, x.moves_as, 0) for x in (start, fit.scene))
     errors = [float((x - true).norm(dim=1).mean()) for x in (before, after)]
     assert errors[1] < 0.5 * errors[0]
-    assert mean_psnr(fit.scene, pictures) > mean_psnr(start, pictures) + 3
+    assert mean_psnr(fit.scene, images) > mean_psnr(start, images) + 3
 
 
 def test_one_silhouette_moves_the_person_and_turns_no_joint(
@@ -147,11 +145,11 @@ def test_one_silhouette_moves_the_person_and_turns_no_joint(
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 6)
     scene, cameras = truth
-    pictures = pictures_of(scene, cameras[:1], [0.0])
+    images = images_of(scene, cameras[:1], [0.0])
     camera = cameras[0].cam_from_world[0]
-    sideways = camera[0, :3] * 0.03  # in the picture, where one view shows it
+    sideways = camera[0, :3] * 0.03  # in the image, where one view shows it
     start = scene.playing(replace(scene.clip, trans=scene.clip.trans + sideways))
-    fit = fitted(start, pictures, SILHOUETTES)
+    fit = fitted(start, images, SILHOUETTES)
     torch.testing.assert_close(fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-6)
     off = [(x.moves_as.trans[0] - scene.moves_as.trans[0]).norm() for x in (start, fit.scene)]
     assert off[1] < 0.4 * off[0]
@@ -163,6 +161,6 @@ def test_masked_pixels_say_nothing_about_the_pose(
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
     scene, cameras = truth
     start = disturbed(scene)
-    pictures = pictures_of(scene, cameras[:1], [0.0], mask=torch.zeros(SIZE, SIZE))
-    fit = fitted(start, pictures)
+    images = images_of(scene, cameras[:1], [0.0], mask=torch.zeros(SIZE, SIZE))
+    fit = fitted(start, images)
     torch.testing.assert_close(fit.scene.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-5)

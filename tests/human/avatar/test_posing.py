@@ -1,4 +1,4 @@
-"""Posed Gaussians with known answers: rest, a bent elbow, mirrored poses, turned colours, and shares of joints.
+"""Posed Gaussians with known answers: rest, a bent elbow, mirrored poses, turned colours, and fractions of joints.
 
 N Gaussians, J joints.
 """
@@ -84,12 +84,12 @@ def test_a_bent_elbow_moves_exactly_its_texels() -> None:
     body, rest, _, weights = person()
     found = in_pose({LEFT_ELBOW: (0.0, 0.0, math.pi / 2)})
     below = torch.tensor([j for j in range(len(body.joints)) if LEFT_ELBOW in ancestors(body, j)])
-    share = weights[:, below].sum(1)
+    fraction = weights[:, below].sum(1)
     moved = (found.means - rest.means).norm(dim=1)
-    assert bool((moved[share == 0] < 1e-6).all())
-    assert bool((moved[share > 0.5] > 0.005).all())
+    assert bool((moved[fraction == 0] < 1e-6).all())
+    assert bool((moved[fraction > 0.5] > 0.005).all())
     elbow, turn = body.joints[LEFT_ELBOW], axis_angle_to_matrix(torch.tensor([0.0, 0.0, math.pi / 2]))
-    forearm = share > 1 - 1e-6
+    forearm = fraction > 1 - 1e-6
     assert int(forearm.sum()) > 20
     wanted = (rest.means[forearm] - elbow) @ turn.T + elbow
     torch.testing.assert_close(found.means[forearm], wanted, rtol=0, atol=1e-5)

@@ -1,4 +1,4 @@
-"""An avatar by itself: equal poses give equal pictures, and corrections that were learned are applied once."""
+"""An avatar by itself: equal poses give equal images, and corrections that were learned are applied once."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose, correction_penalties
 from dyngs.human.avatar.posing import Skeleton
@@ -23,7 +24,6 @@ from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import default_template
-from dyngs.rendering import render
 from dyngs.state import part_of, tensors_of
 from dyngs.static.rates import Rates
 
@@ -63,7 +63,7 @@ def seen(gaussians: Gaussians) -> Tensor:
     return render(gaussians, cameras).rgb[0]
 
 
-def test_two_clips_of_the_same_pose_give_the_same_picture() -> None:
+def test_two_clips_of_the_same_pose_give_the_same_image() -> None:
     scene = reloaded(stirred())
     one, other = random_clip(3, seed=5), random_clip(6, seed=6)
     for name in ("poses", "trans", "scale"):
@@ -101,8 +101,8 @@ def test_parts_are_all_or_nothing() -> None:
     assert len(scene.part("moving")) == len(scene)
     assert len(scene.part("still")) == 0
     still = scene.playing(random_clip(1))
-    assert still.is_still
-    assert still.moving_share == 0
+    assert still.is_static
+    assert still.moving_fraction == 0
     assert len(still.part("still")) == len(scene)
 
 

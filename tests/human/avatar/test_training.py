@@ -44,7 +44,7 @@ def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes:
     model = {
         "resolution": 24,
         "scaffold_heights": (0.0, 0.02),
-        "min_silhouette_share": 0.0,
+        "min_silhouette_fraction": 0.0,
         "refine_from": 0.2,
         "sh_degree": 0,
     } | changes
@@ -113,13 +113,13 @@ def test_what_is_played_back_is_what_was_trained(
     trainer = assemble(tiny(capture, pose_offsets=pose_offsets, body=body))
     assert (human(trainer).shapes is not None) == own_body
     tensors_after(trainer, 8)
-    picture = trainer.pictures[4]
-    drawn = trainer.training.moment(trainer.scene, picture, trainer.done + 1).gaussians
+    image = trainer.images[4]
+    drawn = trainer.training.moment(trainer.scene, image, trainer.done + 1).gaussians
     scene = restored_scene(trainer.checkpoint(), trainer.config.model)
-    played = scene.at(picture.time)
+    played = scene.at(image.time)
     torch.testing.assert_close(played.means, drawn.means.detach(), rtol=0, atol=1e-5)
     torch.testing.assert_close(played.log_scales.sum(1), drawn.log_scales.detach().sum(1), rtol=0, atol=1e-4)
-    assert not scene.is_still
+    assert not scene.is_static
     assert len(scene.rows) == len(scene)
 
 
@@ -162,13 +162,13 @@ def test_without_refinement_nothing_is_learned_about_the_fit(capture: Path) -> N
 
 def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) -> None:
     trainer = assemble(tiny(capture))
-    scene, picture, options = human(trainer), trainer.pictures[0], trainer.config.model
+    scene, image, options = human(trainer), trainer.images[0], trainer.config.model
     assert isinstance(options, HumanModel)
-    first = trainer.training.moment(scene, picture, 1).penalties
+    first = trainer.training.moment(scene, image, 1).penalties
     assert first["offset"].item() == 0
     assert first["smoothness"].item() == 0
     away = scene.gaussians.replace(means=scene.gaussians.means.detach() + torch.tensor([0.01, 0.0, 0.0]))
-    later = trainer.training.moment(scene.with_gaussians(away), picture, 1).penalties
+    later = trainer.training.moment(scene.with_gaussians(away), image, 1).penalties
     assert later["offset"].item() == pytest.approx(options.offset_weight, rel=1e-4)
     assert later["smoothness"].item() == pytest.approx(0, abs=1e-9)
 
@@ -176,7 +176,7 @@ def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) ->
 def test_scaffolds_outside_the_silhouette_are_carved(capture: Path) -> None:
     counts = {}
     for height in (0.02, 0.5):
-        config = tiny(capture, scaffold_heights=(0.0, height), min_silhouette_share=0.9)
+        config = tiny(capture, scaffold_heights=(0.0, height), min_silhouette_fraction=0.9)
         counts[height] = len(assemble(config).optimizer.parameters)
     skin = len(assemble(tiny(capture, scaffold_heights=(0.0,))).optimizer.parameters)
     assert counts[0.5] - skin < 0.05 * skin
@@ -208,7 +208,7 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     first, again = run.scene.at(0.0), own.run.scene.at(0.0)
     torch.testing.assert_close(again.log_scales, first.log_scales, rtol=0, atol=1e-4)
     rest = in_rest_pose(run).scene
-    assert rest.is_still
+    assert rest.is_static
     spread = rest.at(None).means.amax(0) - rest.at(None).means.amin(0)
     assert float(spread[0]) > 1.5, "arms to the sides"
 

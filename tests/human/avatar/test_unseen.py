@@ -1,4 +1,4 @@
-"""What pictures do not show: seen parts stay, a symmetric body is completed exactly, gaps become smooth."""
+"""What images do not show: seen parts stay, a symmetric body is completed exactly, gaps become smooth."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.unseen import filled, mirror_images, sightings, smoothed, trust_in
-from dyngs.rendering import RenderOptions
 
 
 def sheet(width: int = 12, height: int = 10) -> tuple[Gaussians, Anchors]:

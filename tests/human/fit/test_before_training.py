@@ -56,7 +56,7 @@ def test_what_is_a_fit_is_not_fitted_again(data: DataConfig, tmp_path: Path) -> 
     assert with_fitted_body(named, say=pytest.fail) == named
 
 
-def test_a_fitted_capture_shows_the_same_pictures(data: DataConfig, tmp_path: Path) -> None:
+def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path) -> None:
     out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None).root
     before, after = read_capture(data), read_capture(DataConfig(root=out))
     for split in ("train", "test", "pose"):

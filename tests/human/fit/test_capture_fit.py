@@ -124,6 +124,6 @@ def test_without_given_poses_every_frame_has_its_own(
     assert torch.equal(clips["train"].clip.poses, poses)
 
 
-def test_pictures_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) -> None:
+def test_images_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) -> None:
     with pytest.raises(DyngsError, match="no silhouettes"):
         fit_capture(wrong[1].replace(has_alpha=False), DataConfig(root=wrong[1].root), default_template(), print)

@@ -15,13 +15,13 @@ from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 
 def clip(folder: Path, empty: int = 2, count: int = 12) -> Path:
-    """A block that crosses the picture; nobody in the first frames."""
+    """A block that crosses the image; nobody in the first frames."""
     ground = np.random.default_rng(0).uniform(80, 180, (5, 9, 3)).repeat(10, 0).repeat(10, 1).astype(np.uint8)
     for i in range(count):
-        picture = ground.copy()
+        image = ground.copy()
         if i >= empty:
-            picture[10:40, 7 * (i - empty) : 7 * (i - empty) + 12] = [250, 240, 20]
-        write_image(folder / f"f{i:02d}.png", picture)
+            image[10:40, 7 * (i - empty) : 7 * (i - empty) + 12] = [250, 240, 20]
+        write_image(folder / f"f{i:02d}.png", image)
     return folder
 
 
@@ -54,7 +54,7 @@ def test_masks_of_a_folder_replace_those_of_a_capture(tmp_path: Path) -> None:
     assert not has_guessed_lens(capture)
     assert all(view.silhouette is not None for view in capture.splits["train"])
     (tmp_path / "m" / f"{given.splits['train'][0].name}.png").unlink()
-    with pytest.raises(DyngsError, match="no mask for 1 of 4 pictures"):
+    with pytest.raises(DyngsError, match="no mask for 1 of 4 images"):
         read_person(DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w")
 
 

@@ -50,7 +50,7 @@ def test_joints_of_the_trunk_count_less(tmp_path: Path) -> None:
     assert found[0][SPINE, 3] == pytest.approx(INNER)
 
 
-def test_json_names_pictures_or_frames(tmp_path: Path) -> None:
+def test_json_names_images_or_frames(tmp_path: Path) -> None:
     rows = joints("coco17")
     rows[0, 13, 0] = np.nan
     fields = {"joints": {"p1": rows[1].tolist(), "2": rows[2].tolist(), "other": rows[0].tolist()}}

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dyngs.data.capture import Lens, View
-from dyngs.data.pictures.lens import distort
+from dyngs.data.images.lens import distort
 from dyngs.errors import DyngsError
 from dyngs.human.fit.keypoints import JOINTS, read_keypoints
 
@@ -98,7 +98,7 @@ def test_what_is_no_openpose_file_is_refused(tmp_path: Path, text: str, wanted: 
 
 
 def test_no_key_points_at_all_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no key points for any picture"):
+    with pytest.raises(DyngsError, match="no key points for any image"):
         read_keypoints(tmp_path, [view("a")])
     with pytest.raises(DyngsError, match="no such file or folder"):
         read_keypoints(tmp_path / "k.json", [view("a")])

@@ -37,7 +37,7 @@ def avatar(person: Path) -> HumanScene:
 
 
 def new_trainer(person: Path) -> Trainer:
-    model = HumanModel(resolution=24, scaffold_heights=(0.0,), min_silhouette_share=0.0, sh_degree=0)
+    model = HumanModel(resolution=24, scaffold_heights=(0.0,), min_silhouette_fraction=0.0, sh_degree=0)
     train, run = TrainConfig(steps=10), RunConfig(threads=1)
     return assemble(Config(data=DataConfig(root=person), model=model, optim=OptimConfig(), train=train, run=run))
 
@@ -46,16 +46,16 @@ def new_trainer(person: Path) -> Trainer:
 def views(avatar: HumanScene, person: Path, tmp_path_factory: pytest.TempPathFactory) -> list[View]:
     """The avatar in two of the three frames of its clip from three cameras; its colours are noise."""
     folder, found = tmp_path_factory.mktemp("drawn"), []
-    pictures = new_trainer(person).pictures
-    cameras = {tuple(p.cameras.cam_from_world.flatten().tolist()): p.cameras for p in pictures}
+    images = new_trainer(person).images
+    cameras = {tuple(p.cameras.cam_from_world.flatten().tolist()): p.cameras for p in images}
     for frame, time in enumerate(avatar.times[:2]):
         for i, camera in enumerate(cameras.values()):
             larger = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None] * camera.intrinsics
             with torch.no_grad():
                 drawn = avatar.render(replace(camera, intrinsics=larger, width=SIZE, height=SIZE), time)
-            picture = torch.cat([torch.rand(SIZE, SIZE, 3), drawn.alpha[0].clamp(0, 1)[..., None]], 2)
+            image = torch.cat([torch.rand(SIZE, SIZE, 3), drawn.alpha[0].clamp(0, 1)[..., None]], 2)
             path = folder / f"{frame}_{i}.png"
-            write_image(path, (picture.numpy() * 255).round().astype(np.uint8))
+            write_image(path, (image.numpy() * 255).round().astype(np.uint8))
             pose, intrinsics = camera.cam_from_world[0].double().numpy(), larger[0].double().numpy()
             found.append(View(path.stem, path, pose, intrinsics, SIZE, SIZE, camera_id=i, frame=frame))
     return found
@@ -91,7 +91,7 @@ def test_disturbed_poses_are_found_again(
     assert "taken; overlap on 2 views left out of the fit" in found.summary()
     after = found.clip.clip
     assert error(after, avatar.clip)[:2].max() < 0.025 < error(start, avatar.clip).min()
-    assert torch.equal(after.poses[2], start.poses[2]), "no picture shows that frame"
+    assert torch.equal(after.poses[2], start.poses[2]), "no image shows that frame"
     assert torch.equal(after.times, start.times)
 
 

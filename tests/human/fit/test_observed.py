@@ -4,24 +4,24 @@ import pytest
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.human.fit.observed import longest_box_side, observed_frame
 
 
-def picture(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Picture:
+def image(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Image:
     alpha = torch.zeros(height, width)
     alpha[rows, columns] = 1.0
     camera = Cameras(torch.eye(4)[None], torch.tensor([[[50.0, 0, 30], [0, 50, 20], [0, 0, 1]]]), width, height)
-    return Picture("p", camera, alpha[..., None].expand(-1, -1, 3), alpha, None, None, 0)
+    return Image("p", camera, alpha[..., None].expand(-1, -1, 3), alpha, None, None, 0)
 
 
 def test_a_point_of_the_world_falls_on_the_same_part_of_the_person() -> None:
-    shown = picture(slice(10, 30), slice(20, 28))
+    shown = image(slice(10, 30), slice(20, 28))
     side = longest_box_side([shown])
     assert side == 20
     frame = observed_frame([shown], side, 10)
     assert frame is not None
-    corner = torch.tensor([[20.0, 10.0, 1.0], [28.0, 30.0, 1.0]])  # of the box, in the picture
+    corner = torch.tensor([[20.0, 10.0, 1.0], [28.0, 30.0, 1.0]])  # of the box, in the image
     directions = torch.linalg.solve(shown.cameras.intrinsics[0], corner.T)
     inside = (frame.cameras.intrinsics[0] @ directions).T[:, :2]
     covered = frame.alpha[0] > 0.5
@@ -31,16 +31,16 @@ def test_a_point_of_the_world_falls_on_the_same_part_of_the_person() -> None:
     assert float(frame.alpha.sum()) * (25 / 10) ** 2 == pytest.approx(160, rel=0.01)
 
 
-def test_what_lies_outside_of_the_picture_is_not_known() -> None:
-    frame = observed_frame([picture(slice(0, 20), slice(0, 5))], 20, 25)
+def test_what_lies_outside_of_the_image_is_not_known() -> None:
+    frame = observed_frame([image(slice(0, 20), slice(0, 5))], 20, 25)
     assert frame is not None
     assert frame.known[0, :, 12:].mean() > 0.8
-    assert not frame.known[0, :, 0].any(), "left of the picture"
+    assert not frame.known[0, :, 0].any(), "left of the image"
     assert not frame.known[0, 0].any(), "above it"
 
 
 def test_half_the_size_shows_the_same() -> None:
-    frame = observed_frame([picture(slice(10, 30), slice(20, 28))], 20, 24)
+    frame = observed_frame([image(slice(10, 30), slice(20, 28))], 20, 24)
     assert frame is not None
     small = frame.shrunk(2)
     assert small.alpha.shape == (1, 12, 12)
@@ -48,10 +48,10 @@ def test_half_the_size_shows_the_same() -> None:
     assert small.cameras.intrinsics[0, 0, 0] * 2 == frame.cameras.intrinsics[0, 0, 0]
 
 
-def test_pictures_without_anybody_are_left_out() -> None:
-    nobody = picture(slice(0, 0), slice(0, 0))
+def test_images_without_anybody_are_left_out() -> None:
+    nobody = image(slice(0, 0), slice(0, 0))
     assert longest_box_side([nobody]) == 0
     assert observed_frame([nobody], 20, 10) is None
-    found = observed_frame([nobody, picture(slice(10, 30), slice(20, 28))], 20, 10)
+    found = observed_frame([nobody, image(slice(10, 30), slice(20, 28))], 20, 10)
     assert found is not None
     assert len(found) == 1

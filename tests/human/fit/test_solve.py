@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from dyngs.camera import Cameras
+from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import PosePrior, near_given, usual
 from dyngs.human.fit.solve import (
@@ -30,7 +31,6 @@ from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.human.template.load import default_template
-from dyngs.parameters import Parameters
 
 SIZE = 32
 
@@ -77,7 +77,7 @@ def test_silhouettes_count_where_they_are_known() -> None:
 
 
 def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> None:
-    """The given arm is bent by 2 rad; the picture shows it straight."""
+    """The given arm is bent by 2 rad; the image shows it straight."""
     given, straight, view = clip(2.0), clip(), camera()
     with torch.no_grad():
         truth = posed_joints(new_fit(straight, surface), straight, surface, 0)
@@ -146,8 +146,8 @@ def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> Non
         learned["poses"][0, row, 1] += deviations * expected.spread[row, 1]
         return float(prior(Parameters(learned, {}, 1.0), prior_of_poses).detach())
 
-    share = 1 / (21 * 3)
+    fraction = 1 / (21 * 3)
     unlimited = replace(expected, limit=math.inf)
     assert cost(2.9, expected) == pytest.approx(cost(2.9, unlimited), abs=1e-8)
-    assert cost(5.0, expected) - cost(5.0, unlimited) == pytest.approx(LIMIT_WEIGHT * 2.0**2 * share, rel=1e-4)
+    assert cost(5.0, expected) - cost(5.0, unlimited) == pytest.approx(LIMIT_WEIGHT * 2.0**2 * fraction, rel=1e-4)
     assert near_given(clip).limit == math.inf, "given poses may be as they like"

@@ -12,7 +12,15 @@ from dyngs.camera import Cameras
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.pose_prior import usual_pose
 from dyngs.human.fit.solve import drawn_frame, new_fit, posed_joints
-from dyngs.human.fit.start import PELVIS_SHARE, STATURE, first_poses, num_ticks, place_and_height, standing_clip, up_of
+from dyngs.human.fit.start import (
+    PELVIS_FRACTION,
+    STATURE,
+    first_poses,
+    num_ticks,
+    place_and_height,
+    standing_clip,
+    up_of,
+)
 from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.load import default_template
@@ -71,7 +79,7 @@ def test_one_camera_leaves_the_size_open(surface: Surface) -> None:
     found, height = place_and_height(seen, up_of(seen))
     assert height is None
     assert found == pytest.approx(place, abs=0.25)
-    assert 0.5 < PELVIS_SHARE < 0.56
+    assert 0.5 < PELVIS_FRACTION < 0.56
 
 
 def test_nobody_has_the_place_of_the_frame_before(surface: Surface) -> None:

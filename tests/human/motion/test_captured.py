@@ -57,7 +57,7 @@ def test_a_captured_motion_without_times_is_spread_by_frame_number() -> None:
 
 
 def test_a_view_without_parameters_is_named() -> None:
-    with pytest.raises(DyngsError, match="no body parameters for 1 frames that have pictures"):
+    with pytest.raises(DyngsError, match="no body parameters for 1 frames that have images"):
         captured_motion(WHERE, bodies([0, 1]), [view(5, 0.0)], torch.zeros(55, 3))
 
 

@@ -64,7 +64,7 @@ def test_without_a_network_texels_have_seen_or_nearby_colours(shown: Shown) -> N
 
 
 def test_an_untrained_network_changes_colours_a_little_and_nothing_else(shown: Shown) -> None:
-    """It trusts pictures by 98 %, and mixes the mean into what it guesses."""
+    """It trusts images by 98 %, and mixes the mean into what it guesses."""
     bare, untrained = predict_gaussians(*shown, MEAN, None, 0.9), predicted(shown)
     for name in ("means", "log_scales", "logit_opacities"):
         assert torch.equal(getattr(bare.gaussians, name), getattr(untrained.gaussians, name))
@@ -111,12 +111,12 @@ def test_places_lengths_and_opacities_stay_within_bounds(shown: Shown) -> None:
 def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None:
     sitter, maps = shown
     seen = maps.seen[0] > 0
-    trusting = predicted(shown, {"colour": 0.5, "picture_weight": 50.0}).gaussians.base_rgb[: len(sitter.texels)]
+    trusting = predicted(shown, {"colour": 0.5, "image_weight": 50.0}).gaussians.base_rgb[: len(sitter.texels)]
     torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
     mean, nearby, other_side = guessed_colours(sitter, maps, MEAN)
     guess = torch.stack([mean, nearby, other_side], dim=-1) @ torch.tensor([0.0, 2.0, 0.0]).softmax(0)
     torch.testing.assert_close(trusting[~seen], guess[~seen] + 0.5)
-    wary = predicted(shown, {"colour": 0.5, "picture_weight": -50.0}).gaussians.base_rgb
+    wary = predicted(shown, {"colour": 0.5, "image_weight": -50.0}).gaussians.base_rgb
     torch.testing.assert_close(wary[: len(sitter.texels)], guess + 0.5)
 
 

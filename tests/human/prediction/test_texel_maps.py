@@ -1,4 +1,4 @@
-"""Maps of pictures: the colours of a painted person, what is hidden, silhouettes."""
+"""Maps of images: the colours of a painted person, what is hidden, silhouettes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry.poses import cam_from_opengl
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.prediction.person import CapturedPerson, captured_person
@@ -69,7 +69,7 @@ def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.nda
     return texture.reshape(256, 256, 3)
 
 
-def picture(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Picture:
+def image(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Image:
     exact, (uv, uv_faces) = body().to(dtype=torch.float64), texture_coordinates(body())
     vertices = posed_vertices(exact, poses[None].double(), torch.zeros(1, 3).double())[0].numpy()
     pixels = render_mesh(PosedMesh(vertices, body().faces.numpy(), uv, uv_faces, texture), pose, SIZE, 2)
@@ -77,7 +77,7 @@ def picture(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Picture:
     focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
     intrinsics = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]).float()
     camera = Cameras(torch.from_numpy(cam_from_opengl(pose)).float()[None], intrinsics[None], SIZE, SIZE)
-    return Picture("v", camera, rgba[..., :3] * rgba[..., 3:], rgba[..., 3], None, None, 0)
+    return Image("v", camera, rgba[..., :3] * rgba[..., 3:], rgba[..., 3], None, None, 0)
 
 
 def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
@@ -93,7 +93,7 @@ def posing(of: CapturedPerson) -> BodyPose:
 def test_distances_from_the_edge_are_those_of_the_outline() -> None:
     """From the front, texels on the outer side of the legs lie on it, and those 4 cm above them 4 cm outside."""
     shown = sitter(torch.zeros(55, 3))
-    seen = picture(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
+    seen = image(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
     maps = observe_texels(shown, [(seen, shown.pose_in(shown.views[0]))])
     points, normals = shown.texels.points, shown.texels.normals
     outer = (normals[:, 0] * points[:, 0].sign() > 0.98) & (points[:, 1] < -0.1) & (points[:, 1] > -0.7)
@@ -110,14 +110,14 @@ def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
     that are seen when the arms are aside. Mixed colours remain where a pixel covers both."""
     texture = painted(lambda _, joints: np.where(is_arm(joints)[:, None], [0.9, 0.0, 0.0], [0.0, 0.0, 0.9]))
     crossed = sitter(arms_before_the_chest())
-    maps = observe_texels(crossed, [(picture(arms_before_the_chest(), texture, FRONT), posing(crossed))])
+    maps = observe_texels(crossed, [(image(arms_before_the_chest(), texture, FRONT), posing(crossed))])
     arms = torch.from_numpy(is_arm(crossed.texels.weights.argmax(1)))
     redness = maps.rgb[0, :, 0] / maps.rgb[0].sum(1).clamp_min(1e-6)
     seen = maps.seen[0] > 0.3
     assert (redness[seen & arms] > 0.5).float().mean() > 0.9, "fingers are thinner than a pixel"
     assert (redness[seen & ~arms] < 0.5).float().mean() > 0.98
     aside = sitter(torch.zeros(55, 3))
-    free = observe_texels(aside, [(picture(torch.zeros(55, 3), texture, FRONT), posing(aside))])
+    free = observe_texels(aside, [(image(torch.zeros(55, 3), texture, FRONT), posing(aside))])
     x, y, _ = aside.texels.points.T
     chest = (free.seen[0] > 0.8) & ~arms & (x.abs() < 0.2) & ((y - 0.55).abs() < 0.08)
     assert (maps.seen[0][chest] == 0).float().mean() > 0.1, "forearms cover a part of it"
@@ -127,7 +127,7 @@ def test_a_texel_has_the_colour_of_its_place() -> None:
     """A smooth colour over the body, from two sides; up to the light and half a pixel of its change."""
     texture = painted(lambda places, _: 0.5 + 0.4 * np.sin(3 * places))
     aside = sitter(torch.zeros(55, 3))
-    shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
     maps = observe_texels(aside, shown)
     seen = maps.seen[0] > 0.5
     truth = 0.5 + 0.4 * torch.sin(3 * aside.texels.points)
@@ -139,7 +139,7 @@ def test_a_texel_has_the_colour_of_its_place() -> None:
 def test_only_what_faces_a_camera_is_seen() -> None:
     """From before: nothing of the back, and most of the front; more from two sides than from one."""
     texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
-    shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
     one, two = observe_texels(aside, shown[:1]), observe_texels(aside, shown)
     normals = aside.texels.normals
     assert (one.seen[0][normals[:, 2] < -0.2] == 0).all()
@@ -152,7 +152,7 @@ def test_only_what_faces_a_camera_is_seen() -> None:
 def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
     """At 0 nearly all texels are inside, at 4 cm those that point aside are not; a second view carves more."""
     texture, aside = np.full((8, 8, 3), 0.5), sitter(torch.zeros(55, 3))
-    shown = [(picture(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
+    shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
     one, two = observe_texels(aside, shown[:1]), observe_texels(aside, shown)
     assert (one.inside[0] == 1).float().mean() > 0.9
     assert (one.inside[1] == 1).float().mean() < 0.8
@@ -163,12 +163,12 @@ def test_scaffolds_far_from_the_skin_leave_the_silhouette() -> None:
 
 def test_without_alpha_everything_is_inside() -> None:
     aside, rest = sitter(torch.zeros(55, 3)), torch.zeros(55, 3)
-    opaque = replace(picture(rest, np.full((8, 8, 3), 0.5), FRONT), alpha=None)
+    opaque = replace(image(rest, np.full((8, 8, 3), 0.5), FRONT), alpha=None)
     assert (observe_texels(aside, [(opaque, posing(aside))]).inside == 1).all()
 
 
-def test_no_picture_is_an_error() -> None:
-    with pytest.raises(ValueError, match="must be a picture"):
+def test_no_image_is_an_error() -> None:
+    with pytest.raises(ValueError, match="must be an image"):
         observe_texels(sitter(torch.zeros(55, 3)), [])
 
 

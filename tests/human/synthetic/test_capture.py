@@ -63,11 +63,11 @@ def posed(motion: Motion, frame: int) -> np.ndarray:
     return posed_vertices(exact, motion.poses[[frame]].double(), motion.trans[[frame]].double())[0].numpy()
 
 
-def mesh_of(vertices: np.ndarray, picture: np.ndarray) -> PosedMesh:
+def mesh_of(vertices: np.ndarray, image: np.ndarray) -> PosedMesh:
     uv, uv_faces = body().uv, body().uv_faces
     assert uv is not None
     assert uv_faces is not None
-    return PosedMesh(vertices, body().faces.numpy(), uv.double().numpy(), uv_faces.numpy(), picture)
+    return PosedMesh(vertices, body().faces.numpy(), uv.double().numpy(), uv_faces.numpy(), image)
 
 
 def front_camera(distance: float = 3.5, height: float = 0.95) -> np.ndarray:
@@ -97,7 +97,7 @@ def cast(corners: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> tuple[np.
     rule: origin + t ray = a + u (b - a) + v (c - a)."""
     a, b, c = corners.transpose(1, 0, 2)
     first, second, start = b - a, c - a, origin - a
-    faces, shares = np.full(len(rays), -1), np.zeros((len(rays), 3))
+    faces, fractions = np.full(len(rays), -1), np.zeros((len(rays), 3))
     normal, moment = np.cross(first, second), np.cross(start, first)
     for i, ray in enumerate(rays):
         across = np.cross(ray, second)
@@ -109,8 +109,8 @@ def cast(corners: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> tuple[np.
         t = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
         if np.isfinite(t.min()):
             faces[i] = k = int(t.argmin())
-            shares[i] = 1 - u[k] - v[k], u[k], v[k]
-    return faces, shares
+            fractions[i] = 1 - u[k] - v[k], u[k], v[k]
+    return faces, fractions
 
 
 def slow_normals(mesh: PosedMesh) -> np.ndarray:
@@ -121,23 +121,23 @@ def slow_normals(mesh: PosedMesh) -> np.ndarray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
-def slow_texture(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+def slow_texture(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Bilinear between the centres of texels."""
-    size = len(picture)
+    size = len(image)
     column, row = np.clip(uv[0] * size - 0.5, 0, size - 1), np.clip((1 - uv[1]) * size - 0.5, 0, size - 1)
     color = np.zeros(3)
     for i in range(size):
         for j in range(size):
-            color += max(0.0, 1 - abs(row - i)) * max(0.0, 1 - abs(column - j)) * picture[i, j]
+            color += max(0.0, 1 - abs(row - i)) * max(0.0, 1 - abs(column - j)) * image[i, j]
     return color
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
+# --- images ---------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), size=st.integers(1, 9), samples=st.integers(1, 3))
-def test_pictures_are_those_of_casting_every_ray_at_every_triangle(seed: int, size: int, samples: int) -> None:
+def test_images_are_those_of_casting_every_ray_at_every_triangle(seed: int, size: int, samples: int) -> None:
     """Of random triangles through each other, with perspective, texture, light and straight alpha."""
     make = np.random.default_rng(seed)
     mesh = PosedMesh(
@@ -148,12 +148,12 @@ def test_pictures_are_those_of_casting_every_ray_at_every_triangle(seed: int, si
         texture=make.uniform(0, 1, (4, 4, 3)),
     )
     pose = front_camera(2.5, 0.1)
-    faces, shares = cast(mesh.vertices[mesh.faces], pose[:3, 3], rays_of(pose, size, samples))
+    faces, fractions = cast(mesh.vertices[mesh.faces], pose[:3, 3], rays_of(pose, size, samples))
     normals, colors = slow_normals(mesh), np.zeros((len(faces), 4))
     for i in np.flatnonzero(faces >= 0):
-        normal = shares[i] @ normals[mesh.faces[faces[i]]]
+        normal = fractions[i] @ normals[mesh.faces[faces[i]]]
         light = 0.6 + 0.45 * max(normal @ LIGHT / np.linalg.norm(normal), 0.0)
-        rgb = np.minimum(light * slow_texture(mesh.texture, shares[i] @ mesh.uv[mesh.uv_faces[faces[i]]]), 1.0)
+        rgb = np.minimum(light * slow_texture(mesh.texture, fractions[i] @ mesh.uv[mesh.uv_faces[faces[i]]]), 1.0)
         colors[i] = *rgb, 1.0
     sums = colors.reshape(size, samples, size, samples, 4).sum((1, 3))
     found = render_mesh(mesh, pose, size, samples)
@@ -192,7 +192,7 @@ def test_a_texel_is_seen_where_the_surface_is() -> None:
 
 
 def test_the_left_hand_is_on_the_left_of_the_person() -> None:
-    """A picture from the front shows it on the right, one from behind on the left; it is painted by its vertices."""
+    """An image from the front shows it on the right, one from behind on the left; it is painted by its vertices."""
     at_rest = body().vertices.double().numpy()
     mesh = mesh_of(at_rest + np.array([0.0, 0.83, 0.0]), np.ones((128, 128, 3)))
     wrist = body().joints[JOINT_NAMES.index("left_wrist"), 0].item()
@@ -299,7 +299,7 @@ def test_the_layout_is_read_as_a_person(root: Path) -> None:
     assert fields["frames"][1]["file_path"] == "images/pose/f001_c03.png"
 
 
-def test_the_parameters_pose_the_template_as_the_pictures_show_it(root: Path) -> None:
+def test_the_parameters_pose_the_template_as_the_images_show_it(root: Path) -> None:
     """Through the readers: the pelvis lies inside the silhouette, and the silhouette just fills the posed vertices'."""
     capture = captured(root)
     assert capture.body is not None

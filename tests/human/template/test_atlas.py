@@ -25,15 +25,15 @@ NUM_JOINTS = 2
 
 
 def body_of(vertices: Tensor, faces: Tensor, uv: Tensor, uv_faces: Tensor | None = None) -> BodyTemplate:
-    """A template with two joints; the share of the second grows with x, from 0 at x = 0 to 1 at x = 1."""
-    share = vertices[:, :1]
+    """A template with two joints; the fraction of the second grows with x, from 0 at x = 0 to 1 at x = 1."""
+    fraction = vertices[:, :1]
     return BodyTemplate(
         name="test",
         vertices=vertices,
         faces=faces,
         uv=uv,
         uv_faces=faces if uv_faces is None else uv_faces,
-        weights=torch.cat([1 - share, share], dim=1),
+        weights=torch.cat([1 - fraction, fraction], dim=1),
         parents=(-1, 0),
         joints=torch.zeros(NUM_JOINTS, 3),
     )
@@ -135,10 +135,10 @@ def test_a_triangulated_square_has_neither_holes_nor_overlap(seed: int, resoluti
     faces = torch.from_numpy(Delaunay(uv).simplices).long()
     texels = atlas_texels(sheet(torch.from_numpy(uv), faces), resolution)
     assert torch.equal(texels.index, torch.arange(resolution**2))
-    shares = texels.barycentric
-    assert float(shares.min()) >= 0
-    torch.testing.assert_close(shares.sum(1), torch.ones(len(texels)), rtol=0, atol=2e-7)
-    blended = (shares[..., None] * torch.from_numpy(uv)[faces[texels.faces]]).sum(1)
+    fractions = texels.barycentric
+    assert float(fractions.min()) >= 0
+    torch.testing.assert_close(fractions.sum(1), torch.ones(len(texels)), rtol=0, atol=2e-7)
+    blended = (fractions[..., None] * torch.from_numpy(uv)[faces[texels.faces]]).sum(1)
     torch.testing.assert_close(blended, centres(texels), rtol=0, atol=1e-6)
 
 
@@ -282,9 +282,9 @@ def test_texels_of_the_template(resolution: int, count: int) -> None:
     texels = anny(resolution)
     assert len(texels) == count
     assert bool((texels.index.diff() > 0).all())
-    shares, sums = texels.barycentric, texels.weights.double().sum(1)
-    assert float(shares.min()) >= 0
-    assert float(shares.max()) <= 1
+    fractions, sums = texels.barycentric, texels.weights.double().sum(1)
+    assert float(fractions.min()) >= 0
+    assert float(fractions.max()) <= 1
     torch.testing.assert_close(sums, torch.ones_like(sums), rtol=0, atol=5e-7)
     assert_frames(texels)
 

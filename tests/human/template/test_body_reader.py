@@ -168,8 +168,8 @@ def test_the_template_is_what_its_file_says() -> None:
         assert body.parents == tuple(raw["kintree_table"][0].tolist())
         for row in range(0, len(body.weights), 997):
             expected = np.zeros(55)
-            for joint, share in zip(raw["weights_idx"][row], raw["weights_val"][row], strict=True):
-                expected[joint] += share
+            for joint, fraction in zip(raw["weights_idx"][row], raw["weights_val"][row], strict=True):
+                expected[joint] += fraction
             np.testing.assert_allclose(body.weights[row], expected, rtol=0, atol=2e-7)
 
 
@@ -372,8 +372,8 @@ def test_files_that_are_no_body_files(tmp_path: Path) -> None:
 def test_truncated_files(name: str, tmp_path: Path) -> None:
     path = (write_npz if name.endswith("npz") else write_pickle)(tmp_path / name, model("smpl"))
     whole = path.read_bytes()
-    for share in (0.001, 0.1, 0.5, 0.9, 0.999):
-        path.write_bytes(whole[: int(share * len(whole))])
+    for fraction in (0.001, 0.1, 0.5, 0.9, 0.999):
+        path.write_bytes(whole[: int(fraction * len(whole))])
         assert "copy it again" in refusal(path)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.loader import Picture
+from dyngs.data.loader import Image
 from dyngs.training.priors.agreement import depth_agreement, flow_agreement, mask_agreement, track_agreement
 
 SIZE, FOCAL, FAR, NEAR = 48, 48.0, 6.0, 3.0
@@ -19,7 +19,7 @@ def texture(seed: int, channels: int = 3) -> torch.Tensor:
     return torch.nn.functional.interpolate(noise, size=(96, 96), mode="bilinear")[0].permute(1, 2, 0)
 
 
-def picture(shift: float = 0.0, box_px: int = 0, time: float = 0.0) -> Picture:
+def image(shift: float = 0.0, box_px: int = 0, time: float = 0.0) -> Image:
     """A wall ``FAR`` away and a box ``NEAR`` before it, from a camera ``shift`` to the right.
 
     The box moves ``box_px`` to the right beside its parallax.
@@ -33,15 +33,15 @@ def picture(shift: float = 0.0, box_px: int = 0, time: float = 0.0) -> Picture:
     left = BOX.start - box + box_px
     where = (BOX, slice(left, left + BOX.stop - BOX.start))
     rgb[where], depth[where], moves[where] = texture(1)[BOX, BOX], NEAR, 1.0
-    return Picture("a", Cameras(pose[None], k[None], SIZE, SIZE), rgb, None, None, time, moves=moves, depth=depth)
+    return Image("a", Cameras(pose[None], k[None], SIZE, SIZE), rgb, None, None, time, moves=moves, depth=depth)
 
 
 def noisy(x: torch.Tensor, size: float) -> torch.Tensor:
     return x + size * torch.randn(x.shape, generator=torch.Generator().manual_seed(2))
 
 
-def with_flow(flow: torch.Tensor) -> list[tuple[Picture, Picture]]:
-    return [(replace(picture(), flow=flow), picture(box_px=5))]
+def with_flow(flow: torch.Tensor) -> list[tuple[Image, Image]]:
+    return [(replace(image(), flow=flow), image(box_px=5))]
 
 
 def true_flow() -> torch.Tensor:
@@ -70,19 +70,19 @@ def test_tracks_are_compared_with_tracks_at_random() -> None:
     random = torch.Generator().manual_seed(3)
     start = 17 + 14 * torch.rand(30, 2, generator=random)
     end = start + torch.tensor([5.0, 0.0])
-    first, second = picture(), picture(box_px=5)
+    first, second = image(), image(box_px=5)
     assert track_agreement([(first, second, start, end)]).holds
     assert track_agreement([(first, second, start, noisy(end, 0.7))]).holds
     assert not track_agreement([(first, second, start, end[torch.randperm(30, generator=random)])]).holds
     assert not track_agreement([]).holds
 
 
-def triple(depth: torch.Tensor) -> list[tuple[Picture, Picture, Picture]]:
-    return [(replace(picture(), depth=depth), picture(0.25), picture(-0.25))]
+def triple(depth: torch.Tensor) -> list[tuple[Image, Image, Image]]:
+    return [(replace(image(), depth=depth), image(0.25), image(-0.25))]
 
 
 def test_depth_is_used_whatever_its_scale_and_shift() -> None:
-    truth = picture().depth
+    truth = image().depth
     assert truth is not None
     assert depth_agreement(triple(noisy(0.1 * truth + 0.4, 0.01)), 5.0)[1].holds
     _, inverse = depth_agreement(triple(1 / (0.2 / truth + 0.02)), 5.0)
@@ -91,7 +91,7 @@ def test_depth_is_used_whatever_its_scale_and_shift() -> None:
 
 @pytest.mark.parametrize("kind", ["constant", "reversed", "noise"])
 def test_depth_that_explains_nothing_is_not_used(kind: str) -> None:
-    truth = picture().depth
+    truth = image().depth
     assert truth is not None
     random = torch.rand(SIZE, SIZE, generator=torch.Generator().manual_seed(4)) + 0.5
     depth = {"constant": torch.ones(SIZE, SIZE), "reversed": 10 - truth, "noise": random}[kind]
@@ -101,7 +101,7 @@ def test_depth_that_explains_nothing_is_not_used(kind: str) -> None:
 @pytest.mark.parametrize("shift", [0.0, 0.25])
 def test_masks_are_used_unless_they_are_the_wrong_way_round(shift: float) -> None:
     """From one camera that stands, and from one that moves: parallax is not motion."""
-    first, second = picture(), picture(shift, box_px=6, time=0.1)
+    first, second = image(), image(shift, box_px=6, time=0.1)
     assert first.moves is not None
     assert mask_agreement([(first, second)], 5.0).holds
     assert not mask_agreement([(replace(first, moves=1 - first.moves), second)], 5.0).holds

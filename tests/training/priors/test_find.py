@@ -10,7 +10,7 @@ from tiny_priors import with_priors
 from dyngs.build import assemble
 from dyngs.config import Config
 from dyngs.config.io import load_config
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
@@ -26,8 +26,8 @@ def config_of(root: Path, *changes: str) -> Config:
 def found(root: Path, *changes: str, moves: bool = True) -> UsedPriors:
     config = config_of(root, *changes)
     capture = read_capture(config.data)
-    pictures = PictureLoader(capture.splits["train"], config.data, with_maps=True)
-    return used_priors(config, capture, pictures, moves=moves)
+    images = ImageLoader(capture.splits["train"], config.data, with_maps=True)
+    return used_priors(config, capture, images, moves=moves)
 
 
 def test_priors_of_noise_are_ignored_with_one_line_each(tmp_path: Path) -> None:

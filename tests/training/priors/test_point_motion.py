@@ -5,8 +5,8 @@ from dataclasses import replace
 import torch
 from moving_scene import camera, row_of_balls
 
-from dyngs.data.loader import Picture
-from dyngs.rendering import RenderOptions
+from dyngs.data.loader import Image
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.training.priors.point_motion import displacements, flow_error, track_error
 
 OPTIONS = RenderOptions()
@@ -34,14 +34,14 @@ def test_gradients_move_the_gaussians_to_where_flow_says() -> None:
     drawn = displacements(start, start.replace(means=end), here, here, OPTIONS)
     flow = torch.full((24, 32, 2), torch.nan)
     flow[drawn[..., 2].detach() > 0.5] = torch.tensor([3.0, 0.0])
-    picture = Picture("a", here, torch.zeros(24, 32, 3), None, None, 0.0, flow=flow)
-    error = flow_error(drawn, picture)
+    image = Image("a", here, torch.zeros(24, 32, 3), None, None, 0.0, flow=flow)
+    error = flow_error(drawn, image)
     assert error is not None
     (slope,) = torch.autograd.grad(error, end)
     along = here.cam_from_world[0, :3, :3] @ slope[0]
-    assert float(along[0]) < 0  # the loss falls where the point goes to the right in the picture
-    assert flow_error(drawn.detach(), replace(picture, flow=torch.full((24, 32, 2), torch.nan))) is None
-    assert flow_error(drawn.detach(), replace(picture, mask=torch.zeros(24, 32))) is None
+    assert float(along[0]) < 0  # the loss falls where the point goes to the right in the image
+    assert flow_error(drawn.detach(), replace(image, flow=torch.full((24, 32, 2), torch.nan))) is None
+    assert flow_error(drawn.detach(), replace(image, mask=torch.zeros(24, 32))) is None
 
 
 def test_tracks_are_right_where_the_points_go() -> None:

@@ -1,4 +1,4 @@
-"""Sequences of several cameras: one folder of pictures or one video per camera, turned into views with times."""
+"""Sequences of several cameras: one folder of images or one video per camera, turned into views with times."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 from dyngs.data.capture import VideoFrame, View
 from dyngs.data.geometry.intrinsics import match_size, rescale_warning
-from dyngs.data.pictures.frame_cache import VideoFrames, planned_frames
-from dyngs.data.pictures.images import SUFFIXES
-from dyngs.data.pictures.video import VIDEO_SUFFIXES, VideoInfo
+from dyngs.data.images.frame_cache import VideoFrames, planned_frames
+from dyngs.data.images.images import SUFFIXES
+from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
 
@@ -22,23 +22,23 @@ MIN_CAMERAS_TO_HOLD_OUT = 3
 
 @dataclass(frozen=True)
 class CameraSource:
-    """The pictures of one camera.
+    """The images of one camera.
 
     Attributes:
         name: name of its folder, or of its video without the suffix.
-        pictures: frame number to file; frames of a video may have to be decoded first.
+        images: frame number to file; frames of a video may have to be decoded first.
         video: frames of the video, None for a folder.
     """
 
     name: str
-    pictures: dict[int, Path]
+    images: dict[int, Path]
     video: VideoFrames | None = None
 
 
 def find_cameras(root: Path) -> dict[str, Path]:
-    """Map camera names, sorted, to folders of pictures, or to video files where there is no such folder.
+    """Map camera names, sorted, to folders of images, or to video files where there is no such folder.
 
-    Pictures lie in the folder itself or in ``images`` below it.
+    Images lie in the folder itself or in ``images`` below it.
 
     Raises:
         DyngsError: two videos for one camera.
@@ -51,30 +51,30 @@ def find_cameras(root: Path) -> dict[str, Path]:
             found[path.stem] = path
     for path in sorted(root.iterdir()):
         if path.is_dir() and not path.name.startswith("."):
-            folder = next((f for f in (path, path / "images") if _pictures(f)), None)
+            folder = next((f for f in (path, path / "images") if _images(f)), None)
             if folder is not None:
                 found[path.name] = folder
     return dict(sorted(found.items()))
 
 
 def open_camera(name: str, path: Path) -> CameraSource:
-    """List the pictures of the camera that ``find_cameras`` found at ``path``.
+    """List the images of the camera that ``find_cameras`` found at ``path``.
 
     Raises:
-        DyngsError: a picture without a number, two with the same one, or a video that cannot be opened.
+        DyngsError: an image without a number, two with the same one, or a video that cannot be opened.
     """
     if path.is_file():
         planned = planned_frames(path)
         return CameraSource(name, dict(enumerate(planned.paths)), planned)
-    pictures: dict[int, Path] = {}
-    for picture in _pictures(path):
-        digits = re.findall(r"\d+", picture.stem)
+    images: dict[int, Path] = {}
+    for image in _images(path):
+        digits = re.findall(r"\d+", image.stem)
         if not digits:
-            raise DyngsError(f"{picture}: no frame number in its name; call it frame_0000{picture.suffix} or the like")
-        other = pictures.setdefault(int(digits[-1]), picture)
-        if other != picture:
-            raise DyngsError(f"{path}: {other.name} and {picture.name} have the same frame number; remove one of them")
-    return CameraSource(name, pictures)
+            raise DyngsError(f"{image}: no frame number in its name; call it frame_0000{image.suffix} or the like")
+        other = images.setdefault(int(digits[-1]), image)
+        if other != image:
+            raise DyngsError(f"{path}: {other.name} and {image.name} have the same frame number; remove one of them")
+    return CameraSource(name, images)
 
 
 def sequence_views(
@@ -90,7 +90,7 @@ def sequence_views(
     Raises:
         DyngsError: see ``dyngs.data.readers.shared.transforms.read_views``.
     """
-    numbers = sorted({number for camera in cameras for number in camera.pictures})
+    numbers = sorted({number for camera in cameras for number in camera.images})
     span = max(numbers[-1] - numbers[0], 1)
     views: dict[str, tuple[View, ...]] = {}
     warnings = _rate_warning(cameras)
@@ -100,11 +100,11 @@ def sequence_views(
         if camera.video is not None and ("w" not in own or "h" not in own):
             own |= {"w": camera.video.info.width, "h": camera.video.info.height}
         frames = []
-        for number, picture in sorted(camera.pictures.items()):
+        for number, image in sorted(camera.images.items()):
             times = {"frame": number, "time": (number - numbers[0]) / span}
-            fields = {**own, **times, "file_path": str(picture), "camera": index}
+            fields = {**own, **times, "file_path": str(image), "camera": index}
             video = None if camera.video is None else VideoFrame(camera.video.source, number)
-            frames.append(Frame(where, fields, {}, picture, video))
+            frames.append(Frame(where, fields, {}, image, video))
         read, notes = read_views(FrameFile(path, {}, tuple(frames)))
         views[camera.name], more = tuple(read.values()), []
         if camera.video is not None:
@@ -149,7 +149,7 @@ def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
     ]
 
 
-def _pictures(folder: Path) -> list[Path]:
+def _images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))

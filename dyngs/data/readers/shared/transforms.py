@@ -14,7 +14,7 @@ import numpy as np
 from dyngs.data.capture import Lens, VideoFrame, View
 from dyngs.data.geometry.intrinsics import MAX_SIDE, match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import cam_from_opengl, checked_pose, repair_warning
-from dyngs.data.pictures.images import SUFFIXES, PictureHeader, header_if_readable, read_header
+from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
 from dyngs.errors import DyngsError
 from dyngs.files.fields import is_number, matrix_of
 from dyngs.files.json_files import read_json_object
@@ -34,14 +34,14 @@ class Frame:
         where: file and index, for messages.
         own: the frame's fields.
         shared: the file's fields.
-        picture: the picture if ``file_path`` does not name it.
-        video: the video frame that the picture is decoded from, if any.
+        image: the image if ``file_path`` does not name it.
+        video: the video frame that the image is decoded from, if any.
     """
 
     where: str
     own: dict[str, object]
     shared: dict[str, object]
-    picture: Path | None = None
+    image: Path | None = None
     video: VideoFrame | None = None
 
     def number(self, key: str) -> float | None:
@@ -117,7 +117,7 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     """Return views by ``file_path`` as written in the file, in its order, and warnings.
 
     Raises:
-        DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same picture twice.
+        DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same image twice.
     """
     root = file.path.parent
     paths = [_image_path(root, frame) for frame in file.frames]
@@ -148,7 +148,7 @@ def tracks_path_of(file: FrameFile) -> Path | None:
 
 
 def view_name(path: Path, root: Path) -> str:
-    """Name of a view: the picture's path below ``root`` without extension, safe as a relative file name."""
+    """Name of a view: the image's path below ``root`` without extension, safe as a relative file name."""
     relative = PurePosixPath(os.path.relpath(path, root).replace(os.sep, "/")).with_suffix("")
     return "/".join(part for part in relative.parts if part not in ("..", "/"))
 
@@ -225,9 +225,9 @@ def _below(root: Path, written: str, where: str) -> Path:
 
 
 def _image_path(root: Path, frame: Frame) -> Path:
-    """The picture's file; extensions are tried where none is written, PNG first."""
-    if frame.picture is not None:
-        return frame.picture
+    """The image's file; extensions are tried where none is written, PNG first."""
+    if frame.image is not None:
+        return frame.image
     written = frame.own.get("file_path")
     if not isinstance(written, str) or not written:
         raise DyngsError(f"{frame.where}: the key 'file_path' is missing")
@@ -247,8 +247,8 @@ def _described_size(frame: Frame) -> tuple[int, int] | None:
     return round(width), round(height)
 
 
-def _common_size(file: FrameFile, paths: list[Path], headers: list[PictureHeader | None]) -> tuple[int, int] | None:
-    """(width, height) of the pictures without a size of their own, which share the file's focal length."""
+def _common_size(file: FrameFile, paths: list[Path], headers: list[ImageHeader | None]) -> tuple[int, int] | None:
+    """(width, height) of the images without a size of their own, which share the file's focal length."""
     sizes: dict[tuple[int, int], Path] = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
         has_own = any(key in frame.own for key in _FOCAL_KEYS)
@@ -257,7 +257,7 @@ def _common_size(file: FrameFile, paths: list[Path], headers: list[PictureHeader
     if len(sizes) > 1:
         (first, path), (second, other) = list(sizes.items())[:2]
         raise DyngsError(
-            f"{file.path}: pictures of different sizes share one focal length ({path} is {first[0]}x{first[1]}, "
+            f"{file.path}: images of different sizes share one focal length ({path} is {first[0]}x{first[1]}, "
             f"{other} is {second[0]}x{second[1]}); give w, h and fl_x for each frame"
         )
     return next(iter(sizes), None)

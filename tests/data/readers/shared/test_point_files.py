@@ -119,7 +119,7 @@ def test_textures_that_points_name_are_not_opened(tmp_path: Path, monkeypatch: p
     lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
     lines += ["0 0 0 0 0", "1 0 0 0 0", "0 1 0 0 0", "3 0 1 2"]
     (tmp_path / "capture").mkdir()
-    (tmp_path / "own.png").write_bytes(b"no picture")
+    (tmp_path / "own.png").write_bytes(b"no image")
     (tmp_path / "capture" / "points.ply").write_text("\n".join(lines) + "\n")
     monkeypatch.setattr("PIL.Image.open", lambda *_: pytest.fail("a texture is opened"))
     assert read_points(tmp_path / "capture" / "points.ply").xyz.shape == (3, 3)

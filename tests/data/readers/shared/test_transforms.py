@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_captures import random_pixels, write_frames, write_picture
+from tiny_captures import random_pixels, write_frames, write_image
 
+from dyngs.capture.inspection.report import format_report, inspect_capture
 from dyngs.config import DataConfig
-from dyngs.data.inspection.report import format_report, inspect_capture
-from dyngs.data.loader import PictureLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 
@@ -48,10 +48,10 @@ ODD = (
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Four pictures with every field that is read."""
+    """Four images with every field that is read."""
     names = [f"images/{i}.png" for i in range(4)]
     for i, name in enumerate(names):
-        write_picture(tmp_path / name, random_pixels(8, 12, 3, seed=i))
+        write_image(tmp_path / name, random_pixels(8, 12, 3, seed=i))
     lens = {"w": 12, "h": 8, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.0, "k1": 0.01, "p1": 0.001}
     shared = {**lens, "camera_model": "OPENCV", "train_filenames": names[:3], "val_filenames": names[3:], "fps": 30}
     write_frames(tmp_path / "transforms.json", names, shared)
@@ -72,8 +72,8 @@ def use(root: Path) -> str:
         for view in capture.splits["train"]:
             assert np.isfinite(view.intrinsics).all()
             assert np.isfinite(view.cam_from_world).all()
-        picture = PictureLoader(capture.splits["train"], DataConfig(root=root))[0]  # type: ignore[call-arg]
-        assert bool(picture.rgb_premultiplied.isfinite().all())
+        image = ImageLoader(capture.splits["train"], DataConfig(root=root))[0]  # type: ignore[call-arg]
+        assert bool(image.rgb_premultiplied.isfinite().all())
     except DyngsError as error:
         return str(error)
     return ""
@@ -109,7 +109,7 @@ def test_a_field_of_view_that_no_camera_has(root: Path, angle: str) -> None:
     assert "field of view" in use(root)
 
 
-def test_sizes_that_no_picture_has(root: Path) -> None:
+def test_sizes_that_no_image_has(root: Path) -> None:
     path = root / "transforms.json"
     path.write_text(path.read_text().replace('"w": 12', '"w": 1e9'))
     assert "w and h must be from 1 to 1,048,576, got 1e+09 and 8" in use(root)

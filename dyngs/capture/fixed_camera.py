@@ -1,0 +1,177 @@
+"""A video, or a folder of its frames, of a person before one camera that stands, as a capture with a guessed camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
+from dyngs.data.frame_selection import evenly_spaced, parse_frames
+from dyngs.data.images.frame_cache import decode_frames, planned_frames
+from dyngs.data.images.images import read_header
+from dyngs.data.name_order import natural_order
+from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import check_size, images_up_to, inside, staying_within
+from dyngs.files.wrong_place import PHOTO_SUFFIXES, VIDEO_SUFFIXES
+
+FORMAT = "fixed_camera"
+"""``Capture.format`` of what is read here."""
+MOST_FRAMES = 60
+"""Frames that are taken where ``data.frames`` names none."""
+FOCAL = 1.2
+"""Guessed focal length, as a fraction of the longest side of the images: between a phone's and a film camera's."""
+_FACING = np.diag([1.0, -1.0, -1.0, 1.0])
+"""World to camera: the world is y up, and the camera looks along -z from its origin."""
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Frames of a clip, in order: names with suffix, image files, and of a video where they are from."""
+
+    names: tuple[str, ...]
+    paths: tuple[Path, ...]
+    videos: tuple[VideoFrame | None, ...]
+    fps: float | None = None
+
+
+def is_plain_clip(source: Path) -> bool:
+    """Whether a path is a video, or a folder that holds images directly or in ``images``."""
+    with reading(source):
+        if source.is_file():
+            return source.suffix.lower() in VIDEO_SUFFIXES
+        return source.is_dir() and bool(_images_of(source))
+
+
+def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture:
+    """Read a clip of one fixed camera; ``options.root`` is a video, or a folder of images in the order of names.
+
+    The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else ``FOCAL`` times
+    the longest side. The world is y up if the camera is level, the camera stands at its origin.
+
+    Args:
+        options: ``frames`` chooses frames by number; without it ``MOST_FRAMES`` are taken, evenly spread.
+        masks: folder of masks (white = the person), named as the images, or ``frame_000012.png`` for frame 12 of a
+            video; None: alpha, if the images have it.
+
+    Raises:
+        DyngsError: no clip, images of different sizes, or no mask for an image.
+    """
+    source = options.root
+    with staying_within(source if source.is_dir() else source.parent, options.follow_links), reading(source):
+        found = _frames_of(source)
+    numbers = _chosen(options, len(found.names))
+    with images_up_to(options.max_megapixels), reading(source):
+        if found.videos[0] is not None:
+            wanted = {found.paths[i]: video for i in numbers if (video := found.videos[i]) is not None}
+            decode_frames(source, wanted, options.frame_cache_mb)
+        headers = [read_header(found.paths[i]) for i in numbers]
+    silhouettes: Sequence[Silhouette | None]
+    silhouettes = [None] * len(numbers) if masks is None else silhouettes_of(masks, [found.names[i] for i in numbers])
+    first = headers[0]
+    check_size(source, first.width, first.height, first.channels)
+    width, height = first.upright_size
+    other = next((i for i, x in zip(numbers, headers, strict=True) if x.upright_size != (width, height)), None)
+    if other is not None:
+        raise DyngsError(
+            f"{found.paths[other]}: has another size than {found.paths[numbers[0]].name}; give the frames of one camera"
+        )
+    focal = first.tags.focal_px or FOCAL * max(width, height)
+    intrinsics = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    last = max(len(numbers) - 1, 1)
+    views = tuple(
+        View(
+            name=Path(found.names[i]).with_suffix("").as_posix(),
+            image_path=found.paths[i],
+            cam_from_world=_FACING.copy(),
+            intrinsics=intrinsics,
+            width=width,
+            height=height,
+            time=row / last,
+            frame=row,
+            video=found.videos[i],
+            silhouette=silhouettes[row],
+        )
+        for row, i in enumerate(numbers)
+    )
+    has_alpha = masks is not None or first.has_alpha
+    note = f"{len(numbers)} of {len(found.names)} frames, focal length {focal:.0f} px "
+    note += "by the EXIF tags" if first.tags.focal_px else "guessed"
+    return Capture(source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=found.fps, warnings=(note,))
+
+
+def zoomed(view: View, factor: float, distance: float) -> View:
+    """Return the view of a camera with ``factor`` times the focal length that stands back by as much.
+
+    What is at ``distance`` before the camera is as large as before.
+    """
+    intrinsics, pose = view.intrinsics.copy(), view.cam_from_world.copy()
+    intrinsics[:2, :2] *= factor
+    pose[2, 3] += (factor - 1) * distance
+    return replace(view, intrinsics=intrinsics, cam_from_world=pose)
+
+
+def _frames_of(source: Path) -> _Frames:
+    if source.is_file():
+        planned = planned_frames(source)
+        names = tuple(f"frame_{number:06d}.png" for number in range(len(planned.paths)))
+        videos = tuple(VideoFrame(source, number) for number in range(len(planned.paths)))
+        if not names:
+            raise DyngsError(f"{source}: the video holds no image; copy it again")
+        return _Frames(names, planned.paths, videos, planned.info.fps or None)
+    images = _images_of(source)
+    if not images:
+        raise DyngsError(f"{source}: holds no images; give a folder of the frames of a clip, or a video")
+    names = tuple(path.name for path in images)
+    return _Frames(names, tuple(inside(path) for path in images), (None,) * len(images))
+
+
+def _images_of(folder: Path) -> list[Path]:
+    """Return the images directly in a folder, or else in ``images`` below it, 9 before 10."""
+    for place in (folder, folder / "images"):
+        if place.is_dir():
+            found = [
+                path
+                for path in place.iterdir()
+                if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file() and not path.name.startswith(".")
+            ]
+            if found:
+                return sorted(found, key=lambda path: natural_order(path.name))
+    return []
+
+
+def _chosen(options: DataConfig, count: int) -> list[int]:
+    """Return the numbers of the frames to take, ascending."""
+    if options.frames is None:
+        return evenly_spaced(count, MOST_FRAMES)
+    numbers = list(range(count))[parse_frames(options.frames)]
+    if not numbers:
+        raise DyngsError(f"{options.root}: data.frames={options.frames} selects none of {count} frames")
+    return sorted(numbers)
+
+
+def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
+    """Return the masks (white = the person) in a folder of the named images.
+
+    Raises:
+        DyngsError: no folder, or an image without a mask.
+    """
+    if not masks.is_dir():
+        raise DyngsError(f"no such folder of masks: {masks}")
+    with staying_within(masks), reading(masks):
+        found = find_masks(masks)
+        own = [mask_of(name, found) for name in names]
+        for path in own:
+            if path is not None:
+                inside(path)
+    missing = [name for name, path in zip(names, own, strict=True) if path is None]
+    if missing:
+        raise DyngsError(
+            f"{masks}: no mask for {len(missing)} of {len(names)} images, first {missing[0]}; a mask is named as its "
+            "image (a.jpg.png, a.jpg or a.png for a.jpg), white where the person is"
+        )
+    return [Silhouette(path, "white") for path in own if path is not None]

@@ -1,0 +1,174 @@
+"""Report on videos without poses: what one wants to know before structure from motion, and the next command."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dyngs.capture.multi_video.films import Film, SmallImages, open_film, shrunk_grey, videos_in
+from dyngs.capture.multi_video.given import NAME, read_given
+from dyngs.capture.multi_video.planes import motion_of
+from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
+from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.images.video import opened_video, read_frames
+from dyngs.errors import reading
+from dyngs.files.containment import inside
+
+MAX_FRAMES = 3000
+"""Frames that are looked at, from the first one on."""
+UNEVEN = 1.5
+"""Longest over typical gap between frames of a rate that varies."""
+BLURRED = 0.5
+"""Frames with less than this fraction of the typical sharpness are blurred."""
+FAST = 0.05
+"""Fraction of the width by which the image moves from frame to frame of a camera that moves fast."""
+LITTLE = 0.05
+"""Fraction of the width by which the image of a camera that hardly moves is displaced over the clip."""
+_PAIRS = 40
+
+
+@dataclass(frozen=True)
+class VideoFacts:
+    """Facts about a video.
+
+    Attributes:
+        film: the video.
+        facts: (name, value) pairs for people, in order.
+        stands: the camera stands still.
+    """
+
+    film: Film
+    facts: tuple[tuple[str, str], ...]
+    stands: bool
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """What was seen in the frames: small images, and the sharpness of each."""
+
+    small: SmallImages
+    sharpness: np.ndarray
+
+
+def video_report(path: Path) -> str:
+    """Return a report on a video file, or on the videos of a folder, as lines of text.
+
+    Raises:
+        DyngsError: a video that cannot be read.
+    """
+    if path.is_file():
+        found = video_facts(path)
+        return "\n".join([*_lines(found), *_next(path, found)])
+    videos = videos_in(path)
+    if len(videos) == 1:
+        return video_report(videos[0])
+    reports = [video_facts(video) for video in videos]
+    lines = [line for found in reports for line in _lines(found)]
+    return "\n".join([*lines, *_next_of_folder(path, reports)])
+
+
+def video_facts(path: Path) -> VideoFacts:
+    """Return what there is to know about a video; its frames are decoded once.
+
+    Raises:
+        DyngsError: the video cannot be read.
+    """
+    film = open_film(inside(path))
+    looked = _look(film)
+    steady = steadiness(looked.small.grey)
+    rotation, sound = _streams(path)
+    seconds = film.seconds
+    facts = (
+        ("size", f"{film.info.width}x{film.info.height}" + (f" (turned by {rotation} degrees)" if rotation else "")),
+        ("frames", f"{len(seconds)} in {seconds[-1] + 1 / film.rate:.2f} s, {_rate(film)}"),
+        ("sound", sound),
+        ("sharpness", _sharpness(looked.sharpness)),
+        ("camera", _camera(looked.small, steady)),
+    )
+    return VideoFacts(film, facts, steady.stands)
+
+
+def _look(film: Film) -> _Looked:
+    small, sharpness = [], []
+    for number, rgb in enumerate(read_frames(film.path)):
+        if number >= min(MAX_FRAMES, len(film.seconds)):
+            break
+        small.append(shrunk_grey(rgb))
+        step = max(max(rgb.shape[:2]) // 800, 1)
+        grey = rgb[::step, ::step, 1].astype(np.float32)
+        sharpness.append(
+            float(np.diff(grey, axis=0).std() + np.diff(grey, axis=1).std()) if min(grey.shape) > 1 else 0.0
+        )
+    return _Looked(SmallImages(np.stack(small), film.seconds[: len(small)]), np.array(sharpness))
+
+
+def _streams(path: Path) -> tuple[int, str]:
+    """Return by how many degrees images are turned on reading, and what sound there is."""
+    with reading(path, "it must be a video; copy or convert it again"), opened_video(path) as container:
+        first = next(container.decode(container.streams.video[0]))
+        rotation = round(getattr(first, "rotation", 0) / 90) % 4 * 90
+        audio = container.streams.audio
+        return rotation, f"{audio[0].codec_context.name}, {audio[0].rate} Hz" if audio else "none"
+
+
+def _rate(film: Film) -> str:
+    gaps = np.diff(film.seconds)
+    if len(gaps) and gaps.max() > UNEVEN * np.median(gaps):
+        return f"variable rate: {1000 * gaps.min():.0f} to {1000 * gaps.max():.0f} ms between frames (times are kept)"
+    return f"{film.rate:.4g} per second"
+
+
+def _sharpness(sharpness: np.ndarray) -> str:
+    typical = float(np.median(sharpness))
+    blurred = int((sharpness < BLURRED * typical).sum())
+    low, high = sharpness.min() / max(typical, 1e-9), sharpness.max() / max(typical, 1e-9)
+    return f"{low:.2f} to {high:.2f} of the typical frame; {blurred or 'no'} blurred frame{'s' * (blurred != 1)}"
+
+
+def _camera(small: SmallImages, steady: Steadiness) -> str:
+    if steady.stands:
+        changed = float((motion_of(small) > 0).mean()) if len(small.grey) > 1 else 0.0
+        return f"stands still; {changed:.1%} of the image changes at a time"
+    starts = evenly_spaced(len(small.grey) - 1, _PAIRS)
+    steps = [displacement(small.grey[i].astype(float), small.grey[i + 1].astype(float)) for i in starts]
+    known = [step for step in steps if np.isfinite(step)]
+    far = "far" if np.isinf(steady.displaced) else f"by up to {steady.displaced:.1%} of its width"
+    if not known:
+        return f"moves {far}; too fast or too blurred to follow from frame to frame"
+    median = float(np.median(known))
+    fast = "; fast: film slower, or at more frames per second" if median > FAST else ""
+    fast = "; hardly at all, which shows little depth" if steady.displaced < LITTLE else fast
+    return f"moves {far}, {median:.2%} of its width from frame to frame{fast}"
+
+
+def _lines(found: VideoFacts) -> list[str]:
+    width = max(len(name) for name, _ in found.facts)
+    return [f"video {found.film.path}", *(f"  {name:<{width}}  {value}" for name, value in found.facts)]
+
+
+def _next(path: Path, found: VideoFacts) -> list[str]:
+    where = shlex.quote(str(path))
+    if found.stands:
+        return ["next: one camera that stands shows no depth; put videos of two or more that ran at once into a folder"]
+    return [
+        f"next: dyngs train static data.root={where}     # nothing but the camera moves",
+        f"      dyngs train dynamic data.root={where}    # something else moves, too",
+    ]
+
+
+def _next_of_folder(folder: Path, reports: Sequence[VideoFacts]) -> list[str]:
+    moving = [found.film.name for found in reports if not found.stands]
+    if moving:
+        return [f"next: take {', '.join(moving[:5])} out: of several videos, only cameras that stand still get poses"]
+    names = [found.film.name for found in reports]
+    rates = {round(found.film.rate, 2) for found in reports}
+    known = "found by sound or motion" if read_given(folder, names).starts is None else f"as {NAME} says"
+    return [
+        f"{len(names)} cameras that stand, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
+        f"offsets between them: {known}",
+        f"next: dyngs train dynamic data.root={shlex.quote(str(folder))}",
+    ]

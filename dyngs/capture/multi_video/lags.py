@@ -1,0 +1,208 @@
+"""Shifts in time between recordings, from signals that should run alike: correlation of pairs, one shift for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+MIN_OVERLAP = 0.4
+"""Fraction of the shorter signal that must lie within the other one at every shift that is tried,"""
+MIN_SAMPLES = 8
+"""and so many samples."""
+MIN_PEAK = 0.15
+"""Lowest correlation of two signals that count as alike."""
+RIVAL = 0.8
+"""A peak is clear if no other one is higher than this times itself."""
+CERTAIN_PEAK, CERTAIN_RIVAL = 0.5, 0.6
+"""Likewise where no third recording can confirm it: 0.7 % of unrelated signals of 120 samples have such a peak,"""
+CERTAIN_DEVIATIONS = 6.0
+"""and none stands out by so many standard deviations of the other correlations."""
+PEAK_WIDTH = 2.0
+"""Shifts within so many samples of a peak belong to it."""
+_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlation of two signals at whole shifts.
+
+    Attributes:
+        first: shift of the first value, in samples: time of the second signal plus the shift is time of the first one.
+        values: (L,) in [-1, 1], one for each shift from ``first`` on.
+    """
+
+    first: int
+    values: np.ndarray
+
+    def at(self, shift: float) -> float:
+        """Return the correlation at a shift, linear between whole ones, 0 outside."""
+        place = np.arange(len(self.values)) + self.first
+        return float(np.interp(shift, place, self.values, left=0.0, right=0.0))
+
+    @property
+    def best(self) -> float:
+        """Shift of the highest correlation, between whole ones by a parabola."""
+        return self.first + peak_place(self.values)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the highest correlation is high, and alone."""
+        place = peak_place(self.values)
+        peak = float(self.values.max())
+        return peak >= MIN_PEAK and rival_of(self.values, place) <= RIVAL * peak
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the highest correlation can be relied on by itself."""
+        place, peak = peak_place(self.values), float(self.values.max())
+        rival = rival_of(self.values, place)
+        far = np.abs(np.arange(len(self.values)) - place) > PEAK_WIDTH
+        deviation = float(np.sqrt(np.mean(self.values[far] ** 2))) if far.any() else 1.0
+        stands_out = peak >= CERTAIN_DEVIATIONS * deviation
+        return self.is_clear and (stands_out or (peak >= CERTAIN_PEAK and rival <= CERTAIN_RIVAL * peak))
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Shifts of several recordings.
+
+    Attributes:
+        shifts: (C,) samples, to be added to a recording's own time; the first one is 0.
+        agreeing: pairs whose own best shift is this one, to a sample.
+        compared: pairs with a clear peak of their own.
+        pairs: all pairs.
+        correlation: mean over all pairs at these shifts.
+        together: mean over all pairs if nothing is shifted.
+        holds: whether the shifts may be relied on: pairs that agree join all recordings, and of the pairs beyond those
+            that it takes to join them, which agree by themselves, half agree, too. Without such pairs, each is certain.
+    """
+
+    shifts: np.ndarray
+    agreeing: int
+    compared: int
+    pairs: int
+    correlation: float
+    together: float
+    holds: bool
+
+
+def correlate(a: np.ndarray, b: np.ndarray) -> Correlation | None:
+    """Return the correlation of two signals over whole shifts; None where they are too short to be compared.
+
+    Each column is taken relative to its mean. At every shift the energy of what overlaps is the norm.
+
+    Args:
+        a, b: (T, B) values of B bins at even times, with the same rate.
+    """
+    a, b = (x - x.mean(axis=0) for x in (a.astype(np.float64), b.astype(np.float64)))
+    least = max(int(np.ceil(MIN_OVERLAP * min(len(a), len(b)))), MIN_SAMPLES)
+    if min(len(a), len(b)) < least:
+        return None
+    size = len(a) + len(b)
+    spectrum = (np.fft.rfft(a, size, axis=0) * np.conj(np.fft.rfft(b, size, axis=0))).sum(axis=1)
+    products = np.fft.irfft(spectrum, size)
+    shifts = np.arange(least - len(b), len(a) - least + 1)
+    sums = [np.concatenate([[0.0], np.cumsum((x * x).sum(axis=1))]) for x in (a, b)]
+    starts, ends = np.maximum(shifts, 0), np.minimum(shifts + len(b), len(a))
+    energies = [sums[0][ends] - sums[0][starts], sums[1][ends - shifts] - sums[1][starts - shifts]]
+    norm = np.sqrt(np.maximum(energies[0] * energies[1], 0.0))
+    floor = 1e-3 * np.sqrt(sums[0][-1] * sums[1][-1])
+    return Correlation(int(shifts[0]), np.where(norm > floor, products[shifts] / np.maximum(norm, 1e-12), 0.0))
+
+
+def align(pairs: Mapping[tuple[int, int], Correlation], count: int, near: np.ndarray | None = None) -> Alignment:
+    """Return the shifts at which all pairs together correlate best.
+
+    The pairs with the highest peaks join all recordings first; then each recording is shifted to where the sum of its
+    correlations is highest, until nothing changes.
+
+    Args:
+        pairs: correlation of recordings i and j, i < j: shift of j less shift of i.
+        count: of recordings.
+        near: (C,) shifts that are only to be improved, by less than ``PEAK_WIDTH``; None: nothing is known.
+    """
+    shifts = _spanning(pairs, count) if near is None else near.copy()
+    for _ in range(_ROUNDS):
+        before = shifts.copy()
+        for i in range(1, count):
+            shifts[i] = _best_shift(i, shifts, pairs, None if near is None else float(near[i]))
+        if np.abs(shifts - before).max() < 1e-3:
+            break
+    own = {pair: found.best for pair, found in pairs.items()}
+    clear = {pair for pair, found in pairs.items() if found.is_clear}
+    agree = {(i, j) for i, j in clear if abs(own[i, j] - (shifts[j] - shifts[i])) <= 1.0}
+    mean, none = (
+        float(np.mean([found.at(at[j] - at[i]) for (i, j), found in pairs.items()])) if pairs else 0.0
+        for at in (shifts, np.zeros(count))
+    )
+    beyond = len(pairs) - (count - 1)
+    confirmed = (
+        2 * (len(agree) - (count - 1)) >= beyond if beyond > 0 else all(pairs[pair].is_certain for pair in agree)
+    )
+    holds = len(_reached(agree, count)) == count and confirmed
+    return Alignment(shifts - shifts[0], len(agree), len(clear), len(pairs), mean, none, holds)
+
+
+def peak_place(values: np.ndarray) -> float:
+    """Return the place of the highest value, between whole ones by the parabola through its neighbours."""
+    top = int(np.argmax(values))
+    if not 0 < top < len(values) - 1:
+        return float(top)
+    before, peak, after = values[top - 1 : top + 2]
+    bend = before - 2 * peak + after
+    return top + (0.5 * float((before - after) / bend) if bend < 0 else 0.0)
+
+
+def rival_of(values: np.ndarray, place: float) -> float:
+    """Return the highest local maximum that does not belong to the peak at ``place``, 0 without any."""
+    inner = values[1:-1]
+    is_top = (inner >= values[:-2]) & (inner >= values[2:])
+    far = np.abs(np.arange(1, len(values) - 1) - place) > PEAK_WIDTH
+    return float(max(inner[is_top & far].max(initial=0.0), 0.0))
+
+
+def _spanning(pairs: Mapping[tuple[int, int], Correlation], count: int) -> np.ndarray:
+    """Return shifts by the pairs with the highest peaks that join all recordings; 0 for those that none joins."""
+    shifts = np.zeros(count)
+    joined = {0}
+    ranked = sorted(pairs.items(), key=lambda item: (-float(item[1].values.max()), item[0]))
+    while len(joined) < count:
+        link = next(((i, j, found.best) for (i, j), found in ranked if (i in joined) != (j in joined)), None)
+        if link is None:
+            break
+        i, j, shift = link
+        if i in joined:
+            shifts[j] = shifts[i] + shift
+        else:
+            shifts[i] = shifts[j] - shift
+        joined |= {i, j}
+    return shifts
+
+
+def _best_shift(i: int, shifts: np.ndarray, pairs: Mapping[tuple[int, int], Correlation], near: float | None) -> float:
+    """Return the shift of recording ``i`` with the highest sum of correlations, the others as they are."""
+    curves = []
+    for (first, second), found in pairs.items():
+        if i not in (first, second):
+            continue
+        place = np.arange(len(found.values)) + found.first
+        own, other = (place, shifts[first]) if i == second else (-place[::-1], shifts[second])
+        curves.append((own + other, found.values if i == second else found.values[::-1]))
+    if not curves:
+        return float(shifts[i])
+    low, high = min(own[0] for own, _ in curves), max(own[-1] for own, _ in curves)
+    if near is not None:
+        low, high = near - PEAK_WIDTH, near + PEAK_WIDTH
+    grid = np.arange(np.floor(low), np.ceil(high) + 1)
+    total = np.sum([np.interp(grid, own, values, left=0.0, right=0.0) for own, values in curves], axis=0)
+    return float(grid[0] + peak_place(total))
+
+
+def _reached(links: set[tuple[int, int]], count: int) -> set[int]:
+    """Return the recordings that a chain of links joins to the first one."""
+    reached = {0}
+    for _ in range(count):
+        reached |= {x for link in links for x in link if reached & set(link)}
+    return reached

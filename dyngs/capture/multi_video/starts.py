@@ -1,0 +1,109 @@
+"""When each of several videos begins, in one clock: given, or found from their sound, or from the motion in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from dyngs.capture.multi_video.films import Film
+from dyngs.capture.multi_video.given import NAME
+from dyngs.capture.multi_video.lags import Alignment, align, correlate
+from dyngs.capture.multi_video.planes import Watcher, correlations
+from dyngs.capture.multi_video.sound import RATE, onsets
+from dyngs.errors import DyngsError
+
+NEIGHBOURS = 8
+"""Other cameras that the motion seen by a camera is compared with."""
+COARSE, FINE = 1.2, 0.0
+"""Blur of motion in time, in frames, with which the offsets are found, and then measured."""
+WHOLE = 0.2
+"""Offsets so near to whole frames, in frames, are taken as whole: they are not known better."""
+TOGETHER = 0.97
+"""Videos begin together if that explains them as well as the offsets found, to this share."""
+MAX_RATE = 60.0
+_SHOWN = 12
+
+
+@dataclass(frozen=True)
+class Starts:
+    """When the videos begin.
+
+    Attributes:
+        seconds: (C,) in one clock, the earliest one at 0.
+        line: how they were found, and what they are.
+    """
+
+    seconds: np.ndarray
+    line: str
+
+
+def given_starts(films: Sequence[Film], starts: dict[str, float]) -> Starts:
+    """Return the starts that a person gave, for those of the videos that are left."""
+    seconds = np.array([starts[film.name] for film in films])
+    seconds = seconds - seconds.min()
+    return Starts(seconds, f"offsets between the cameras as given: {_listed(films, seconds)}")
+
+
+def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
+    """Return the starts by the sound if all videos have some that tells, else by the motion that they show.
+
+    Args:
+        films: the videos.
+        watchers: one for each, with poses.
+
+    Raises:
+        DyngsError: neither sound nor motion tells; says what to give.
+    """
+    by_sound, why_not = _by_sound(films)
+    rate = min(max(film.rate for film in films), MAX_RATE)
+    found, hertz = by_sound, RATE
+    if found is None:
+        found, hertz = align(correlations(watchers, rate, NEIGHBOURS, COARSE), len(films)), rate
+        if not found.holds:
+            raise DyngsError(
+                f"the offsets between the videos are not known: {why_not}, and the motion seen agrees for "
+                f"{found.agreeing} of {found.pairs} pairs of cameras only; give the second at which each video begins "
+                f'in {NAME} beside them, {{"starts": {{"{films[0].name}": 0, "{films[1].name}": 0.5, ..}}}}, or '
+                '{"starts": 0} if all began at once'
+            )
+        fine = align(correlations(watchers, rate, NEIGHBOURS, FINE), len(films), found.shifts)
+        found = replace(found, shifts=fine.shifts, correlation=fine.correlation, together=fine.together)
+    what = "the motion seen" if by_sound is None else "the sound"
+    sure = f"{found.agreeing} of {found.pairs} pairs agree, correlation {found.correlation:.2f}"
+    frames = found.shifts / hertz * rate
+    if found.together >= TOGETHER * found.correlation or np.abs(frames).max() <= WHOLE:
+        return Starts(np.zeros(len(films)), f"the videos begin together, by {what} ({sure})")
+    if _same_rate(films) and np.abs(frames - np.round(frames)).max() <= WHOLE:
+        frames = np.round(frames)
+        sure += ", whole frames"
+    seconds = (frames - frames.min()) / rate
+    return Starts(seconds, f"offsets between the cameras by {what} ({sure}): {_listed(films, seconds)}")
+
+
+def _by_sound(films: Sequence[Film]) -> tuple[Alignment | None, str]:
+    """Return the alignment of the sound, None where it does not tell, with the reason."""
+    heard = [onsets(film.path) for film in films]
+    silent = [film.name for film, sound in zip(films, heard, strict=True) if sound is None]
+    if silent:
+        return None, f"{silent[0]} has no sound" if len(silent) < len(films) else "there is no sound"
+    sounds = [sound for sound in heard if sound is not None]
+    found = {(i, j): correlate(sounds[i], sounds[j]) for i, j in combinations(range(len(films)), 2)}
+    pairs = {pair: value for pair, value in found.items() if value is not None}
+    aligned = align(pairs, len(films))
+    if aligned.holds:
+        return aligned, ""
+    return None, f"the sound agrees for {aligned.agreeing} of {aligned.pairs} pairs only"
+
+
+def _same_rate(films: Sequence[Film]) -> bool:
+    rates = [film.rate for film in films]
+    return max(rates) <= 1.01 * min(rates)
+
+
+def _listed(films: Sequence[Film], seconds: np.ndarray) -> str:
+    """Return the seconds by camera, in words; the first few of many."""
+    named = [f"{film.name} +{start:.3f} s" for film, start in zip(films, seconds, strict=True)]
+    return ", ".join(named[:_SHOWN]) + (f" and {len(named) - _SHOWN} more" if len(named) > _SHOWN else "")

@@ -1,0 +1,197 @@
+"""Features and matches of images, in COLMAP's database; what a stopped run found is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dyngs.capture.photos import Photo
+from dyngs.conventions import ReportProgress
+from dyngs.files.write import write_text
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_AT_ONCE, _MATCHING_CALLS = 8, 16
+_SMALL_PX = 1000
+"""Images up to this long are doubled in size for finding features: they have few otherwise."""
+_PEAK = 0.02 / 3
+_STRONGER = (1.0, 1.5, 2.0, 3.0, 4.0)
+_TRIED = 3
+
+
+@dataclass(frozen=True)
+class FeatureTask:
+    """Input of finding and matching features.
+
+    Attributes:
+        database: COLMAP's; made where it is missing.
+        images: folder of upright images.
+        names: of the images in it, in order.
+        photos: the same ones, with their tags.
+        masks: folder of masks ``NAME.png``, white = keep; None without.
+        camera_model: COLMAP's name of the lens.
+        single_camera: all images share a lens.
+        max_features: per image.
+        longest_side: images are shrunk to this for finding features.
+        seed, num_threads: as in ``SfmOptions``.
+        enough: features of an image, on average over three of them, above which weak ones are left out; 0 = never.
+    """
+
+    database: Path
+    images: Path
+    names: Sequence[str]
+    photos: Sequence[Photo]
+    masks: Path | None
+    camera_model: str
+    single_camera: bool
+    max_features: int
+    longest_side: int
+    seed: int
+    num_threads: int
+    enough: int = 0
+
+    @property
+    def side(self) -> int:
+        """Longest side of an image, in pixels."""
+        return max((max(photo.header.size) for photo in self.photos), default=0)
+
+
+def find_features(task: FeatureTask, report: ReportProgress) -> float:
+    """Find SIFT features of all images that have none in the database yet.
+
+    Returns how many times the usual contrast a feature must have: more than 1 where images have more than
+    ``task.enough``. The largest features (``max_features``) would be the coarse ones, whose places are not exact.
+
+    COLMAP is called for some images at a time: it has no callbacks, and its database must not be opened by another
+    copy of SQLite in the same process, whose end would take away COLMAP's locks.
+
+    Images and cameras are entered first, in order: with several threads COLMAP would number them as they are done,
+    and what follows depends on the numbers. Focal lengths of the EXIF tags are taken as first values.
+    """
+    import pycolmap
+
+    reader, mode = _reader(task)
+    if _num_images(task.database) < len(task.names):
+        task.database.unlink(missing_ok=True)
+        pycolmap.Database.open(task.database).close()
+        pycolmap.import_images(task.database, task.images, mode, task.names, reader)
+        _enter_focal_lengths(task)
+    stronger = _stronger(task) if task.enough else 1.0
+    count = len(task.names)
+    for first in range(0, count, _AT_ONCE):
+        _extract(task, task.database, task.names[first : first + _AT_ONCE], stronger)
+        report("features, images", min(first + _AT_ONCE, count), count)
+    return stronger
+
+
+def _reader(task: FeatureTask) -> tuple[pycolmap.ImageReaderOptions, pycolmap.CameraMode]:
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = task.camera_model
+    if task.masks is not None:
+        reader.mask_path = task.masks
+    return reader, pycolmap.CameraMode.SINGLE if task.single_camera else pycolmap.CameraMode.PER_IMAGE
+
+
+def _extract(task: FeatureTask, database: Path, names: Sequence[str], stronger: float) -> None:
+    """Find features of some images, with ``stronger`` times the usual contrast."""
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = task.num_threads or -1
+    extraction.max_image_size = task.longest_side
+    extraction.sift.max_num_features = task.max_features
+    extraction.sift.peak_threshold = stronger * _PEAK
+    extraction.sift.first_octave = -1 if min(task.side, task.longest_side) <= _SMALL_PX else 0
+    reader, mode = _reader(task)
+    pycolmap.extract_features(
+        database, task.images, names, camera_mode=mode, reader_options=reader,
+        extraction_options=extraction, device=pycolmap.Device.cpu,
+    )  # fmt: skip
+
+
+def _stronger(task: FeatureTask) -> float:
+    """Return the least contrast, in multiples of the usual one, at which images have at most ``task.enough``."""
+    import pycolmap
+
+    places = np.linspace(0, len(task.names) - 1, _TRIED + 2).round()[1:-1]
+    names = [task.names[place] for place in sorted({int(place) for place in places})]
+    trial = task.database.with_name("trial.db")
+    for stronger in _STRONGER:
+        trial.unlink(missing_ok=True)
+        pycolmap.Database.open(trial).close()
+        _extract(task, trial, names, stronger)
+        with pycolmap.Database.open(trial) as opened:
+            if opened.num_keypoints() <= task.enough * len(names):
+                return stronger
+    return _STRONGER[-1]
+
+
+def match_pairs(task: FeatureTask, pairs: Sequence[tuple[int, int]], report: ReportProgress) -> None:
+    """Match pairs of images, given by their places in the order, and verify them; those of before are left."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.num_threads = task.num_threads or -1
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = task.seed
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = task.database.with_name("pairs.txt")
+    ordered = sorted(set(pairs))  # of few images at a time: COLMAP prepares each one anew in every call
+    step = max(len(ordered) // _MATCHING_CALLS, _AT_ONCE)
+    for first in range(0, len(ordered), step):
+        part = ordered[first : first + step]
+        write_text(pairing.match_list_path, "".join(f"{task.names[i]} {task.names[j]}\n" for i, j in part))
+        pycolmap.match_image_pairs(task.database, matching, pairing, verification, device=pycolmap.Device.cpu)
+        report("matching, pairs", first + len(part), len(ordered))
+
+
+def matched_images(database: Path) -> dict[str, int]:
+    """Return how many other images each one was matched with, by name."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        counts = {image.image_id: 0 for image in opened.read_all_images()}
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        ids, geometries = opened.read_two_view_geometries()
+        for key, geometry in zip(ids, geometries, strict=True):
+            if len(geometry.inlier_matches):
+                for image in pycolmap.pair_id_to_image_pair(key):
+                    counts[image] += 1
+    return {names[image]: count for image, count in counts.items()}
+
+
+def _num_images(database: Path) -> int:
+    import pycolmap
+
+    if not database.is_file():
+        return 0
+    with closing(pycolmap.Database.open(database)) as opened:
+        return int(opened.num_images())
+
+
+def _enter_focal_lengths(task: FeatureTask) -> None:
+    import pycolmap
+
+    tags = dict(zip(task.names, (photo.header.tags for photo in task.photos), strict=True))
+    with pycolmap.Database.open(task.database) as opened:
+        first: dict[int, str] = {}
+        for image in sorted(opened.read_all_images(), key=lambda image: image.name):
+            first.setdefault(image.camera_id, image.name)
+        for camera in opened.read_all_cameras():
+            focal = tags[first[camera.camera_id]].focal_px
+            camera.has_prior_focal_length = focal is not None
+            if focal is not None:
+                params = camera.params.copy()
+                params[list(camera.focal_length_idxs())] = focal
+                camera.params = params
+            opened.update_camera(camera)

@@ -1,0 +1,1 @@
+"""Images and videos: decoding, lens undistortion, silhouettes, the cache of video frames."""

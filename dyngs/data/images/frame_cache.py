@@ -1,0 +1,281 @@
+"""Cache of video frames as image files: decoded once, within a disk limit, found again by the video's content.
+
+The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` beside them holds
+the video's size and frame rate and marks the folder as ours. Nothing is ever written to a capture. Only files named
+like ours in folders with that mark are removed, never through a link.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from dyngs.data.capture import VideoFrame
+from dyngs.data.images.video import VideoInfo, probe_video, read_numbered_frames
+from dyngs.errors import DyngsError, reading
+from dyngs.files.cache import CACHE_VARIABLE, cache_folder
+from dyngs.files.containment import inside
+from dyngs.files.image_errors import image_error
+from dyngs.files.write import atomic_file, write_text
+
+try:
+    import fcntl
+except ImportError:  # Windows, where a folder with an open file in it cannot be renamed
+    fcntl = None
+
+WHOLE_BYTES = 2**30
+"""Larger videos are compared by samples and modification time only."""
+_MARK_NAME = "video.json"
+_MARK = "frames that dyngs decoded from a video; the folder may be removed"
+_NUM_SAMPLES, _SAMPLE_BYTES = 256, 2**20
+_OUR_FILES = re.compile(r"\.?(frame_\d{6,}|video)(\.\d+-[0-9a-f]{6}\.dyngs)?\.(png|json)")
+_MAX_LOCKED = 256
+_locked: dict[Path, BinaryIO] = {}
+"""Marks that this process keeps open and locked, so that no other process removes frames that it reads."""
+
+
+@dataclass(frozen=True)
+class VideoFrames:
+    """Frames of a video in the cache, decoded or not.
+
+    Attributes:
+        info: size, length and frame rate of the video.
+        source: the video.
+        paths: one image file per frame, in order; ``decode_frames`` writes those that are missing.
+    """
+
+    info: VideoInfo
+    source: Path
+    paths: tuple[Path, ...]
+
+
+def planned_frames(video: Path) -> VideoFrames:
+    """Return the frames of ``video`` and where they are cached; nothing is written.
+
+    Raises:
+        DyngsError: the video cannot be opened.
+    """
+    inside(video)
+    try:
+        status = video.stat()
+        digest = _digest(video, status.st_size, status.st_mtime_ns)
+    except OSError as error:
+        raise DyngsError(f"{video}: cannot be opened ({error.strerror})") from None
+    label = re.sub(r"[^A-Za-z0-9-]", "_", video.stem)[:40]
+    # Two cameras may have filmed the same: the name keeps their frames apart.
+    named = hashlib.sha256(os.fsencode(video.name) + b"\0" + digest).hexdigest()[:32]
+    folder = cache_folder("frames") / f"{label}.{named}"
+    info = _stored_info(folder) or probe_video(video)
+    return VideoFrames(info, video, tuple(folder / f"frame_{number:06d}.png" for number in range(info.num_frames)))
+
+
+def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float) -> None:
+    """Decode the frames whose image is missing; every file is written atomically.
+
+    The total size is estimated from the frames written so far, from the first on, so that too much is refused early.
+    The least recently used frames of other captures are removed to make room, unless a running process uses them.
+
+    Args:
+        root: the capture, for messages.
+        frames: image file, as ``planned_frames`` named it, to the frame of a video that it holds.
+        limit_mb: 1e6 bytes on disk that all cached frames together may take.
+
+    Raises:
+        DyngsError: a damaged video (names it and the frame), more than the limit or than the disk has (says how much).
+    """
+    wanted = {path.parent: frame.video for path, frame in frames.items()}
+    for folder in wanted:
+        _lock(folder)
+    missing: dict[Path, list[int]] = {}
+    for path in sorted(frames):
+        if not path.is_file():
+            missing.setdefault(path.parent, []).append(frames[path].number)
+    if not missing:
+        return
+    need, count, written = sum(map(len, missing.values())), 0, 0
+    space = _DiskSpace(root, frozenset(wanted), limit_mb)
+    for folder, numbers in missing.items():
+        _make(folder, wanted[folder])
+        for number, rgb in read_numbered_frames(wanted[folder], numbers):
+            path = folder / f"frame_{number:06d}.png"
+            _write_png(path, rgb)
+            count, written = count + 1, written + path.stat().st_size
+            space.check(written, written * need / count)
+
+
+def _make(folder: Path, video: Path) -> None:
+    """Create the folder with its mark before anything else is in it."""
+    if not _stored_info(folder):
+        text = json.dumps({"what": _MARK, **asdict(probe_video(video))})
+        try:
+            if folder.is_symlink():
+                raise DyngsError("it is a link")
+            write_text(folder / _MARK_NAME, text)
+        except DyngsError as error:
+            raise DyngsError(
+                f"{folder}: the frames of a video cannot be kept there ({error}); set {CACHE_VARIABLE} to a folder "
+                "that can be written"
+            ) from error
+    _lock(folder)
+
+
+def _write_png(path: Path, rgb: np.ndarray) -> None:
+    """Write (H, W, 3) uint8 with little compression: a third of the time of the usual level, a tenth more bytes."""
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, oiio.UINT8)
+    spec.attribute("png:compressionLevel", 1)
+    with atomic_file(path) as temporary, reading(path, "the disk may be full"):
+        output = oiio.ImageOutput.create(str(temporary))
+        written = output is not None and output.open(str(temporary), spec) and output.write_image(rgb)
+        problem = image_error(oiio if output is None else output)
+        if output is None or not (output.close() and written):
+            raise DyngsError(f"cannot write {path}: {problem or 'the disk may be full'}")
+
+
+@lru_cache(maxsize=4096)
+def _digest(video: Path, size: int, changed_ns: int) -> bytes:
+    """SHA-256 of size and bytes; for huge files of size, samples and modification time.
+
+    The time is included because a copy that was cut off and then completed may agree in all samples.
+    """
+    digest = hashlib.sha256(str(size).encode())
+    with video.open("rb") as file:
+        if size <= WHOLE_BYTES:
+            while block := file.read(_SAMPLE_BYTES):
+                digest.update(block)
+        else:
+            digest.update(str(changed_ns).encode())
+            for sample in range(_NUM_SAMPLES):
+                file.seek(sample * max(size - _SAMPLE_BYTES, 0) // (_NUM_SAMPLES - 1))
+                digest.update(file.read(_SAMPLE_BYTES))
+    return digest.digest()
+
+
+def _stored_info(folder: Path) -> VideoInfo | None:
+    """Return what the mark of ``folder`` says about the video, None without a mark of ours."""
+    mark = folder / _MARK_NAME
+    if folder.is_symlink() or mark.is_symlink():
+        return None
+    try:
+        fields = json.loads(mark.read_text(encoding="utf-8"))
+        width, height, count = (int(fields[key]) for key in ("width", "height", "num_frames"))
+        return VideoInfo(width, height, count, float(fields["fps"])) if fields["what"] == _MARK else None
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return None
+
+
+def _lock(folder: Path) -> None:
+    """Protect the folder, if it exists, from removal by other processes while this one lives, and note its use."""
+    mark = folder / _MARK_NAME
+    if _stored_info(folder) is None:
+        return
+    try:
+        os.utime(mark)
+        if folder in _locked and os.path.samestat(os.fstat(_locked[folder].fileno()), mark.stat()):
+            return
+        if len(_locked) < _MAX_LOCKED:
+            _locked[folder] = mark.open("rb")
+            if fcntl is not None:
+                fcntl.flock(_locked[folder], fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        pass  # a read-only cache, or another process is removing it: what is missing then is decoded again
+
+
+class _DiskSpace:
+    """Disk space for the frames of one capture; frames of others are removed as needed."""
+
+    def __init__(self, root: Path, kept: frozenset[Path], limit_mb: float) -> None:
+        self._root, self._kept, self._limit_mb = root, kept, limit_mb
+        self._used = sum(map(_num_bytes, kept))
+        self._elsewhere = sum(_num_bytes(folder) for folder in _our_folders() if folder not in kept)
+
+    def check(self, now: int, end: float) -> None:
+        """Free space for ``end`` bytes, of which ``now`` are written already.
+
+        Raises:
+            DyngsError: it is more than the limit, or than other processes or the disk leave.
+        """
+        total, limit, cache = self._used + end, self._limit_mb * 1e6, cache_folder("frames")
+        if total > limit:
+            others = f", of which {self._used / 1e6:.4g} MB are there already" if self._used else ""
+            raise DyngsError(
+                f"{self._root}: the frames of its videos need about {total / 1e6:.4g} MB on disk{others}, but "
+                f"data.frame_cache_mb is {self._limit_mb:g}; raise it, or choose fewer with data.frames=start:stop:step"
+            )
+        self._elsewhere -= _removed(self._kept, self._elsewhere + total - limit)
+        if self._elsewhere + total > limit:
+            raise DyngsError(
+                f"{cache}: the frames of other videos, which are in use, take {self._elsewhere / 1e6:.4g} MB, and "
+                f"those of {self._root} need about {total / 1e6:.4g} MB, but data.frame_cache_mb is "
+                f"{self._limit_mb:g}; raise it, or wait until the others are done"
+            )
+        free = shutil.disk_usage(cache).free
+        if end - now > free:
+            raise DyngsError(
+                f"{cache}: the frames of the videos need about {(end - now) / 1e6:.4g} MB more, but the disk has only "
+                f"{free / 1e6:.4g} MB left; free some, set {CACHE_VARIABLE} to a folder on another disk, or choose "
+                "fewer with data.frames=start:stop:step"
+            )
+
+
+def _removed(kept: frozenset[Path], too_much: float) -> int:
+    """Remove the least recently used frames, except in ``kept``, until ``too_much`` bytes are freed; return these."""
+    gone = 0
+    if too_much <= 0:
+        return gone
+    others = [folder for folder in _our_folders() if folder not in kept and folder not in _locked]
+    for folder in sorted(others, key=lambda folder: (folder / _MARK_NAME).stat().st_mtime_ns):
+        if gone >= too_much:
+            break
+        gone += _remove(folder)
+    return gone
+
+
+def _our_folders() -> list[Path]:
+    """Folders of the cache that carry our mark and are no links."""
+    cache = cache_folder("frames")
+    return [folder for folder in cache.iterdir() if _stored_info(folder)] if cache.is_dir() else []
+
+
+def _remove(folder: Path) -> int:
+    """Remove our files from a folder, and the folder if nothing else is in it; return the bytes freed."""
+    freed = 0
+    try:
+        if fcntl is None:
+            folder = folder.rename(folder.with_name(f"{folder.name}.{os.getpid()}"))
+        with (folder / _MARK_NAME).open("rb") as mark:
+            if fcntl is not None:
+                fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            frames = [path for path in _own_files(folder) if path.name != _MARK_NAME]
+            for path in frames:
+                size = path.stat().st_size
+                path.unlink()
+                freed += size
+        (folder / _MARK_NAME).unlink()
+        folder.rmdir()
+    except OSError:
+        pass  # another process reads these frames, or somebody else's files are there, too
+    return freed
+
+
+def _own_files(folder: Path) -> Iterator[Path]:
+    """Yield the regular files of a folder that are named like ours."""
+    with os.scandir(folder) as entries:
+        for found in entries:
+            if found.is_file(follow_symlinks=False) and _OUR_FILES.fullmatch(found.name):
+                yield Path(found.path)
+
+
+def _num_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in _own_files(folder)) if _stored_info(folder) else 0

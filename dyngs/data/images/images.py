@@ -1,0 +1,313 @@
+"""Image files: headers, decoding to 8-bit sRGB with straight alpha, exact area downscaling."""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.data.images.exif import PhotoTags, is_lying, tags_of, turned_upright
+from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import check_size, inside, max_decoded_mb
+from dyngs.files.image_errors import image_error
+
+if TYPE_CHECKING:
+    import OpenImageIO
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp")
+_TAIL_BYTES = 4096
+_STRIP_PIXELS = 2**18
+"""Pixels of an image that are shrunk at a time."""
+_PNG_END = b"IEND"
+_END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """Header of an image file.
+
+    Attributes:
+        width, height: pixels, as stored.
+        channels: number of stored channels.
+        has_alpha: whether one of them is alpha.
+        tags: what the camera wrote.
+    """
+
+    width: int
+    height: int
+    channels: int
+    has_alpha: bool
+    tags: PhotoTags = field(default_factory=PhotoTags)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) as stored."""
+        return self.width, self.height
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """(width, height) when it is shown as its EXIF tag says."""
+        return (self.height, self.width) if is_lying(self.tags.orientation) else self.size
+
+    def size_for(self, described: tuple[int, int] | None) -> tuple[int, int]:
+        """Return the stored or the upright (width, height), that which has the shape of a camera's ``described`` one.
+
+        Programs that find poses take images as stored or upright, and their cameras say which. Where both have that
+        shape it is the stored one, which is what COLMAP takes.
+        """
+        if described is None:
+            return self.upright_size
+        wide, tall = described
+        lies = (wide > tall) != (self.width > self.height) and wide != tall
+        return self.upright_size if lies else self.size
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Read size and channels of an image without decoding it.
+
+    Raises:
+        DyngsError: the file is missing or is no image.
+    """
+    with _reading(path):
+        source = _open(path)
+        spec = source.spec()
+        source.close()
+        return ImageHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags_of(spec))
+
+
+def header_if_readable(path: Path) -> ImageHeader | None:
+    """Read the header of a capture's image; None where it is missing or damaged, which the loader reports.
+
+    Raises:
+        DyngsError: the image lies outside the capture, or is larger than ``data.max_megapixels``.
+    """
+    inside(path)
+    try:
+        header = read_header(path)
+    except DyngsError:
+        return None
+    check_size(path, header.width, header.height, header.channels)
+    return header
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
+    """Read an image as (H, W, 3) or, with alpha, (H, W, 4) uint8: sRGB, straight alpha.
+
+    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are linear with premultiplied
+    alpha: they are clamped to [0, 1] and encoded as sRGB. Grey becomes RGB.
+
+    Args:
+        path: a file.
+        size: (width, height) of its camera; an image that has this shape only when it is turned as its EXIF tag says
+            is turned. None: as stored.
+        upright: turn it as its EXIF tag says in any case.
+
+    Raises:
+        DyngsError: the file is missing, truncated, no image, or larger than ``data.max_megapixels``.
+    """
+    with _reading(path):
+        return _decoded(path, size, upright)
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return reading(path, "the image is damaged or of an unknown kind; copy or convert it again")
+
+
+def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
+    import OpenImageIO as oiio
+
+    source = _open(path)
+    spec = source.spec()
+    tags = tags_of(spec)
+    check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
+    is_linear = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    pixels = source.read_image(oiio.FLOAT if is_linear else oiio.UINT8)
+    message = image_error(source)
+    source.close()
+    # Half a JPEG decodes to an image with a grey lower half and a message.
+    if pixels is None or "premature" in message.lower():
+        reason = message or "the data ends early"
+        raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
+    pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
+    header = ImageHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags)
+    if upright or (size is not None and header.size_for(size) != header.size):
+        pixels = turned_upright(pixels, tags.orientation)
+    alpha = pixels[..., spec.alpha_channel] if spec.alpha_channel >= 0 else None
+    colour_channels = [i for i in range(spec.nchannels) if i != spec.alpha_channel]
+    if not colour_channels:
+        raise DyngsError(f"{path}: the image has no colour channel; use an RGB or RGBA image")
+    colour_channels = colour_channels[:3] if len(colour_channels) >= 3 else colour_channels[:1] * 3
+    rgb = pixels[..., colour_channels]
+    if is_linear:
+        rgb, alpha = _encode_linear(rgb, alpha)
+    return torch.as_tensor(np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha])), device="cpu")
+
+
+def read_raw(path: Path) -> tuple[np.ndarray, bool]:
+    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers.
+
+    Raises:
+        DyngsError: as ``read_image``.
+    """
+    import OpenImageIO as oiio
+
+    with _reading(path):
+        source = _open(path)
+        spec = source.spec()
+        check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
+        whole = spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+        numbers = source.read_image(spec.format if whole else oiio.FLOAT)
+        message = image_error(source)
+        source.close()
+        if numbers is None:
+            raise DyngsError(f"{path}: the image is truncated or damaged ({message}); copy it again")
+        return numbers.reshape(spec.height, spec.width, spec.nchannels).astype(np.float32), whole
+
+
+def read_mask(path: Path) -> Tensor:
+    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half.
+
+    Raises:
+        DyngsError: as ``read_image``.
+    """
+    return read_image(path)[..., :3].float().mean(dim=-1) >= 127.5
+
+
+def check_image(path: Path) -> ImageHeader:
+    """Read the header and check that the file is very likely complete; a JPEG without end marker is decoded for that.
+
+    Raises:
+        DyngsError: the file is missing, truncated or no image.
+    """
+    header = read_header(path)
+    check_size(path, header.width, header.height, header.channels)
+    marker = _END_MARKERS.get(path.suffix.lower())
+    if marker:
+        with _reading(path), path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            complete = marker in file.read()
+        if not complete and marker == _PNG_END:  # not decoded: libpng would print lines of its own
+            raise DyngsError(f"{path}: the image is truncated or damaged (its end is missing); copy it again")
+        if not complete:
+            read_image(path)
+    return header
+
+
+def target_size(width: int, height: int, downscale: float = 1.0, longest_side: int | None = None) -> tuple[int, int]:
+    """Return (width, height) divided by ``downscale`` and shrunk to at most ``longest_side``; never enlarged."""
+    factor = max(1.0, downscale)
+    if longest_side is not None:
+        factor = max(factor, max(width, height) / longest_side)
+    return max(1, math.floor(width / factor + 0.5)), max(1, math.floor(height / factor + 0.5))
+
+
+def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
+    """Return a (height, width, D) image; each pixel is the exact mean of the area of ``pixels`` (H, W, D) it covers.
+
+    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered share.
+    """
+    return _shrink_axis(_shrink_axis(pixels, 0, _all_of(pixels.shape[0], height)), 1, _all_of(pixels.shape[1], width))
+
+
+def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
+    """Return ``straight_uint8(area_downscale(premultiplied(pixels), width, height))``, a strip of rows at a time.
+
+    A photo of 12 megapixels takes 0.6 GB as floats with what is computed from them, and strips fit into caches.
+    """
+    old = pixels.shape[0]
+    step, parts = max(1, _STRIP_PIXELS * height // (old * pixels.shape[1])), []
+    for begin in range(0, height, step):
+        end = min(begin + step, height)
+        first, last = begin * old // height, min(-(-end * old // height), old)
+        rows = premultiplied(pixels[first:last])
+        part = _shrink_axis(rows, 0, _Span(old, height, begin, end, first))
+        parts.append(straight_uint8(_shrink_axis(part, 1, _all_of(part.shape[1], width))))
+    return torch.cat(parts)
+
+
+def premultiplied(pixels: Tensor) -> Tensor:
+    """Return (H, W, 3 or 4) float32 in [0, 1] with colours multiplied by alpha, from uint8 straight alpha."""
+    scaled = pixels.float() / 255
+    if scaled.shape[-1] == 4:
+        scaled[..., :3] *= scaled[..., 3:]
+    return scaled
+
+
+def straight_uint8(pixels: Tensor) -> Tensor:
+    """Return (H, W, 3 or 4) uint8 with straight alpha from premultiplied floats; inverse of ``premultiplied``."""
+    if pixels.shape[-1] == 4:
+        alpha = pixels[..., 3:].clamp(0, 1)
+        rgb = torch.where(alpha > 0, pixels[..., :3] / alpha.clamp(min=1e-6), 0)
+        pixels = torch.cat([rgb, alpha], dim=-1)
+    return (pixels.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _open(path: Path) -> OpenImageIO.ImageInput:
+    import OpenImageIO as oiio
+
+    if not path.is_file():
+        raise DyngsError(f"{path}: no such image; restore it or remove it from the capture")
+    # Some readers of OpenImageIO allocate the image when they open the file.
+    oiio.attribute("limits:imagesize_MB", max_decoded_mb())
+    config = oiio.ImageSpec()
+    config["oiio:UnassociatedAlpha"] = 1
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        reason = image_error(oiio) or "unknown format"
+        raise DyngsError(f"{path}: cannot be read as an image ({reason}); copy or convert it again")
+    return source
+
+
+def _encode_linear(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """uint8 sRGB and alpha from linear premultiplied floats."""
+    rgb = np.nan_to_num(rgb, nan=0.0, posinf=1.0, neginf=0.0)
+    if alpha is not None:
+        alpha = np.clip(np.nan_to_num(alpha, nan=0.0), 0, 1)
+        rgb = np.where(alpha[..., None] > 0, rgb / np.maximum(alpha[..., None], 1e-6), 0)
+        alpha = np.round(alpha * 255).astype(np.uint8)
+    rgb = np.clip(rgb, 0, 1)
+    encoded = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * np.maximum(rgb, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.round(encoded * 255).astype(np.uint8), alpha
+
+
+@dataclass(frozen=True)
+class _Span:
+    """Part of an axis that shrinks from ``old`` to ``size``: outputs ``begin`` to ``end``, inputs from ``first`` on."""
+
+    old: int
+    size: int
+    begin: int
+    end: int
+    first: int
+
+
+def _all_of(old: int, size: int) -> _Span:
+    return _Span(old, size, 0, size, 0)
+
+
+def _shrink_axis(pixels: Tensor, axis: int, span: _Span) -> Tensor:
+    old, size = span.old, span.size
+    if size == old:
+        return pixels
+    if size > old:
+        raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
+    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the shares exact.
+    starts = torch.arange(span.begin, span.end + 1, device=pixels.device) * old
+    first = starts[:-1] // size
+    shape = [1] * pixels.ndim
+    shape[axis] = span.end - span.begin
+    total = pixels.new_zeros(1)
+    for tap in range(-(-old // size) + 1):
+        index = first + tap
+        begin = torch.maximum(index * size, starts[:-1])
+        end = torch.minimum((index + 1) * size, starts[1:])
+        fraction = ((end - begin).clamp(min=0).double() / old).to(pixels.dtype).reshape(shape)
+        inside = (index - span.first).clamp(max=pixels.shape[axis] - 1)
+        total = total + pixels.index_select(axis, inside) * fraction
+    return total

@@ -1,0 +1,193 @@
+"""Decoding of video files, through PyAV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from dyngs.errors import DyngsError, reading, reason
+from dyngs.files.containment import check_size
+from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
+
+if TYPE_CHECKING:
+    import av
+    from av.container import InputContainer
+
+MAX_FRAMES = 1_000_000
+"""Limit on the frames of one video: ten hours."""
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
+"""FFmpeg's names for files that hold images themselves, whatever their suffix says."""
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """Size, length and frame rate of a video.
+
+    Attributes:
+        width, height: pixels of an image, turned as the rotation tag says.
+        num_frames: images that there should be; those of a truncated file may not all be readable.
+        fps: mean images per second, 0 if the file does not say.
+    """
+
+    width: int
+    height: int
+    num_frames: int
+    fps: float
+
+
+def read_frames(path: Path) -> Iterator[np.ndarray]:
+    """Yield the frames of a video in order, (H, W, 3) uint8, rotated as its rotation tag says.
+
+    Raises:
+        DyngsError: no such file, no video in it, or damage (at the damaged place).
+    """
+    for _, frame in _decoded(path, "AUTO"):
+        yield _turned_rgb(frame)
+
+
+def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the frames of these ``numbers``, counted from 0, in ascending order, as ``read_frames`` does.
+
+    One image is in memory at a time. Nothing behind the last wanted one is decoded; unwanted ones before it are (each
+    image builds on others), but not converted.
+
+    Raises:
+        DyngsError: as ``read_frames``; a wanted image is damaged or missing: names its number.
+    """
+    wanted = set(numbers)
+    left = len(wanted)
+    index = -1
+    for index, frame in _decoded(path) if left else ():
+        if index not in wanted:
+            continue
+        if frame.is_corrupt:
+            raise _broken(path, index, "its data is damaged")
+        yield index, _turned_rgb(frame)
+        left -= 1
+        if left == 0:
+            return
+    if left:
+        raise _broken(path, index + 1, "the video ends there")
+
+
+def probe_video(path: Path) -> VideoInfo:
+    """Read size, length and frame rate of a video; the first frame is decoded, and the packets are counted.
+
+    Raises:
+        DyngsError: no such file, no video in it, or damage at its beginning.
+    """
+    from av.error import FFmpegError
+
+    first = next((frame for _, frame in _decoded(path)), None)
+    if first is None:
+        raise _broken(path, 0, "it holds no image")
+    height, width = _turned_rgb(first).shape[:2]
+    counted = hidden = 0
+    with _reading(path), opened_video(path) as container:
+        stream = container.streams.video[0]
+        promised, fps = stream.frames, float(stream.average_rate or 0)
+        try:
+            for packet in container.demux(stream):
+                counted += packet.size > 0
+                hidden += packet.size > 0 and packet.is_discard  # cut off by an edit list: never shown
+        except FFmpegError:
+            pass  # truncated: what the header promises is what there should be
+    count = max(promised, counted) - hidden
+    if count > MAX_FRAMES:
+        raise DyngsError(f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up")
+    return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0)
+
+
+def frame_seconds(path: Path, num_frames: int) -> list[float]:
+    """Return the second at which each of the first ``num_frames`` frames is shown, the first one at 0.
+
+    Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or too few, the mean
+    rate does, and 30 frames per second where the file names none either.
+
+    Raises:
+        DyngsError: as ``probe_video``.
+    """
+    from av.error import FFmpegError
+
+    stamps: list[float] = []
+    with _reading(path), opened_video(path) as container:
+        stream = container.streams.video[0]
+        fps = float(stream.average_rate or 0) or 30.0
+        try:
+            for packet in container.demux(stream):
+                if packet.size > 0 and not packet.is_discard and packet.pts is not None and packet.time_base:
+                    stamps.append(float(packet.pts * packet.time_base))
+        except FFmpegError:
+            pass  # truncated: the frames up to there have their stamps
+    shown = sorted(stamps)[:num_frames]
+    if len(shown) < num_frames or len(set(shown)) < num_frames:
+        return [number / fps for number in range(num_frames)]
+    return [stamp - shown[0] for stamp in shown]
+
+
+def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterator[tuple[int, av.VideoFrame]]:
+    """Yield number and frame, in order; damage is an error that names the frame.
+
+    With "AUTO", which is faster, several frames are decoded at once, and damage takes those before it along.
+    """
+    from av.error import FFmpegError
+
+    if not path.is_file():
+        raise DyngsError(f"no such video file: {path}")
+    index = 0
+    with _reading(path):
+        try:
+            with opened_video(path) as container:
+                stream = container.streams.video[0]
+                stream.thread_type = threads
+                for frame in container.decode(stream):
+                    if (frame.width, frame.height) != (stream.width, stream.height):
+                        check_size(path, frame.width, frame.height)
+                    yield index, frame
+                    index += 1
+        except FFmpegError as error:
+            if index == 0:
+                raise DyngsError(f"cannot read the video {path}: {error.strerror or reason(error)}") from error
+            raise _broken(path, index, error.strerror or reason(error)) from error
+
+
+@contextmanager
+def opened_video(path: Path) -> Iterator[InputContainer]:
+    """Open the file for PyAV, which must contain the video itself: playlists, which name other files, are refused.
+
+    Raises:
+        DyngsError: no video in it, or one larger than ``data.max_megapixels``.
+        FFmpegError: damage.
+    """
+    import av
+
+    options = {"protocol_whitelist": "file", "format_whitelist": _CONTAINERS}
+    # Titles may be in any encoding.
+    with av.open(f"file:{path}", options=options, metadata_errors="replace") as container:
+        if not container.streams.video:
+            raise DyngsError(f"{path} has no video stream")
+        stream = container.streams.video[0]
+        check_size(path, stream.width, stream.height)
+        yield container
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    return reading(path, "it must be a video; copy or convert it again")
+
+
+def _broken(path: Path, index: int, why: str) -> DyngsError:
+    return DyngsError(
+        f"the video {path} breaks at frame {index} ({why}); copy it again, or choose data.frames without that part"
+    )
+
+
+def _turned_rgb(frame: av.VideoFrame) -> np.ndarray:
+    rgb = frame.to_ndarray(format="rgb24")
+    quarter_turns = round(getattr(frame, "rotation", 0) / 90) % 4
+    return np.ascontiguousarray(np.rot90(rgb, quarter_turns))

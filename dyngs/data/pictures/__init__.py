@@ -1,1 +1,0 @@
-"""Pictures and videos: decoding, lens undistortion, silhouettes, the cache of video frames."""

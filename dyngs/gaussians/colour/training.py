@@ -1,0 +1,247 @@
+"""Training of colours: one class per ``colour.kind``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from dyngs.config import AutoColour, ColourSection, NetworkColour
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import ColourNetwork
+from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
+from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.initialisation import glorot
+from dyngs.ops.adam import Count
+from dyngs.ops.perceptron import Layer
+from dyngs.ops.shading import num_inputs
+from dyngs.state import Role, State, StateTensor
+from dyngs.tensor_checks import require_tensor
+
+_MILESTONES = (1 / 6, 1 / 2, 5 / 6)
+"""Fractions of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k steps)."""
+HELD_OUT_EVERY = 8
+_HELD_OUT = 5
+"""Index, in each eight views, of the one that is held out."""
+
+
+@dataclass(frozen=True)
+class TrainingLooks:
+    """The training views as the scene is drawn for them now.
+
+    Attributes:
+        indices: of the views that may be trained on.
+        views: those of some indices, one at a time.
+        options: how to draw.
+        background: (3,) colour.
+    """
+
+    indices: Sequence[int]
+    views: Callable[[Sequence[int]], Iterator[MeasuredView]]
+    options: RenderOptions
+    background: Tensor
+
+
+@dataclass(frozen=True)
+class HarmonicsDropped:
+    """Gaussians whose harmonics are dropped for good.
+
+    Attributes:
+        text: what was found, for people.
+        rows: (N,) bool, those without harmonics from now on; None: all keep theirs.
+        offsets: (N, 3) colour to add to their base.
+    """
+
+    text: str
+    rows: Tensor | None = None
+    offsets: Tensor | None = None
+
+
+class ColourTraining:
+    """Harmonics as they are stored: nothing to learn beside them."""
+
+    def __init__(self, options: ColourSection) -> None:
+        self.entropy_weight = options.opacity_entropy
+
+    @property
+    def network(self) -> ColourNetwork | None:
+        """The colour network; None where the harmonics give the colours."""
+        return None
+
+    @property
+    def learned(self) -> Parameters | None:
+        """What ``optimize`` updates; None: nothing."""
+        return None
+
+    def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
+        """Return differentiable regularizers, weighted, by name."""
+        if self.entropy_weight == 0:
+            return {}
+        return {"opacity entropy": self.entropy_weight * opacity_entropy(gaussians.logit_opacities)}
+
+    def holds_out(self, index: int, step: int) -> bool:
+        """Return whether training view ``index`` must not be trained on in ``step``."""
+        return False
+
+    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> HarmonicsDropped | None:
+        """Measure, if due after ``step``, whose harmonics improve images, and drop the others."""
+        return None
+
+    def frozen_rest(self) -> Tensor | None:
+        """Return (N,) bool, Gaussians whose harmonics stay zero but for the base colour; None: of none."""
+        return None
+
+    def follow(self, edit: TopologyEdit) -> None:
+        """Follow a change of the set of Gaussians."""
+
+    def optimize(self, step: int) -> Count:
+        """Update what is learned beside the harmonics, and return the number of rows left out for bad gradients."""
+        return 0
+
+    def place(self, device: torch.device) -> None:
+        """Go on on ``device``."""
+
+    def state(self) -> State:
+        """Return the tensors that a checkpoint must hold beside the scene's colours."""
+        return {}
+
+    def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
+        """Take over the state of the scene's colours and of ``state``, for N Gaussians.
+
+        Raises:
+            KeyError: a tensor is missing.
+            ValueError: one is not as it must be.
+        """
+
+
+class NetworkTraining(ColourTraining):
+    """A network that all Gaussians share, learned by Adam.
+
+    Args:
+        options: size and rate.
+        steps: length of the run.
+        box: (2, 3), see ``ColourNetwork``.
+        generator: of the first weights.
+        sees_time: time is an input.
+    """
+
+    def __init__(
+        self, options: NetworkColour, steps: int, box: Tensor, generator: torch.Generator, *, sees_time: bool
+    ) -> None:
+        super().__init__(options)
+        self.options, self.steps, self.box, self.sees_time = options, steps, box, sees_time
+        inputs = num_inputs(sees_time=sees_time, sees_normals=options.normals)
+        values = _start_values([inputs, *[options.width] * options.depth, 3], generator)
+        self.parameters = Parameters(values, dict.fromkeys(values, options.lr))
+
+    @property
+    def network(self) -> ColourNetwork:
+        count = self.options.depth + 1
+        layers = (Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count))
+        return ColourNetwork(tuple(layers), self.box, self.sees_time, self.options.normals)
+
+    @property
+    def learned(self) -> Parameters:
+        return self.parameters
+
+    def optimize(self, step: int) -> Count:
+        return self.parameters.update(step, rate_factor(step, self.steps, self.options.warm_up))
+
+    def place(self, device: torch.device) -> None:
+        self.box, self.parameters = self.box.to(device), self.parameters.to(device)
+
+    def state(self) -> State:
+        return {name: x for name, x in self.parameters.state().items() if x.role is Role.TRAINING}
+
+    def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
+        self.box = require_tensor("box", tensors["box"], (2, 3), None)
+        self.parameters = self.parameters.restored(tensors)
+
+
+class AutoTraining(ColourTraining):
+    """Harmonics for all Gaussians at first, later only for those where they are measured to improve images.
+
+    Args:
+        options: when, and what may be given away.
+        steps: length of the run.
+        num_views: training views.
+    """
+
+    def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
+        super().__init__(options)
+        self.tolerance = options.tolerance
+        self.measured_after = min(max(1, round(options.measure_at * steps)), steps)
+        self.held_out = tuple(range(_HELD_OUT, num_views, HELD_OUT_EVERY))
+        self._frozen: Tensor | None = None
+
+    def holds_out(self, index: int, step: int) -> bool:
+        """Return true for every eighth view, until the harmonics are measured on them."""
+        return step <= self.measured_after and index in self.held_out
+
+    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> HarmonicsDropped | None:
+        if step != self.measured_after or not self.held_out:
+            return None
+        views = looks()
+        seen = [i for i in views.indices if i not in self.held_out]
+        held_out = [i for i in views.indices if i in self.held_out]
+        if not seen or not held_out:
+            return HarmonicsDropped(
+                "too few views are trained on as yet to measure where view dependence pays: all harmonics stay"
+            )
+        judged = list(views.views(held_out))
+        found = find_view_dependent(views.views(seen), judged, views.options, views.background, self.tolerance)
+        self.freeze(~found.keeps)
+        return HarmonicsDropped(str(found), ~found.keeps, found.offsets)
+
+    def freeze(self, frozen: Tensor) -> None:
+        """Keep the harmonics of the Gaussians ``frozen`` (N,) zero from now on."""
+        self._frozen = None if bool(frozen.all()) else frozen
+
+    def frozen_rest(self) -> Tensor | None:
+        return self._frozen
+
+    def follow(self, edit: TopologyEdit) -> None:
+        if self._frozen is not None:
+            self._frozen = edit.apply(self._frozen)
+
+    def place(self, device: torch.device) -> None:
+        self._frozen = None if self._frozen is None else self._frozen.to(device)
+
+    def state(self) -> State:
+        return {} if self._frozen is None else {"frozen": StateTensor(self._frozen, Role.TRAINING)}
+
+    def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
+        frozen = tensors.get("frozen")
+        self._frozen = None if frozen is None else require_tensor("frozen", frozen, (count,), torch.bool)
+
+
+def opacity_entropy(logits: Tensor) -> Tensor:
+    """Return the mean of -o ln o over opacities o with ``logits`` (N,), of which there may be none (Zhang et al. 2024).
+
+    It is largest at o = 1/e: what is fainter is pushed towards 0, what is more opaque towards 1. The gradient by a
+    logit, -(ln o + 1) o (1 - o), is finite everywhere.
+    """
+    if not len(logits):
+        return logits.sum()
+    return -(logits.sigmoid() * logsigmoid(logits)).mean()
+
+
+def rate_factor(step: int, steps: int, warm_up: int) -> float:
+    """Return the factor on the rate of ``step``, from 1: a linear warm-up, then a third after each milestone."""
+    passed = sum(step > fraction * steps for fraction in _MILESTONES)
+    return min(1.0, step / warm_up) / 3**passed
+
+
+def _start_values(widths: list[int], generator: torch.Generator) -> dict[str, Tensor]:
+    """Return Glorot weights and zero biases; the last layer is all zero, so that nothing is added at first."""
+    values: dict[str, Tensor] = {}
+    for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
+        weight = glorot(fan_in, fan_out, generator)
+        values[f"weight{i}"] = torch.zeros_like(weight) if i == len(widths) - 2 else weight
+        values[f"bias{i}"] = torch.zeros(fan_out, device=weight.device)
+    return values

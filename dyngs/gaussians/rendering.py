@@ -1,0 +1,301 @@
+"""Rendering of Gaussians: images, and what each Gaussian contributes to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.ops.finite import check_finite, finite_rows
+from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.options import check_choice, check_count
+from dyngs.ops.projection import Projection, ProjectionOptions, project
+from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
+
+FOCAL_LENGTHS = (1e-6, 1e12)
+"""Smallest and largest allowed, px; beyond them gradients leave the range of float32."""
+
+Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
+"""Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour models other than
+harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but must be finite."""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Settings of a render.
+
+    Attributes:
+        near, far: centres outside are culled, world units (3DGS: 0.2).
+        eps2d: 2D low-pass variance, px^2 (3DGS: 0.3; Mip-Splatting: 0.1).
+        mode: classic, or antialiased (opacity compensated for the low-pass).
+        sh_degree: highest degree used; None = that of the Gaussians.
+        alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
+        depth: none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha).
+        absgrad: fill the absolute part of the probe's gradient.
+        nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or it is not looked
+            for (``trust``; the trainer does this, because its optimizer never writes such values).
+
+    Raises:
+        DyngsError: a number that is negative, NaN or beyond its range, or a choice that does not exist.
+    """
+
+    near: float = 0.2
+    far: float = 1e10
+    eps2d: float = 0.3
+    mode: RasterizeMode = RasterizeMode.CLASSIC
+    sh_degree: int | None = None
+    alpha_min: float = 1 / 255
+    alpha_max: float = 0.99
+    transmittance_min: float = 1e-4
+    depth: Literal["none", "accumulated", "expected"] = "none"
+    absgrad: bool = False
+    nonfinite: Literal["error", "skip", "trust"] = "error"
+
+    def __post_init__(self) -> None:
+        check_choice("mode", self.mode, [mode.value for mode in RasterizeMode])
+        check_choice("depth", self.depth, ("none", "accumulated", "expected"))
+        check_choice("nonfinite", self.nonfinite, ("error", "skip", "trust"))
+        if self.sh_degree is not None:
+            check_count("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
+        _ = self.projection, self.blending  # making them checks the numbers
+
+    @property
+    def projection(self) -> ProjectionOptions:
+        """The part that concerns the projection."""
+        antialiased = self.mode == RasterizeMode.ANTIALIASED
+        return ProjectionOptions(self.eps2d, self.near, self.far, self.alpha_min, antialiased=antialiased)
+
+    @property
+    def blending(self) -> BlendOptions:
+        """The part that concerns the blending."""
+        return BlendOptions(self.alpha_min, self.alpha_max, self.transmittance_min, self.absgrad)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """V rendered images.
+
+    Attributes:
+        rgb: (V, H, W, 3), background composited; not clamped above 1.
+        transmittance: (V, H, W) in [0, 1], the fraction of the background that is seen.
+        depth: (V, H, W) view-space z in world units, or None; 0 where nothing is drawn.
+        radii: (V, N, 2) int32 half extents in px, 0 = not drawn.
+    """
+
+    rgb: Tensor
+    transmittance: Tensor
+    depth: Tensor | None
+    radii: Tensor
+
+    @property
+    def alpha(self) -> Tensor:
+        """Return (V, H, W) opacities of the images, in [0, 1]."""
+        return 1 - self.transmittance
+
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rendering:
+        """Return the same images on another device or in another precision; radii stay integers."""
+        rgb, transmittance = (x.to(device=device, dtype=dtype) for x in (self.rgb, self.transmittance))
+        depth = None if self.depth is None else self.depth.to(device=device, dtype=dtype)
+        return Rendering(rgb, transmittance, depth, self.radii.to(device=device))
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    options: RenderOptions = RenderOptions(),
+    *,
+    background: Tensor | None = None,
+    probe: Tensor | None = None,
+    shader: Shader | None = None,
+) -> Rendering:
+    """Return images of the Gaussians from every camera (Kerbl et al. 2023).
+
+    Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the probe and what the
+    shader computes.
+
+    Args:
+        gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).
+        cameras: V cameras, on the device of the Gaussians.
+        options: settings.
+        background: (3,) or (V, 3) colour; None = black.
+        probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
+        shader: gives the colours; None: the Gaussians' harmonics do.
+
+    Raises:
+        DyngsError: NaN or infinite input (names the argument and the count), focal lengths that are not positive, a
+            background or probe of another shape, cameras on another device than the Gaussians, or a render too large
+            for memory.
+    """
+    gaussians, cameras = _checked(gaussians, cameras, background, options)
+    if probe is not None and probe.shape != (len(cameras), len(gaussians), 4):
+        raise DyngsError(f"probe must be ({len(cameras)}, {len(gaussians)}, 4), got {tuple(probe.shape)}")
+    projection, opacities = _project(gaussians, cameras, options)
+    colors = _colors(gaussians, cameras, projection.radii, options, shader)
+    if options.nonfinite != "trust":
+        colors = _finite_colors(colors, options.nonfinite)
+    if background is not None:
+        background = background.to(colors).expand(len(cameras), 3)
+    if options.depth != "none":
+        colors, background = _with_depth(colors, projection.depths, background, weights=_needs_weights(options))
+    size = (cameras.width, cameras.height)
+    blended = rasterize(
+        projection, opacities, colors, size, background=background, probe=probe, options=options.blending
+    )
+    depth = None
+    if options.depth != "none":
+        depth = blended.color[..., 3]
+        if options.depth == "expected":
+            alpha = blended.color[..., 4] if _needs_weights(options) else 1 - blended.transmittance
+            depth = depth / torch.where(alpha > 0, alpha, 1.0)
+    return Rendering(blended.color[..., :3], blended.transmittance, depth, projection.radii)
+
+
+def _needs_weights(options: RenderOptions) -> bool:
+    """Return whether alpha is summed from the weights, one more channel to blend, instead of 1 - transmittance.
+
+    Below 1/255 the latter has fewer than four digits left.
+    """
+    return options.depth == "expected" and options.alpha_min < 1 / 255
+
+
+def _with_depth(
+    colors: Tensor, depths: Tensor, background: Tensor | None, *, weights: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Return channels (V, N, D) with depth appended, and 1 if the sum of ``weights`` is wanted, on backgrounds of 0."""
+    more = [depths[..., None]] + ([torch.ones_like(depths)[..., None]] if weights else [])
+    if background is not None:
+        background = torch.nn.functional.pad(background, (0, len(more)))
+    return torch.cat([colors, *more], dim=-1), background
+
+
+def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:
+    """Return the (V, N) sums over pixels of each Gaussian's blending weight: its fraction of every image.
+
+    Raises:
+        DyngsError: as ``render``.
+    """
+    gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
+    projection, opacities = _project(gaussians, cameras, options)
+    return tally(projection, opacities, (cameras.width, cameras.height), Tally.WEIGHTS, options.blending)
+
+
+def sensitivities(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    options: RenderOptions = RenderOptions(),
+    *,
+    background: Tensor | None = None,
+    shader: Shader | None = None,
+) -> Tensor:
+    """Return the (V, N) sums over pixels of (dI/dG)^2 (Tu et al. 2026).
+
+    I is the sum of a pixel's channels, G the value of the 2D Gaussian there.
+
+    Raises:
+        DyngsError: as ``render``.
+    """
+    gaussians, cameras = _checked(gaussians.detach(), cameras, background, options)
+    projection, opacities = _project(gaussians, cameras, options)
+    colors = _colors(gaussians, cameras, projection.radii, options, shader)
+    if background is not None:
+        background = background.to(colors).expand(len(cameras), 3)
+    size, kind = (cameras.width, cameras.height), Tally.SQUARED_SLOPES
+    return tally(projection, opacities, size, kind, options.blending, colors=colors, background=background)
+
+
+def _colors(
+    gaussians: Gaussians, cameras: Cameras, radii: Tensor, options: RenderOptions, shader: Shader | None
+) -> Tensor:
+    """Return the colours (V, N, 3)."""
+    if shader is not None:
+        return shader(gaussians, cameras, radii)
+    degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
+    return evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, radii, degree)
+
+
+def _finite_colors(colors: Tensor, policy: str) -> Tensor:
+    """Return ``colors`` with overflow dealt with: they may overflow though all that they come from is finite."""
+    if policy == "error":
+        check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
+        return colors
+    return torch.where(colors.isfinite(), colors, torch.zeros_like(colors))
+
+
+def _project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Projection, Tensor]:
+    opacities = gaussians.opacities
+    projection = project(gaussians.means, gaussians.quats, gaussians.scales, opacities, cameras, options.projection)
+    per_view = opacities.expand(len(cameras), -1)
+    if options.mode == RasterizeMode.ANTIALIASED:
+        per_view = per_view * projection.compensations
+    return projection, per_view
+
+
+def _one_dtype(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+    dtype = torch.float64 if gaussians.means.dtype == torch.float64 else torch.float32
+    if any(x.dtype != dtype for x in gaussians.tensors().values()):
+        gaussians = gaussians.replace(**{name: x.to(dtype) for name, x in gaussians.tensors().items()})
+    if cameras.cam_from_world.dtype != dtype or cameras.intrinsics.dtype != dtype:
+        cameras = cameras.to(dtype=dtype)
+    return gaussians, cameras
+
+
+def _checked(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
+) -> tuple[Gaussians, Cameras]:
+    """Return both in one dtype, with NaN and infinity dealt with as ``options`` say."""
+    if background is not None and tuple(background.shape) not in ((3,), (len(cameras), 3)):
+        raise DyngsError(f"background must be (3,) or ({len(cameras)}, 3), got {tuple(background.shape)}")
+    if cameras.cam_from_world.device != gaussians.means.device:
+        devices = f"the cameras are on {cameras.cam_from_world.device}, the Gaussians on {gaussians.means.device}"
+        raise DyngsError(f"{devices}; move one of them with .to(device=...)")
+    gaussians, cameras = _one_dtype(gaussians, cameras)
+    if options.nonfinite != "trust":
+        _check_views(cameras, background)
+        gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
+    return gaussians, cameras
+
+
+def _check_views(cameras: Cameras, background: Tensor | None) -> None:
+    check_finite({"cam_from_world": cameras.cam_from_world, "intrinsics": cameras.intrinsics})
+    check_focal_lengths(cameras.intrinsics)
+    if background is not None:
+        check_finite({"background": background.to(cameras.intrinsics.dtype)})
+
+
+def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
+    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``.
+
+    Raises:
+        DyngsError: naming the first camera whose focal lengths do not.
+    """
+    focal, (shortest, longest) = intrinsics.detach().diagonal(dim1=1, dim2=2)[:, :2], FOCAL_LENGTHS
+    bad = torch.nonzero(~((focal >= shortest) & (focal <= longest)).all(1))[:, 0]
+    if len(bad):
+        fx, fy = (float(x) for x in focal[bad[0]])
+        wanted = f"{name}: focal lengths must be positive, from {shortest:g} to {longest:g} px"
+        raise DyngsError(f"{wanted}, but camera {int(bad[0])} has {fx:g} and {fy:g}")
+
+
+def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
+    # log_scales can be finite and the scales not: from 88.8 in float32
+    watched = {**gaussians.tensors(), "exp(log_scales)": gaussians.scales.detach()}
+    if policy == "error":
+        check_finite(watched, 'clean the input, or render with nonfinite="skip" to leave these Gaussians out')
+        return gaussians
+    keep = finite_rows(list(watched.values()))
+    if bool(keep.all()):
+        return gaussians
+    cleaned: dict[str, Tensor] = {}
+    for name, x in gaussians.tensors().items():
+        mask = keep.view(-1, *[1] * (x.ndim - 1))
+        cleaned[name] = torch.where(mask, x, torch.zeros_like(x))
+    hidden = torch.full_like(gaussians.logit_opacities, -1e4)  # opacity exactly 0: culled, no gradient
+    cleaned["logit_opacities"] = torch.where(keep, cleaned["logit_opacities"], hidden)
+    return Gaussians(**cleaned)

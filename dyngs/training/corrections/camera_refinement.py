@@ -1,0 +1,250 @@
+"""Refinement of the training cameras while the scene is trained: poses, focal lengths and principal points.
+
+Poses found from images are wrong by some pixels now and then, which blurs the scene. The rasterizer's gradients say
+how each camera should move (as in BARF, Lin et al. 2021). Scene and cameras together could move, turn and grow without
+any change of the images; corrections never contain such a common motion, so that test cameras stay where they are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.adam import AdamState
+from dyngs.camera import Cameras
+from dyngs.data.capture import View
+from dyngs.ops.adam import Count, adam_step_
+from dyngs.ops.quaternions import rotation_matrices
+from dyngs.tensor_checks import require_tensor
+
+STARTS = 0.05
+"""Fraction of the run in which cameras stay as they are: a scene that is not there yet says nothing about them."""
+FIRST_RATE, LAST_RATE = 3e-3, 1e-5
+"""Learning rates after ``STARTS`` and at the end, rad, and as a fraction of the scene's size; log-linear between."""
+LENS_RATE = 0.01
+"""Rate of focal lengths and principal points, as a fraction of that of poses: a lens is updated in every step."""
+LENS_STARTS = 0.3
+"""Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share."""
+MIN_POSES = 8
+"""Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is."""
+POSES, LENSES = "poses", "lenses"
+
+
+class CameraCorrections:
+    """Small corrections of the cameras of V views, at first none.
+
+    A camera that stands still has one correction for all its views, and so has a lens that several views share.
+
+    Args:
+        views: V views.
+        size: of the scene, world units: the unit of translations.
+
+    Attributes:
+        poses: (P, 6) rotation vectors, rad, and translations in units of ``size``, both in the camera's frame.
+        lenses: (L, 3) logarithms of the factors of the focal lengths, and shifts of the principal points as fractions
+            of the focal lengths.
+    """
+
+    def __init__(self, views: Sequence[View], size: float) -> None:
+        self.size = size
+        self._pose_of, self._pose_rows = _numbered([_pose_key(view) for view in views])
+        self._lens_of, self._lens_rows = _numbered([_lens_key(view) for view in views])
+        poses_of_lens = Counter(lens for lens, _ in set(zip(self._lens_of, self._pose_of, strict=True)))
+        self._refines_lens = [poses_of_lens[i] >= MIN_POSES for i in range(len(poses_of_lens))]
+        self.poses = torch.zeros(max(self._pose_of) + 1, 6, device="cpu")
+        self.lenses = torch.zeros(len(poses_of_lens), 3, device="cpu")
+        self._common = common_motions([views[self._pose_of.index(i)] for i in range(len(self.poses))], size)
+
+    def rows(self, index: int) -> tuple[int, int | None]:
+        """Return the row of the pose of view ``index``, and that of its lens; None where that is not refined."""
+        lens = self._lens_of[index]
+        return self._pose_of[index], lens if self._refines_lens[lens] else None
+
+    def applied(self, index: int, cameras: Cameras) -> Cameras:
+        """Return ``cameras``, that of an image of view ``index`` at any scale, corrected."""
+        pose, lens = self.rows(index)
+        return corrected(cameras, self.poses[pose], None if lens is None else self.lenses[lens], self.size)
+
+    def applied_to(self, view: View, cameras: Cameras) -> Cameras:
+        """Return ``cameras``, that of an image of any view of the capture, with what is known of it.
+
+        A view that was not trained on has the pose of a camera that stands still, or a lens, as training found it.
+        """
+        pose, lens = self._pose_rows.get(_pose_key(view)), self._lens_rows.get(_lens_key(view))
+        own = torch.zeros(6, device="cpu") if pose is None else self.poses[pose]
+        return corrected(
+            cameras, own, None if lens is None or not self._refines_lens[lens] else self.lenses[lens], self.size
+        )
+
+    def corrected_view(self, view: View) -> View:
+        """Return ``view`` with its camera as ``applied_to`` has it, in float64."""
+        pose, lens = (torch.from_numpy(x).double()[None] for x in (view.cam_from_world, view.intrinsics))
+        camera = self.applied_to(view, Cameras(pose, lens, view.width, view.height))
+        return replace(view, cam_from_world=camera.cam_from_world[0].numpy(), intrinsics=camera.intrinsics[0].numpy())
+
+    def remove_common_motion(self) -> None:
+        """Remove from the corrections how all cameras together move, turn and grow."""
+        flat = self.poses.view(-1)
+        flat -= self._common @ (self._common.T @ flat)
+
+
+def corrected(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) -> Cameras:
+    """Return the camera ``cameras`` (V = 1) with the corrections ``pose`` (6,) and ``lens`` (3,); differentiable.
+
+    Args:
+        cameras: of any scale.
+        pose, lens: as the rows of ``CameraCorrections``.
+        size: unit of translations.
+    """
+    pose = pose.to(cameras.cam_from_world)
+    rotation = rotation_matrices(torch.cat([pose.new_ones(1), pose[:3] / 2]))  # by |pose| up to its cube
+    last = pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+    motion = torch.cat([torch.cat([rotation, size * pose[3:, None]], 1), last])
+    intrinsics = cameras.intrinsics
+    if lens is not None:
+        lens = lens.to(intrinsics)
+        factor, zero = lens[0].exp(), torch.zeros_like(lens[0])
+        rows = [factor, zero, lens[1], zero, factor, lens[2], zero, zero, torch.ones_like(zero)]
+        intrinsics = intrinsics @ torch.stack(rows).view(3, 3)
+    return Cameras(motion @ cameras.cam_from_world, intrinsics, cameras.width, cameras.height)
+
+
+def watched(cameras: Cameras) -> Cameras:
+    """Return ``cameras`` as leaf tensors that collect gradients."""
+    pose, intrinsics = (x.detach().clone().requires_grad_() for x in (cameras.cam_from_world, cameras.intrinsics))
+    return Cameras(pose, intrinsics, cameras.width, cameras.height)
+
+
+def slopes(cameras: Cameras, by_pose: Tensor, by_intrinsics: Tensor, size: float) -> tuple[Tensor, Tensor]:
+    """Return the gradients (6,) and (3,) by a further small correction of the pose and of the lens.
+
+    Args:
+        cameras: one camera.
+        by_pose, by_intrinsics: (1, 4, 4) and (1, 3, 3) gradients by its two parts.
+        size: unit of translations.
+    """
+    columns, forces = cameras.cam_from_world.detach()[0, :3], by_pose[0, :3]  # both (3, 4)
+    turn = torch.linalg.cross(columns, forces, dim=0).sum(1)
+    pull = by_intrinsics[0] * cameras.intrinsics.detach()[0]
+    focal = cameras.intrinsics.detach()[0].diagonal()[:2]
+    lens = torch.cat([pull.diagonal()[:2].sum()[None], by_intrinsics[0, :2, 2] * focal])
+    return torch.cat([turn, size * forces[:, 3]]), lens
+
+
+def common_motions(views: Sequence[View], size: float) -> Tensor:
+    """Return an orthonormal basis (6 P, C), C at most 7, of those corrections of all poses that change no image.
+
+    They turn, shift and scale the scene with all its cameras; to first order.
+
+    Args:
+        views: P views of different poses.
+        size: unit of translations.
+    """
+    poses = np.stack([view.cam_from_world for view in views])
+    rotations, centers = poses[:, :3, :3], np.linalg.inv(poses)[:, :3, 3]
+    centers = (centers - centers.mean(0)) / size
+    columns = np.zeros((len(views), 6, 7))
+    columns[:, :3, :3] = -rotations
+    columns[:, 3:, :3] = rotations @ _cross_matrices(centers)
+    columns[:, 3:, 3:6] = -rotations
+    columns[:, 3:, 6] = -np.einsum("vij,vj->vi", rotations, centers)
+    basis, values, _ = np.linalg.svd(columns.reshape(-1, 7), full_matrices=False)
+    return torch.as_tensor(basis[:, values > 1e-9 * values[0]], dtype=torch.float32, device="cpu")
+
+
+def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices (V, 3, 3) that multiply a vector from the left by ``vectors`` (V, 3): cross products."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+
+
+def _pose_key(view: View) -> Hashable:
+    return view.cam_from_world.tobytes()
+
+
+def _lens_key(view: View) -> Hashable:
+    return view.intrinsics.tobytes(), view.width, view.height
+
+
+def _numbered(keys: Sequence[Hashable]) -> tuple[list[int], dict[Hashable, int]]:
+    """Return for each key the number of those equal to it, in order of their first appearance; and by key."""
+    numbers: dict[Hashable, int] = {}
+    return [numbers.setdefault(key, len(numbers)) for key in keys], numbers
+
+
+class CameraRefinement:
+    """Corrections of the training cameras, and their optimizer.
+
+    Args:
+        views: V training views.
+        size: of the scene, world units.
+        steps: of the run.
+    """
+
+    def __init__(self, views: Sequence[View], size: float, steps: int) -> None:
+        self.corrections = CameraCorrections(views, size)
+        self._steps = steps
+        self._adam = AdamState.zero(self._values())
+        self._updates = {
+            name: torch.zeros(len(x), dtype=torch.int64, device="cpu") for name, x in self._values().items()
+        }
+
+    @torch.no_grad()
+    def optimize(self, step: int, index: int, cameras: Cameras) -> Count:
+        """Update the corrections of view ``index``; return how many had gradients that are not finite.
+
+        A gradient is that by a further correction of the corrected camera; both are so small that they add.
+
+        Args:
+            step: that is being done.
+            index: of the view.
+            cameras: that of its image, from ``watched``, after the backward pass.
+        """
+        rate, left_out = self.rate(step), torch.zeros((), dtype=torch.int64, device="cpu")
+        by_pose, by_intrinsics = cameras.cam_from_world.grad, cameras.intrinsics.grad
+        if rate == 0 or by_pose is None or by_intrinsics is None:
+            return 0
+        gradients = slopes(cameras, by_pose, by_intrinsics, self.corrections.size)
+        rates = (rate, LENS_RATE * rate if step >= LENS_STARTS * self._steps else 0.0)
+        for name, row, gradient, lr in zip(self._values(), self.corrections.rows(index), gradients, rates, strict=True):
+            if row is not None and lr > 0:
+                arrays = self._values()[name], self._adam.exp_avg[name], self._adam.exp_avg_sq[name]
+                x, first, second = (a[row : row + 1] for a in arrays)
+                self._updates[name][row] += 1
+                left_out += adam_step_(
+                    x, gradient[None].to(x), first, second, lr=lr, step=int(self._updates[name][row])
+                )
+        self.corrections.remove_common_motion()
+        return left_out
+
+    def rate(self, step: int) -> float:
+        """Return the learning rate of the poses, see ``FIRST_RATE``; 0 before they begin."""
+        progress = (step / self._steps - STARTS) / (1 - STARTS)
+        if progress < 0:
+            return 0.0
+        return FIRST_RATE * (LAST_RATE / FIRST_RATE) ** min(progress, 1.0)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything that ``load_state`` needs."""
+        state = dict(self._values())
+        for name, updates in self._updates.items():
+            state |= {f"updates.{name}": updates}
+            state |= {f"exp_avg.{name}": self._adam.exp_avg[name], f"exp_avg_sq.{name}": self._adam.exp_avg_sq[name]}
+        return state
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Restore what ``state()`` returned. Raises KeyError, or ValueError for that of other views."""
+        for name, x in self._values().items():
+            x.copy_(require_tensor(name, state[name], tuple(x.shape), x.dtype))
+            stored = state[f"updates.{name}"]
+            self._updates[name] = require_tensor(f"updates.{name}", stored, (len(x),), torch.int64).clone()
+        self._adam = AdamState.restored(state, self._values())
+
+    def _values(self) -> dict[str, Tensor]:
+        return {POSES: self.corrections.poses, LENSES: self.corrections.lenses}

@@ -1,0 +1,168 @@
+"""A run that goes on to another number of steps: its configuration from there on, and what that means in words.
+
+All schedules become those of the new length, but what has begun keeps the step at which it did: nothing is begun twice,
+images do not become small again, and what was decided stays decided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dyngs.config import AutoColour, Config, DynamicModel, HumanModel, TrainConfig
+from dyngs.config.kinds import harmonics_measured_after, network_of
+from dyngs.deform.training import DeformSchedule
+from dyngs.errors import DyngsError
+from dyngs.static.rates import Rates
+from dyngs.training.corrections.exposure import WARM_UP
+from dyngs.training.schedule import (
+    PUBLISHED_STEPS,
+    deform_schedule,
+    hold_out_until,
+    means_rate,
+    motion_begins_after,
+    rates_of,
+    scaled,
+)
+
+MOST_FRACTION = 1 - 1e-9
+"""Largest fraction of a run, for keys that must be below 1."""
+
+
+@dataclass(frozen=True)
+class Length:
+    """A change of the length of a run.
+
+    Attributes:
+        done: steps done.
+        was: steps that the run had.
+        steps: that it shall have.
+    """
+
+    done: int
+    was: int
+    steps: int
+
+    def kept(self, step: int | float) -> float:
+        """Return the fraction of the new length at which ``step`` of the old one lies, at most 1."""
+        return min(step / self.steps, 1.0)
+
+    def share(self, fraction: float) -> float:
+        """Return the fraction of the new length for what began, or shall begin, after ``share`` of a run.
+
+        What has begun keeps its step; what should have begun by now, in a shorter run, begins with the next step.
+        """
+        if self.done >= round(fraction * self.was):
+            return self.kept(fraction * self.was)
+        return max(fraction, self.kept(self.done + 1)) if self.done >= round(fraction * self.steps) else fraction
+
+
+def with_length(config: Config, done: int, steps: int) -> Config:
+    """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no limit of time holds.
+
+    Args:
+        config: of the run so far.
+
+    Raises:
+        DyngsError: so many steps are done already, the run was pruned, or its motion began too early for that length.
+    """
+    length = Length(done, config.train.steps, steps)
+    if done > length.was:
+        raise DyngsError(
+            f"train.steps={steps}: the run was pruned after step {length.was:,}, so its training cannot be made "
+            "longer; go on with the run before that, and prune again"
+        )
+    if steps <= done:
+        raise DyngsError(f"train.steps={steps}: {done:,} steps are done already; give more than that")
+    _require_exposures_stay(config, length)
+    changed: dict[str, object] = {"train": _train(config.train, length)}
+    match config.model:
+        case DynamicModel():
+            changed["model"] = _dynamic(config, config.model, length)
+        case HumanModel():
+            fraction = length.share(config.model.refine_from)
+            changed["model"] = config.model.model_copy(update={"refine_from": fraction})
+        case _:
+            pass
+    match config.colour:
+        case AutoColour():
+            fraction = min(_fraction_of_measure(config, length), MOST_FRACTION)
+            changed["colour"] = config.colour.model_copy(update={"measure_at": fraction})
+        case _:
+            pass
+    return config.model_copy(update=changed)
+
+
+def _require_exposures_stay(config: Config, length: Length) -> None:
+    """Raise DyngsError where exposures were learned before a run of the new length begins with that."""
+    begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
+    if config.train.exposure == "always" and begun < length.done <= begins:
+        raise DyngsError(
+            f"train.steps={length.steps}: exposures were learned after {begun:,} steps, and a run of {length.steps:,} "
+            f"begins with that after {begins:,}; train anew with so many steps"
+        )
+
+
+def told(before: Config, after: Config, done: int) -> str:
+    """Return the line that says how a run goes on after ``done`` steps."""
+    was, steps = before.train.steps, after.train.steps
+    line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {steps:,} steps"
+    if network_of(after) is not None:
+        return line
+    then, now = (means_rate(c.optim, rates_of(c).progress(done), 1.0) for c in (before, after))
+    stop = scaled(after.strategy.stop, steps)
+    grows = after.strategy.growth_limit > 0 and stop > done + 1
+    line += f": the learning rate of positions is {now / then:.3g} times what it was, "
+    line += f"Gaussians are added up to step {stop:,}" if grows else "no more Gaussians are added"
+    return line + ("" if before.train.minutes is None else "; train.minutes holds no longer")
+
+
+def _train(options: TrainConfig, length: Length) -> TrainConfig:
+    """Return the section ``train``: images, harmonics and views held out go on where they are."""
+    changed: dict[str, object] = {"steps": length.steps, "minutes": None}
+    full_at = max(options.resolution_grows_from, options.resolution_full_at)
+    if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
+        changed["resolution_grows_from"] = length.kept(options.resolution_grows_from * length.was)
+        changed["resolution_full_at"] = length.kept(full_at * length.was)
+    if length.steps > length.was:
+        pace = scaled(options.sh_every, length.was)
+        changed["sh_every"] = max(1, pace * PUBLISHED_STEPS // length.steps)
+    if length.done >= hold_out_until(options):
+        changed["hold_out_every"] = 0
+    return options.model_copy(update=changed)
+
+
+def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicModel:
+    """Return the section ``model`` of a moving scene.
+
+    Raises:
+        DyngsError: motion began before a run of the new length lets anything move.
+    """
+    old = deform_schedule(model, Rates(length.was))
+    fractions = {"motion_from": _motion_from(old, model, length)}
+    if length.done >= old.opens:
+        fractions |= {"time_window_grows_from": length.kept(old.opens), "time_window_full_at": length.kept(old.full)}
+    changed = model.model_copy(update=fractions)
+    begins = motion_begins_after(config.model_copy(update={"model": changed}), length.steps)
+    if begins is not None and old.fine <= length.done < begins:
+        raise DyngsError(
+            f"train.steps={length.steps}: motion began after {old.fine:,} steps, and a run of {length.steps:,} trains "
+            f"{begins:,} before anything moves; train anew with so many steps"
+        )
+    return changed
+
+
+def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
+    """Return the share after which motion is learned: the step where it began, else one that is still to come."""
+    if length.done >= old.fine:
+        return length.kept(old.fine)
+    new = deform_schedule(model, Rates(length.steps))
+    return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from
+
+
+def _fraction_of_measure(config: Config, length: Length) -> float:
+    """Return the share after which harmonics are measured, likewise."""
+    longer = config.model_copy(update={"train": config.train.model_copy(update={"steps": length.steps})})
+    old, new = harmonics_measured_after(config) or 0, harmonics_measured_after(longer) or 0
+    if length.done >= old:
+        return length.kept(old)
+    return length.kept(length.done + 1) if new <= length.done else new / length.steps

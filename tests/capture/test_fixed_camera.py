@@ -1,0 +1,77 @@
+"""A folder of frames as a capture of one fixed camera: order, size, masks, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dyngs.capture.fixed_camera import FOCAL, is_plain_clip, read_fixed_camera, zoomed
+from dyngs.config import DataConfig
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
+
+
+def frames(folder: Path, count: int, size: tuple[int, int] = (12, 16), channels: int = 3) -> Path:
+    for i in range(count):
+        write_image(folder / f"f{i}.png", np.full((*size, channels), 10 * i, np.uint8))
+    return folder
+
+
+def test_frames_are_in_order_with_one_camera(tmp_path: Path) -> None:
+    capture = read_fixed_camera(DataConfig(root=frames(tmp_path / "c", 11)))
+    views = capture.splits["train"]
+    assert [view.name for view in views] == [f"f{i}" for i in range(11)]
+    assert [view.frame for view in views] == list(range(11))
+    assert (views[0].time, views[-1].time) == (0.0, 1.0)
+    assert views[3].intrinsics.tolist() == [[FOCAL * 16, 0, 8], [0, FOCAL * 16, 6], [0, 0, 1]]
+    assert not capture.has_alpha
+    assert "guessed" in capture.warnings[0]
+
+
+def test_frames_are_chosen_by_number_or_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = frames(tmp_path / "c" / "images", 9).parent
+    chosen = read_fixed_camera(DataConfig(root=root, frames="1:8:3")).splits["train"]
+    assert [view.name for view in chosen] == ["f1", "f4", "f7"]
+    monkeypatch.setattr("dyngs.capture.fixed_camera.MOST_FRAMES", 3)
+    spread = read_fixed_camera(DataConfig(root=root)).splits["train"]
+    assert [view.name for view in spread] == ["f0", "f3", "f6"]
+    with pytest.raises(DyngsError, match="selects none of 9 frames"):
+        read_fixed_camera(DataConfig(root=root, frames="20:"))
+
+
+def test_masks_are_named_as_images(tmp_path: Path) -> None:
+    root, masks = frames(tmp_path / "c", 3), frames(tmp_path / "m", 2, channels=1)
+    with pytest.raises(DyngsError, match=r"no mask for 1 of 3 images, first f2\.png"):
+        read_fixed_camera(DataConfig(root=root), masks)
+    capture = read_fixed_camera(DataConfig(root=root, frames=":2"), masks)
+    shown = capture.splits["train"][1].silhouette
+    assert capture.has_alpha
+    assert shown is not None
+    assert shown.path.name == "f1.png"
+    with pytest.raises(DyngsError, match="no such folder of masks"):
+        read_fixed_camera(DataConfig(root=root), tmp_path / "none")
+
+
+def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
+    root = frames(tmp_path / "c", 2)
+    write_image(root / "g.png", np.zeros((5, 6, 3), np.uint8))
+    with pytest.raises(DyngsError, match="has another size than f0"):
+        read_fixed_camera(DataConfig(root=root))
+
+
+def test_what_is_a_clip(tmp_path: Path) -> None:
+    assert is_plain_clip(frames(tmp_path / "c", 1))
+    assert not is_plain_clip(tmp_path)
+    assert not is_plain_clip(tmp_path / "missing.mp4")
+    (tmp_path / "a.mp4").touch()
+    assert is_plain_clip(tmp_path / "a.mp4")
+    with pytest.raises(DyngsError):
+        read_fixed_camera(DataConfig(root=tmp_path / "a.mp4"))
+
+
+def test_a_zoomed_camera_stands_back(tmp_path: Path) -> None:
+    view = read_fixed_camera(DataConfig(root=frames(tmp_path / "c", 1))).splits["train"][0]
+    far = zoomed(view, 2.0, 3.0)
+    point = view.cam_from_world @ np.array([0.4, 0.2, -3.0, 1.0])
+    before, after = view.intrinsics @ point[:3], far.intrinsics @ (far.cam_from_world @ [0.4, 0.2, -3.0, 1.0])[:3]
+    assert (after / after[2]).tolist() == pytest.approx((before / before[2]).tolist())

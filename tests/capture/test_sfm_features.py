@@ -1,0 +1,37 @@
+"""Features of frames: weak ones are left out where there are many."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from skimage.filters import gaussian
+
+from dyngs.capture.photos import Photo
+from dyngs.capture.sfm_features import FeatureTask, find_features
+from dyngs.conventions import report_nothing
+from dyngs.data.images.images import read_header
+from dyngs.files.write import write_image
+
+
+def test_weak_features_are_left_out_where_images_have_many(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    names = [f"{i}.png" for i in range(4)]
+    for name in names:
+        texture = gaussian(rng.random((96, 128)), 1.5)
+        write_image(tmp_path / "images" / name, np.repeat((texture - 0.2).clip(0, 1)[..., None], 3, 2))
+    photos = [Photo(name, read_header(tmp_path / "images" / name)) for name in names]
+    task = FeatureTask(
+        tmp_path / "all.db", tmp_path / "images", names, photos, None, "SIMPLE_RADIAL", True, 8192, 1600, 0, 1
+    )
+    assert find_features(task, report_nothing) == 1.0
+    with pycolmap.Database.open(task.database) as opened:
+        count = opened.num_keypoints() / len(names)
+    fewer = replace(task, database=tmp_path / "fewer.db", enough=int(count * 0.7))
+    stronger = find_features(fewer, report_nothing)
+    assert stronger > 1
+    with pycolmap.Database.open(fewer.database) as opened:
+        assert 0 < opened.num_keypoints() / len(names) <= 0.9 * count
+    assert find_features(replace(fewer, enough=10 * fewer.enough), report_nothing) == 1.0

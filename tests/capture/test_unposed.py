@@ -1,0 +1,127 @@
+"""Photos and videos that are given as captures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_captures import write_colmap
+
+from dyngs.capture import unposed
+from dyngs.capture.multi_video.estimate import VideosOptions, VideosResult
+from dyngs.capture.sfm import SfmOptions, SfmResult
+from dyngs.capture.unposed import with_poses
+from dyngs.config import DataConfig
+from dyngs.errors import DyngsError
+from dyngs.files.cache import cache_folder
+from dyngs.files.write import write_image
+from dyngs.output.video import VideoWriter
+
+
+@pytest.fixture(autouse=True)
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Structure from motion is not done; what it was asked for is listed."""
+    sources: list[Path] = []
+
+    def estimate(source: Path, out: Path, options: SfmOptions, report: object) -> SfmResult:
+        sources.append(source)
+        write_colmap(out)
+        return SfmResult(out, 3, 3, (), 8, 0.5)
+
+    def several(source: Path, out: Path, options: VideosOptions, report: object) -> VideosResult:
+        sources.append(source)
+        write_colmap(out)
+        return VideosResult(out, ())
+
+    monkeypatch.setattr(unposed, "estimate_poses", estimate)
+    monkeypatch.setattr(unposed, "poses_of_videos", several)
+    return sources
+
+
+def _photos(folder: Path, count: int = 3) -> Path:
+    for i in range(count):
+        write_image(folder / f"photo_{i}.png", np.full((4, 6, 3), i, np.uint8))
+    return folder
+
+
+def _videos(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    for i in range(count):
+        (folder / f"cam{i}.mp4").write_bytes(b"")
+    return folder
+
+
+def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
+    said: list[str] = []
+    data = DataConfig(root=_photos(tmp_path / "photos"))
+    first = with_poses(data, say=said.append)
+    assert cache_folder("poses") in first.root.parents
+    assert "estimated first" in said[0]
+    assert "3 of 3 images" in said[1]
+    assert with_poses(data, say=said.append) == first
+    assert asked == [tmp_path / "photos"]
+    assert "of before" in said[-1]
+    write_image(tmp_path / "photos" / "photo_1.png", np.zeros((4, 8, 3), np.uint8))
+    assert with_poses(data, say=said.append).root != first.root, "a photo has changed"
+    assert len(asked) == 2
+
+
+def test_masks_beside_the_images_are_no_photos(tmp_path: Path, asked: list[Path]) -> None:
+    _photos(tmp_path / "scan" / "images")
+    _photos(tmp_path / "scan" / "masks")
+    with_poses(DataConfig(root=tmp_path / "scan"), say=lambda _: None)
+    assert asked == [tmp_path / "scan" / "images"]
+
+
+def test_masks_that_come_later_give_new_poses(tmp_path: Path, asked: list[Path]) -> None:
+    data = DataConfig(root=tmp_path)
+    _photos(tmp_path / "images")
+    before = with_poses(data, say=lambda _: None)
+    _photos(tmp_path / "masks")
+    assert with_poses(data, say=lambda _: None).root != before.root
+    assert len(asked) == 2
+
+
+def test_a_video_gets_poses_and_has_times(tmp_path: Path, asked: list[Path]) -> None:
+    with VideoWriter(tmp_path / "clip.mp4", fps=10) as video:
+        for i in range(3):
+            video.add(np.full((16, 16, 3), 50 * i, np.uint8))
+    with_poses(DataConfig(root=tmp_path / "clip.mp4"), needs_times=True, say=lambda _: None)
+    assert asked == [tmp_path / "clip.mp4"]
+
+
+def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
+    data = DataConfig(root=_videos(tmp_path / "rig", 2))
+    first = with_poses(data, needs_times=True, say=lambda _: None)
+    assert with_poses(data, needs_times=True, say=lambda _: None) == first
+    assert asked == [tmp_path / "rig"]
+    (tmp_path / "rig" / "videos.json").write_text('{"starts": 0}')
+    assert with_poses(data, needs_times=True, say=lambda _: None).root != first.root, "offsets are given now"
+
+
+def test_captures_and_other_folders_stay_as_they_are(tmp_path: Path, asked: list[Path]) -> None:
+    write_colmap(tmp_path / "capture")
+    (tmp_path / "empty").mkdir()
+    for data in (
+        DataConfig(root=tmp_path / "capture"),
+        DataConfig(root=tmp_path / "empty"),
+        DataConfig(root=tmp_path / "nowhere"),
+        DataConfig(root=_photos(tmp_path / "two", 2)),
+        DataConfig(root=_photos(tmp_path / "photos"), format="colmap"),
+    ):
+        assert with_poses(data, say=print) is data
+    assert asked == []
+
+
+def test_what_cannot_work_is_said_before_poses_are_estimated(tmp_path: Path, asked: list[Path]) -> None:
+    photos = DataConfig(root=_photos(tmp_path / "photos"))
+    with pytest.raises(DyngsError, match=r"no times.*data\.times=order"):
+        with_poses(photos, needs_times=True)
+    with pytest.raises(DyngsError, match=r"2 videos.*dyngs train dynamic"):
+        with_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
+    with pytest.raises(DyngsError, match=r"one video; give that: data\.root=.*cam0\.mp4"):
+        with_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
+    assert asked == []
+    ordered = photos.model_copy(update={"times": "order"})
+    assert with_poses(ordered, needs_times=True, say=lambda _: None).root != photos.root

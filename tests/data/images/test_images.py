@@ -1,0 +1,252 @@
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_captures import random_pixels, write_image
+
+from dyngs.data.images import images
+from dyngs.data.images.images import (
+    area_downscale,
+    area_downscale_uint8,
+    check_image,
+    premultiplied,
+    read_header,
+    read_image,
+    read_mask,
+    straight_uint8,
+    target_size,
+)
+from dyngs.errors import DyngsError
+from dyngs.files.containment import images_up_to
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_8_bit_png_comes_out_bit_for_bit(tmp_path: Path, channels: int) -> None:
+    """Straight alpha, also where alpha is 0."""
+    pixels = random_pixels(5, 7, channels)
+    write_image(tmp_path / "a.png", pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png").numpy(), pixels)
+
+
+def test_grey_becomes_rgb(tmp_path: Path) -> None:
+    pixels = random_pixels(5, 7, 1)
+    write_image(tmp_path / "a.png", pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png").numpy(), np.repeat(pixels, 3, axis=2))
+
+
+def test_16_bit_is_rounded(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 65536, (9, 9, 3), dtype=np.uint16)
+    write_image(tmp_path / "a.png", pixels)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png").numpy(), pixels / 257.0, atol=0.5 + 1e-6)
+
+
+def test_jpeg_is_close(tmp_path: Path) -> None:
+    y, x = np.mgrid[:16, :24]
+    pixels = np.stack([5 * x, 10 * y, 128 + 0 * x], axis=-1).astype(np.uint8)
+    write_image(tmp_path / "a.jpg", pixels)
+    assert np.abs(read_image(tmp_path / "a.jpg").numpy().astype(int) - pixels).mean() < 3
+
+
+def test_exr_is_linear_and_clamped(tmp_path: Path) -> None:
+    """0.18 linear is 117.8 in 8-bit sRGB; out of range and NaN become black or white."""
+    values = [0.0, 0.18, 0.5, 1.0, 7.0, -1.0, np.nan, 0.002]
+    pixels = np.repeat(np.array(values, np.float32)[None, :, None], 3, axis=2)
+    write_image(tmp_path / "a.exr", pixels)
+    assert read_image(tmp_path / "a.exr")[0, :, 0].tolist() == [0, 118, 188, 255, 255, 0, 0, 7]
+
+
+def test_exr_alpha_is_premultiplied(tmp_path: Path) -> None:
+    """Half-covered white is stored as 0.5 in EXR and must come out as straight white."""
+    write_image(tmp_path / "a.exr", np.full((1, 1, 4), 0.5, np.float32))
+    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [255, 255, 255, 128]
+
+
+@pytest.mark.parametrize(("name", "channels", "alpha"), [("a.png", 4, True), ("a.png", 3, False), ("a.jpg", 3, False)])
+def test_header(tmp_path: Path, name: str, channels: int, alpha: bool) -> None:
+    write_image(tmp_path / name, random_pixels(5, 7, channels))
+    header = read_header(tmp_path / name)
+    assert (header.width, header.height, header.channels, header.has_alpha) == (7, 5, channels, alpha)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9])
+def test_truncated_image_is_named_by_check_and_by_read(tmp_path: Path, name: str, kept: float) -> None:
+    path = tmp_path / name
+    write_image(path, random_pixels(64, 64, 3))
+    check_image(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    for refuse in (check_image, read_image):
+        with pytest.raises(DyngsError) as caught:
+            refuse(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_missing_image(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match=r"none\.png: no such image"):
+        read_image(tmp_path / "none.png")
+
+
+def test_mask_keeps_white(tmp_path: Path) -> None:
+    write_image(tmp_path / "m.png", np.array([[[0], [127], [128], [255]]], np.uint8))
+    assert read_mask(tmp_path / "m.png").tolist() == [[False, False, True, True]]
+
+
+def test_area_filter_known_answer() -> None:
+    """5 pixels to 2: each covers two and a half."""
+    row = torch.tensor([1.0, 2, 3, 4, 10]).reshape(1, 5, 1)
+    wanted = [(1 + 2 + 0.5 * 3) / 2.5, (0.5 * 3 + 4 + 10) / 2.5]
+    torch.testing.assert_close(area_downscale(row, 2, 1)[0, :, 0], torch.tensor(wanted))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.data())
+def test_area_filter_is_the_mean_over_the_covered_rectangle(height: int, width: int, data: st.DataObject) -> None:
+    """Against the integral image, in float64; so also the mean of the image is kept."""
+    new_height, new_width = data.draw(st.integers(1, height)), data.draw(st.integers(1, width))
+    pixels = np.random.default_rng(height * 41 + width).random((height, width, 2))
+
+    def axis_means(array: np.ndarray, size: int) -> np.ndarray:
+        old = len(array)
+        summed = np.concatenate([np.zeros_like(array[:1]), np.cumsum(array, axis=0)])
+        edges = np.arange(size + 1) * old / size
+        low = np.minimum(edges.astype(int), old - 1)
+        at_edges = summed[low] + (edges - low)[:, None, None] * (summed[low + 1] - summed[low])
+        return np.diff(at_edges, axis=0) * size / old
+
+    wanted = axis_means(axis_means(pixels, new_height).swapaxes(0, 1), new_width).swapaxes(0, 1)
+    found = area_downscale(torch.from_numpy(pixels), new_width, new_height).numpy()
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    np.testing.assert_allclose(found.mean(axis=(0, 1)), pixels.mean(axis=(0, 1)), atol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([3, 4]), st.data())
+def test_strips_give_the_same_bytes(height: int, width: int, channels: int, data: st.DataObject) -> None:
+    new_height, new_width = data.draw(st.integers(1, height)), data.draw(st.integers(1, width))
+    numbers = np.random.default_rng(height * 41 + width).integers(0, 256, (height, width, channels), dtype=np.uint8)
+    pixels = torch.from_numpy(numbers)
+    wanted = straight_uint8(area_downscale(premultiplied(pixels), new_width, new_height))
+    assert torch.equal(area_downscale_uint8(pixels, new_width, new_height), wanted)
+    with mock.patch.object(images, "_STRIP_PIXELS", data.draw(st.integers(1, 200))):
+        assert torch.equal(area_downscale_uint8(pixels, new_width, new_height), wanted)
+
+
+def test_colour_of_transparent_pixels_does_not_bleed() -> None:
+    """Opaque red beside invisible green shrinks to half-covered red."""
+    pixels = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8)
+    small = straight_uint8(area_downscale(premultiplied(pixels), 1, 1))
+    assert small[0, 0].tolist() == [255, 0, 0, 128]
+
+
+@pytest.mark.parametrize(
+    ("size", "downscale", "longest", "wanted"),
+    [
+        ((800, 600), 1, None, (800, 600)),
+        ((800, 600), 2, None, (400, 300)),
+        ((801, 600), 2, None, (401, 300)),
+        ((800, 600), 1.5, None, (533, 400)),
+        ((800, 600), 1, 200, (200, 150)),
+        ((600, 800), 2, 1000, (300, 400)),
+        ((800, 600), 2, 100, (100, 75)),
+        ((800, 600), 1, 4000, (800, 600)),
+        ((3, 2), 100, None, (1, 1)),
+    ],
+)
+def test_target_size(size: tuple[int, int], downscale: float, longest: int | None, wanted: tuple[int, int]) -> None:
+    assert target_size(*size, downscale, longest) == wanted
+
+
+# ---------------------------------------------------------------------------------------------------- damaged and huge
+
+
+def mutated(data: bytes, seed: int) -> bytes:
+    """``data`` with some bytes changed, removed or inserted, most of them near the beginning."""
+    rng, changed = np.random.default_rng(seed), bytearray(data)
+    for _ in range(rng.choice([1, 2, 4, 16])):
+        at = int(rng.integers(min(len(changed), rng.choice([64, 200, len(changed)]))))
+        kind = rng.random()
+        if kind < 0.6:
+            changed[at] = rng.integers(256)
+        elif kind < 0.8:
+            changed[at : at + 4] = bytes([255, 255, 255, 127])
+        elif kind < 0.9 and len(changed) > 100:
+            del changed[at : at + 20]
+        else:
+            changed[at:at] = bytes(rng.integers(128, 256, 8, dtype=np.uint8))
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr", ".tif", ".webp", ".bmp"])
+def test_damaged_images_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str) -> None:
+    """One in fifty ended in a traceback, because OpenImageIO quotes bytes that are no text."""
+    pixels = random_pixels(20, 24, 3)
+    write_image(tmp_path / f"a{suffix}", pixels.astype(np.float32) / 255 if suffix == ".exr" else pixels)
+    data = (tmp_path / f"a{suffix}").read_bytes()
+    path = tmp_path / f"m{suffix}"
+    lines = []
+    for seed in range(200):
+        path.write_bytes(mutated(data, seed))
+        for read in (read_header, check_image, read_mask):
+            try:
+                read(path)
+            except DyngsError as error:
+                lines.append(str(error))
+    assert len(lines) > 50
+    assert [line for line in lines if not line.isprintable() or str(path) not in line] == []
+
+
+def test_texts_that_are_not_utf_8_are_shown_with_escapes(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    write_image(path, random_pixels(4, 4, 3).astype(np.float32))
+    path.write_bytes(path.read_bytes().replace(b"channels\0chlist\0", b"channels\xe4chlist\0"))
+    with pytest.raises(DyngsError, match=r"a\.exr: cannot be read as an image \(.*copy or convert it again"):
+        read_header(path)
+
+
+def write_empty_png(path: Path, side: int) -> None:
+    """A real grey image, black throughout."""
+    data = zlib.compress(bytes((1 + side // 8) * side), 6)
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", data), (b"IEND", b"")]
+    chunks = [struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in parts]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+
+
+def test_a_small_file_with_a_huge_image_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    """It took 2.7 GB."""
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "a.png"
+    write_empty_png(path, 20_000)
+    assert path.stat().st_size < 400_000
+    assert read_header(path).width == 20_000
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for read in (read_image, read_mask, check_image):
+        with pytest.raises(DyngsError, match=r"20000x20000 .*max_megapixels is 150; shrink .*or raise"):
+            read(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
+
+
+def test_the_limit_can_be_raised_and_lowered(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", random_pixels(100, 100, 3))
+    with (
+        images_up_to(0.005),
+        pytest.raises(DyngsError, match=r"0\.01 megapixels, but .* is 0\.005"),
+    ):
+        read_image(tmp_path / "a.png")
+    with images_up_to(0.01):
+        assert read_image(tmp_path / "a.png").shape == (100, 100, 3)
+
+
+def test_many_channels_count_as_many_images(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.exr", np.zeros((100, 100, 40), np.float32))
+    with images_up_to(0.05), pytest.raises(DyngsError, match=r"of 40 channels are 0\.1 megapixels"):
+        read_image(tmp_path / "a.exr")

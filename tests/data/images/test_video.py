@@ -1,0 +1,136 @@
+"""Decoding of videos: the frames asked for, and where a damaged file breaks."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from tiny_captures import level_of, packet_places, truncate_video, write_video
+
+from dyngs.data.images import video as video_module
+from dyngs.data.images.video import VideoInfo, probe_video, read_frames, read_numbered_frames
+from dyngs.errors import DyngsError
+from dyngs.files.containment import images_up_to
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "cam00.mp4"
+    write_video(path, 9, fps=25, size=(32, 24))
+    return path
+
+
+def copy(video: Path, name: str) -> Path:
+    return Path(shutil.copy(video, video.with_name(name)))
+
+
+def test_video_probe(video: Path) -> None:
+    assert probe_video(video) == VideoInfo(32, 24, 9, 25.0)
+
+
+@pytest.mark.parametrize("numbers", [[0], [8], [1, 2, 7], [7, 1, 2], range(9), []])
+def test_wanted_frames_in_order(video: Path, numbers: list[int]) -> None:
+    found = list(read_numbered_frames(video, numbers))
+    assert [number for number, _ in found] == sorted(numbers)
+    everything = list(read_frames(video))
+    assert len(everything) == 9
+    for number, rgb in found:
+        assert rgb.shape == (24, 32, 3)
+        assert np.abs(rgb.astype(int) - level_of(number)).max() <= 6, "colours are converted in 8 bit"
+        np.testing.assert_array_equal(rgb, everything[number])
+
+
+def test_a_frame_behind_the_end(video: Path) -> None:
+    frames = read_numbered_frames(video, [8, 9])
+    assert next(frames)[0] == 8
+    with pytest.raises(DyngsError, match=r"cam00\.mp4 breaks at frame 9 "):
+        next(frames)
+
+
+def test_truncated_video(video: Path) -> None:
+    """The frames before the break can be had; the error says where it is."""
+    short = copy(video, "short.mp4")
+    truncate_video(short, 6)
+    assert probe_video(short).num_frames == 9
+    assert [number for number, _ in read_numbered_frames(short, [0, 1])] == [0, 1]
+    with pytest.raises(DyngsError, match=r"short\.mp4 breaks at frame [3-7] .*data\.frames"):
+        list(read_numbered_frames(short, range(9)))
+
+
+def test_video_damaged_in_the_middle(video: Path) -> None:
+    broken = copy(video, "broken.mp4")
+    data = bytearray(broken.read_bytes())
+    for place, size in packet_places(video)[4:6]:
+        data[place : place + size] = b"\xa5" * size
+    broken.write_bytes(data)
+    assert [number for number, _ in read_numbered_frames(broken, [0])] == [0]
+    with pytest.raises(DyngsError, match=r"broken\.mp4 breaks at frame [1-6]"):
+        list(read_numbered_frames(broken, range(9)))
+
+
+def test_no_video_at_all(video: Path) -> None:
+    with pytest.raises(DyngsError, match="no such video file"):
+        probe_video(video.with_name("none.mp4"))
+    text = video.with_name("text.mp4")
+    text.write_text("not a video " * 50)
+    with pytest.raises(DyngsError, match=r"cannot read the video .*text\.mp4"):
+        probe_video(text)
+    empty = copy(video, "empty.mp4")
+    truncate_video(empty, 0)
+    with pytest.raises(DyngsError, match=r"empty\.mp4"):
+        probe_video(empty)
+
+
+def test_a_title_in_latin_1(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = "Café"
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 16, 12, "yuv420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((12, 16, 3), np.uint8), format="rgb24")))
+        container.mux(stream.encode(None))
+    path.write_bytes(path.read_bytes().replace("Café".encode(), b"Caf\xe9 "))
+    assert b"Caf\xe9 " in path.read_bytes()
+    assert probe_video(path).num_frames == 3
+    assert len(list(read_frames(path))) == 3
+
+
+@pytest.mark.parametrize(
+    "content", ["ffconcat version 1.0\nfile cam00.mp4\n", "#EXTM3U\n#EXTINF:1,\n{video}\n#EXT-X-ENDLIST\n"]
+)
+def test_playlists_which_name_other_files_are_no_videos(video: Path, content: str) -> None:
+    path = video.with_name("list.mp4")
+    path.write_text(content.format(video=video))
+    with pytest.raises(DyngsError, match=r"cannot read the video .*list\.mp4"):
+        probe_video(path)
+
+
+def test_large_videos_are_refused_before_they_are_decoded(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        images_up_to(0.0005),
+        pytest.raises(DyngsError, match=r"32x24 .*data\.max_megapixels is 0\.0005"),
+    ):
+        probe_video(video)
+    monkeypatch.setattr(video_module, "MAX_FRAMES", 8)
+    with pytest.raises(DyngsError, match=r"cam00\.mp4: the video has 9 frames, of which 8 are read at most; cut it up"):
+        probe_video(video)
+
+
+def test_mutated_videos_are_read_or_refused_in_one_line(video: Path) -> None:
+    data, path = video.read_bytes(), video.with_name("mutated.mp4")
+    lines = []
+    for seed in range(150):
+        rng, changed = np.random.default_rng(seed), bytearray(data)
+        for _ in range(rng.choice([1, 4, 16])):
+            changed[int(rng.integers(rng.choice([200, 1000, len(data)])))] = rng.integers(256)
+        path.write_bytes(changed)
+        try:
+            for _ in read_numbered_frames(path, range(min(probe_video(path).num_frames, 20))):
+                pass
+        except DyngsError as error:
+            lines.append(str(error))
+    assert all(line.isprintable() for line in lines)

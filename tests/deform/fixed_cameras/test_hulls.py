@@ -1,0 +1,73 @@
+"""Visual hulls of balls of known places, from cameras on a ring."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from static_balls import Ball, filmed
+
+from dyngs.deform.fixed_cameras.hulls import Blob, blobs_in, silhouettes_at
+
+LOW, HIGH = np.full(3, -3.0), np.full(3, 3.0)
+MOMENTS = 5
+
+
+def hulls(*balls: Ball, count: int = 8) -> list[Blob]:
+    """Of the last of some moments; before, the balls were not there."""
+    times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
+    footage = filmed(lambda t: balls if t == 1.0 else [], times, count)
+    return sorted(blobs_in(silhouettes_at(footage, 1.0), LOW, HIGH), key=lambda blob: -blob.radius)
+
+
+@pytest.mark.parametrize(("count", "fraction"), [(4, 0.3), (8, 0.1)])  # of four, three suffice: their hull has corners
+def test_a_ball_is_found(count: int, fraction: float) -> None:
+    """Its centre to a fraction of its radius, its radius to a fifth."""
+    ball = Ball((0.31, -0.22, 0.13))
+    (found,) = hulls(ball, count=count)
+    assert np.linalg.norm(found.center - ball.center) < fraction * ball.radius
+    assert found.radius == pytest.approx(ball.radius, rel=0.2)
+    assert np.abs(found.color - ball.color).max() < 0.15
+    if count == 8:
+        assert np.linalg.norm(found.cubes - np.array(ball.center), axis=1).max() < 1.6 * ball.radius
+
+
+def test_two_balls_are_two() -> None:
+    found = hulls(Ball((-0.4, 0.0, 0.1)), Ball((0.5, 0.2, -0.1), 0.15, (0.1, 0.2, 0.9)))
+    places = np.array([blob.center for blob in found[:2]])
+    assert np.abs(places - np.array([[-0.4, 0.0, 0.1], [0.5, 0.2, -0.1]])).max() < 0.05
+    assert all(blob.radius < 0.08 for blob in found[2:]), "crossings of other silhouettes are small"
+
+
+def test_what_one_of_eight_cameras_does_not_see_is_found() -> None:
+    """Something still hides it there; but of three cameras all must see it."""
+    times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
+    for count, number in ((8, 1), (3, 0)):
+        footage = filmed(lambda t: [Ball((0.1, 0.0, 0.0))] if t == 1.0 else [], times, count)
+        footage[0].changed[:] = False
+        found = blobs_in(silhouettes_at(footage, 1.0), LOW, HIGH)
+        assert len(found) == number
+        assert all(np.linalg.norm(blob.center - [0.1, 0.0, 0.0]) < 0.05 for blob in found)
+
+
+def test_masked_cameras_do_not_count() -> None:
+    times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
+    footage = filmed(lambda t: [Ball((0.1, 0.0, 0.0))] if t == 1.0 else [], times, 6)
+    for one in footage[:3]:
+        one.changed[:], one.counted[:] = False, False
+    (found,) = blobs_in(silhouettes_at(footage, 1.0), LOW, HIGH)
+    assert np.linalg.norm(found.center - [0.1, 0.0, 0.0]) < 0.1
+
+
+def test_nothing_is_found_where_nothing_moves() -> None:
+    assert hulls() == []
+    assert blobs_in([], LOW, HIGH) == []
+
+
+def test_a_large_box_does_not_matter() -> None:
+    """What is far off is not divided."""
+    times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
+    footage = filmed(lambda t: [Ball((0.1, 0.0, 0.0))] if t == 1.0 else [], times, 6)
+    found = blobs_in(silhouettes_at(footage, 1.0), 8 * LOW, 8 * HIGH)
+    largest = max(found, key=lambda blob: len(blob.cubes))
+    assert np.linalg.norm(largest.center - [0.1, 0.0, 0.0]) < 0.05
+    assert largest.radius == pytest.approx(0.2, rel=0.25)

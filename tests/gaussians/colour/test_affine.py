@@ -1,0 +1,76 @@
+"""Affine colours of images: found again from what they did, and backgrounds are not in front of the camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from flat_wall import BLACK, cameras_before_wall, seen_from
+from torch import Tensor
+
+from dyngs.data.loader import Image
+from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.rendering import Rendering
+
+WARM = torch.tensor([[1.2, 0.05, 0.0, 0.02], [0.0, 1.0, -0.03, -0.01], [0.02, 0.0, 0.8, 0.03]])
+WHITE = torch.ones(3)
+
+
+def shown_as(rgb: Tensor, transmittance: Tensor | None = None) -> Rendering:
+    through = torch.zeros_like(rgb[..., 0]) if transmittance is None else transmittance
+    return Rendering(rgb[None], through[None], None, torch.zeros(1, 0, 2, dtype=torch.int32))
+
+
+def image_and_rendering() -> tuple[Image, Rendering]:
+    """Return colourful noise as the scene has it, and as a camera with WARM shows it."""
+    image = seen_from(cameras_before_wall(1))[0]
+    rgb = 0.1 + 0.6 * torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(0))
+    return replace(image, rgb_premultiplied=rgb @ WARM[:, :3].T + WARM[:, 3]), shown_as(rgb)
+
+
+def test_an_affine_is_found_again() -> None:
+    image, rendering = image_and_rendering()
+    found = fitted_affine([(image, rendering)], BLACK)
+    torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)  # the ridge pulls a little to the identity
+    shown = recoloured(found, image, rendering, BLACK)
+    assert float((shown - image.rgb_premultiplied).abs().mean()) < 3e-3
+
+
+def test_masked_pixels_and_those_of_weight_0_do_not_count() -> None:
+    image, rendering = image_and_rendering()
+    spoilt = image.rgb_premultiplied.clone()
+    spoilt[:10], spoilt[50:] = 1.0, 0.0
+    mask, counts = torch.ones(60, 80), torch.ones(60, 80)
+    mask[:10], counts[50:] = 0, 0
+    found = fitted_affine([(replace(image, rgb_premultiplied=spoilt, mask=mask), rendering)], BLACK, counts)
+    torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)
+
+
+def test_without_pixels_it_is_the_identity() -> None:
+    image, rendering = image_and_rendering()
+    found = fitted_affine([(replace(image, mask=torch.zeros(60, 80)), rendering)], BLACK)
+    torch.testing.assert_close(found, torch.eye(3, 4))
+
+
+def test_saturated_pixels_do_not_darken() -> None:
+    """A third of the pixels would be brighter than white after twice the exposure, and were cut off."""
+    image, rendering = image_and_rendering()
+    twice = 2 * rendering.rgb[0]
+    found = fitted_affine([(replace(image, rgb_premultiplied=(1.15 * twice).clamp_max(1.0)), rendering)], BLACK)
+    gain = found[:, :3].sum(1) + found[:, 3] / 0.4
+    assert bool((twice * 1.15 > 1).any())
+    torch.testing.assert_close(gain, torch.full((3,), 2.3), atol=0.12, rtol=0)
+
+
+def test_a_background_behind_a_cut_out_object_keeps_its_colour() -> None:
+    """Exposure makes the object twice as bright; the white that we put behind it stays white."""
+    image, rendering = image_and_rendering()
+    alpha = torch.zeros(60, 80)
+    alpha[:, 20:60], alpha[:, 60:] = 1.0, 0.5
+    object_only = 0.5 * rendering.rgb[0] * alpha[..., None]
+    cut_out = replace(image, rgb_premultiplied=2 * object_only, alpha=alpha)
+    drawn = shown_as(object_only + (1 - alpha[..., None]) * WHITE, 1 - alpha)
+    found = fitted_affine([(cut_out, drawn)], WHITE)
+    again = recoloured(found, cut_out, drawn, WHITE)
+    torch.testing.assert_close(again, cut_out.composite(WHITE), atol=0.01, rtol=0)
+    assert bool((again[:, :20] == 1).all())

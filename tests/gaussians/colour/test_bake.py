@@ -1,0 +1,65 @@
+"""Harmonics fitted to a network: exact where they can be, with an error that is told where not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scenes import random_scene
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.colour.bake import DIRECTIONS, sphere, with_harmonics
+from dyngs.gaussians.rendering import Shader
+from dyngs.ops.harmonics import evaluate_harmonics
+
+
+def harmonics_shader(sh: Tensor, degree: int) -> Shader:
+    def colors(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+        return evaluate_harmonics(gaussians.means, cameras.centers, sh, radii, degree)
+
+    return colors
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_are_found_again(degree: int) -> None:
+    gaussians = random_scene(n=8, degree=degree).gaussians
+    sh = 0.1 * gaussians.sh  # no colour is clamped
+    baked = with_harmonics(gaussians, harmonics_shader(sh, degree), 3)
+    assert baked.gaussians.sh.shape == (8, 16, 3)
+    # the eye is 1e4 times farther than the Gaussians, not infinitely far
+    torch.testing.assert_close(baked.gaussians.sh[:, : sh.shape[1]], sh, rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        baked.gaussians.sh[:, sh.shape[1] :], torch.zeros_like(baked.gaussians.sh[:, sh.shape[1] :]), rtol=0, atol=1e-4
+    )
+    assert baked.error < 1e-4
+    assert torch.equal(baked.gaussians.means, gaussians.means)
+
+
+def test_the_error_is_what_cannot_be_fitted() -> None:
+    """White from one half of all directions, black from the other: degree 0 can only be grey."""
+    gaussians = random_scene(n=3, degree=0).gaussians
+
+    def half(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+        white = (cameras.centers[:, 2] > 0).double()
+        return white[:, None, None].expand(len(cameras), len(gaussians), 3)
+
+    baked = with_harmonics(gaussians, half, 0)
+    torch.testing.assert_close(baked.gaussians.base_rgb, torch.full((3, 3), 0.5, dtype=torch.float64))
+    assert baked.error == pytest.approx(0.5)
+    assert with_harmonics(gaussians, half, 3).error < 0.25
+
+
+def test_no_gaussians() -> None:
+    nobody = random_scene(n=3, degree=0).gaussians.select(torch.zeros(0, dtype=torch.long))
+    baked = with_harmonics(nobody, harmonics_shader(nobody.sh, 0), 3)
+    assert baked.gaussians.sh.shape == (0, 16, 3)
+    assert baked.error == 0
+
+
+def test_directions_are_even() -> None:
+    directions = sphere(DIRECTIONS)
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones(DIRECTIONS, dtype=torch.float64))
+    assert directions.mean(0).abs().max() < 0.01
+    nearest = (directions @ directions.T - 2 * torch.eye(DIRECTIONS)).amax(1).acos()
+    assert nearest.min() > 0.5 * nearest.max()

@@ -1,0 +1,185 @@
+"""What is learned of colours beside harmonics, its rates, when harmonics are measured, and the entropy of opacities."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import random_scene
+from torch import Tensor
+
+from dyngs.config import AutoColour, NetworkColour, ShColour
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.colour.training import (
+    AutoTraining,
+    ColourTraining,
+    NetworkTraining,
+    TrainingLooks,
+    opacity_entropy,
+    rate_factor,
+)
+from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.state import tensors_of
+
+
+def gaussians() -> Gaussians:
+    drawn = random_scene(n=30, degree=0).gaussians
+    return Gaussians(**{name: x.float() for name, x in drawn.tensors().items()})
+
+
+def colours(seed: int = 0, **options: object) -> NetworkTraining:
+    box = torch.tensor([[0.0] * 3, [2.0] * 3])
+    generator = torch.Generator().manual_seed(seed)
+    return NetworkTraining(NetworkColour.model_validate(options), 60, box, generator, sees_time=True)
+
+
+def stored(learner: NetworkTraining) -> dict[str, Tensor]:
+    """What a checkpoint has of colours: of the scene, and of its training."""
+    return {name: x.clone() for name, x in tensors_of(learner.network.state() | learner.state()).items()}
+
+
+def test_plain_colours_do_nothing() -> None:
+    plain = ColourTraining(ShColour())
+    assert plain.network is None
+    assert plain.penalties(gaussians()) == {}
+    assert plain.optimize(1) == 0
+    assert plain.state() == {}
+    assert plain.frozen_rest() is None
+    assert not plain.holds_out(5, 1)
+
+
+def test_an_untrained_network_shows_the_base_colours() -> None:
+    camera = random_scene(views=1).to(torch.float32).cameras
+    drawn = [render(gaussians(), camera, shader=s).rgb for s in (None, colours().network.shader(0.4))]
+    torch.testing.assert_close(drawn[0], drawn[1], rtol=0, atol=1e-6)  # base + 0 in another order of float32 sums
+
+
+def test_it_learns_what_depends_on_the_view() -> None:
+    """Base colours fixed: only the network can tell the two views apart."""
+    cameras = random_scene(views=2).to(torch.float32).cameras
+    shown = torch.ones(2, 30, 2, dtype=torch.int32)
+    target = torch.tensor([0.2, 0.8])[:, None, None]
+    learner, drawn = colours(warm_up=5), gaussians()
+    losses = []
+    for step in range(1, 61):
+        error = (learner.network.shader(0.5)(drawn, cameras, shown) - target).square().mean()
+        error.backward()
+        losses.append(float(error.detach()))
+        assert learner.optimize(step) == 0
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_the_rate_warms_up_and_falls_by_thirds() -> None:
+    factors = [rate_factor(step, 600, 50) for step in range(1, 601)]
+    assert factors[24] == pytest.approx(0.5)
+    assert factors[49] == factors[99] == 1
+    assert factors[100] == pytest.approx(1 / 3)
+    assert factors[300] == pytest.approx(1 / 9)
+    assert factors[599] == pytest.approx(1 / 27)
+
+
+def test_a_bad_gradient_is_left_out_and_counted() -> None:
+    learner = colours()
+    before = stored(learner)
+    learner.network.layers[-1].bias.grad = torch.tensor([1.0, float("nan"), 1.0])
+    assert learner.optimize(1) == 1
+    after = stored(learner)
+    assert (after["bias2"] != before["bias2"]).tolist() == [True, False, True]
+    assert all(x.isfinite().all() for x in after.values() if x.is_floating_point())
+
+
+def test_state_goes_round_and_training_goes_on_alike() -> None:
+    cameras = random_scene(views=1).to(torch.float32).cameras
+    shown = torch.ones(1, 30, 2, dtype=torch.int32)
+
+    def train(learner: NetworkTraining, first: int, last: int) -> None:
+        for step in range(first, last + 1):
+            (learner.network.shader(0.1)(gaussians(), cameras, shown) - 0.3).square().mean().backward()
+            learner.optimize(step)
+
+    whole, resumed = colours(), colours(seed=5)
+    train(whole, 1, 5)
+    resumed.restore(stored(whole), 30)
+    train(whole, 6, 10)
+    train(resumed, 6, 10)
+    for name, x in stored(whole).items():
+        assert torch.equal(x, stored(resumed)[name]), name
+    found = network_of(stored(whole))
+    assert found is not None
+    assert torch.equal(found.layers[1].weight, whole.network.layers[1].weight)
+
+
+def test_every_eighth_view_is_held_out_until_it_is_measured() -> None:
+    colours = AutoTraining(AutoColour(measure_at=0.5), 100, 20)
+    assert [i for i in range(20) if colours.holds_out(i, 50)] == [5, 13]
+    assert not any(colours.holds_out(i, 51) for i in range(20))
+    assert measured_steps(colours) == [50]
+    few = AutoTraining(AutoColour(), 100, 5)
+    assert not few.held_out
+    assert measured_steps(few) == [], "too few views to spare one"
+
+
+def measured_steps(colours: AutoTraining) -> list[int]:
+    """Steps of 100 after which views are looked at; here there are none to look at."""
+    looked: list[int] = []
+    for step in range(101):
+
+        def looks(step: int = step) -> TrainingLooks:
+            looked.append(step)
+            return TrainingLooks((), lambda _: iter(()), RenderOptions(), torch.zeros(3))
+
+        found = colours.measured(step, looks)
+        assert (found is None) == (step not in looked)
+        assert found is None or (found.rows is None and "all harmonics stay" in found.text)
+    return looked
+
+
+def test_the_frozen_follow_the_set_and_go_round() -> None:
+    colours = AutoTraining(AutoColour(), 100, 20)
+    assert colours.frozen_rest() is None
+    colours.freeze(torch.tensor([True, False, True]))
+    colours.follow(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
+    assert colours.frozen_rest() is not None
+    other = AutoTraining(AutoColour(), 100, 20)
+    other.restore(tensors_of(colours.state()), 3)
+    frozen = other.frozen_rest()
+    assert frozen is not None
+    assert frozen.tolist() == [False, True, True]
+    with pytest.raises(ValueError, match="frozen"):
+        other.restore(tensors_of(colours.state()), 4)
+    colours.freeze(torch.ones(3, dtype=torch.bool))
+    assert colours.frozen_rest() is None, "where no harmonics are stored none need to be kept at zero"
+
+
+@pytest.mark.parametrize("measure_at", [0.0, 1.0])
+def test_it_is_measured_within_the_run(measure_at: float) -> None:
+    with pytest.raises(ValueError, match="measure_at"):
+        AutoColour(measure_at=measure_at)
+
+
+@given(st.floats(-1e4, 1e4))
+def test_the_entropy_and_its_gradient_are_finite_and_right(logit: float) -> None:
+    x = torch.tensor([logit], dtype=torch.float64, requires_grad=True)
+    value = opacity_entropy(x)
+    value.backward()
+    o = torch.sigmoid(x.detach())
+    log = torch.nn.functional.logsigmoid(x.detach())
+    assert 0 <= float(value.detach()) <= 1 / torch.e + 1e-12
+    assert x.grad is not None
+    torch.testing.assert_close(x.grad, -(log + 1) * o * torch.sigmoid(-x.detach()))
+
+
+def test_the_entropy_pushes_away_from_one_over_e() -> None:
+    logits = torch.tensor([0.2, 0.3, 0.45, 0.6]).logit().requires_grad_()
+    opacity_entropy(logits).backward()
+    assert logits.grad is not None
+    assert (logits.grad > 0).tolist() == [True, True, False, False], "a step down the gradient makes the faint fainter"
+
+
+def test_the_entropy_is_weighted_and_of_nothing_zero() -> None:
+    some = gaussians()
+    (term,) = ColourTraining(ShColour(opacity_entropy=0.5)).penalties(some).values()
+    assert float(term) == pytest.approx(0.5 * float(opacity_entropy(some.logit_opacities)))
+    assert float(opacity_entropy(torch.zeros(0))) == 0

@@ -1,0 +1,128 @@
+"""Whose harmonics pay: of a matte scene none, of a partly glossy one those of the glossy part."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.colour.view_dependence import Finding, MeasuredView, find_view_dependent, first_worthwhile
+from dyngs.gaussians.rendering import RenderOptions, render
+
+BLACK = torch.zeros(3)
+GLOSSY = torch.arange(24) < 6
+
+
+def camera(angle: float) -> Cameras:
+    """3 from the origin, which it looks at, turned about y."""
+    c, s = math.cos(angle), math.sin(angle)
+    pose = torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 3], [0, 0, 0, 1]])
+    intrinsics = torch.tensor([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]])
+    return Cameras(pose[None], intrinsics[None], 32, 32)
+
+
+def balls(rest: Tensor) -> Gaussians:
+    """24 balls on a ring, grey, with harmonics of degree 1 (24, 3, 3)."""
+    angle = torch.arange(24) * (2 * math.pi / 24)
+    means = torch.stack([angle.cos(), 0.7 * (3 * angle).sin(), angle.sin()], dim=1)
+    sh = torch.cat([torch.full((24, 1, 3), 0.3), rest], dim=1)
+    return Gaussians(means, torch.tensor([[1.0, 0, 0, 0]]).expand(24, 4), torch.full((24, 3), -2.2), torch.ones(24), sh)
+
+
+def noise(seed: int) -> Tensor:
+    return torch.randn(24, 3, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def looks(angles: list[float], model: Gaussians, truth: Gaussians, mask: Tensor | None = None) -> list[MeasuredView]:
+    return [MeasuredView(model, camera(a), render(truth, camera(a)).rgb[0], mask) for a in angles]
+
+
+def find(model: Gaussians, truth: Gaussians, tolerance: float = 0.05, mask: Tensor | None = None) -> Finding:
+    seen = looks([0.37 * i for i in range(17)], model, truth)
+    held_out = looks([0.1 + 0.9 * i for i in range(7)], model, truth, mask)
+    return find_view_dependent(seen, held_out, RenderOptions(), BLACK, tolerance)
+
+
+def test_a_matte_scene_keeps_none() -> None:
+    """What was learned of the view is noise: it is worth less than nothing."""
+    found = find(balls(0.05 * noise(0)), balls(torch.zeros(24, 3, 3)))
+    assert not found.keeps.any()
+    assert found.worth_all < 0
+    assert found.worth_kept == 0
+    assert "does not pay" in str(found)
+
+
+def test_only_the_glossy_part_keeps_them() -> None:
+    rest = 0.3 * noise(1) * GLOSSY[:, None, None]
+    found = find(balls(rest + 0.01 * noise(2)), balls(rest))
+    assert found.keeps[GLOSSY].float().mean() > 0.8, "all but those that are hardly seen or hardly glossy"
+    assert not found.keeps[~GLOSSY].any()
+    assert found.worth_kept > 3
+    assert "pays for 2" in str(found)
+
+
+def test_all_keep_them_where_nothing_may_be_given_away() -> None:
+    rest = 0.3 * noise(1)
+    found = find(balls(rest), balls(rest), tolerance=0.0)
+    assert found.keeps.float().mean() > 0.9
+    assert found.worth_kept > 0.9 * found.worth_all
+
+
+def test_the_mean_of_what_is_seen_takes_their_place() -> None:
+    """A colour that is the same from everywhere it is seen from moves into the base."""
+    rest = torch.zeros(24, 3, 3)
+    model = balls(rest)
+    lone = model.replace(sh=model.sh.clone())
+    lone.sh[:, 2] = 0.5  # along z: one camera sees all from about the same side
+    seen = looks([0.0], lone, lone)
+    found = find_view_dependent(seen, looks([0.01], lone, lone), RenderOptions(), BLACK, 300.0)
+    assert not found.keeps.any(), "300 dB may be given away"
+    plain = model.replace(sh=torch.cat([lone.sh[:, :1] + found.offsets[:, None] / SH_C0, rest], dim=1))
+    torch.testing.assert_close(render(plain, camera(0.0)).rgb, render(lone, camera(0.0)).rgb, rtol=0, atol=2e-5)
+
+
+def test_masked_pixels_do_not_count() -> None:
+    rest = 0.3 * noise(1) * GLOSSY[:, None, None]
+    found = find(balls(rest), balls(rest), mask=torch.zeros(32, 32))
+    assert not found.keeps.any()
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 40), st.floats(0, 3))
+def test_the_fewest_that_are_worth_nearly_everything(seed: int, count: int, tolerance: float) -> None:
+    g = torch.Generator().manual_seed(seed)
+    changes, worths = torch.rand(count, generator=g), torch.randn(count, generator=g)
+    without = float(worths.clamp_min(0).sum()) + 1
+    keeps = first_worthwhile(changes, worths, without, tolerance)
+    order = changes.argsort(descending=True, stable=True)
+    errors = [without - float(worths[order[:k]].double().sum()) for k in range(count + 1)]
+    limit = min(errors) * 10 ** (tolerance / 10) * (1 + 1e-9)
+    chosen = int(keeps.sum())
+    assert set(torch.nonzero(keeps)[:, 0].tolist()) == set(order[:chosen].tolist())
+    assert errors[chosen] <= limit + 1e-5
+    assert all(error > limit - 1e-5 for error in errors[:chosen])
+
+
+def test_in_words() -> None:
+    keeps = torch.arange(100) < 12
+    some = Finding(keeps, torch.zeros(100, 3), 0.35, 0.31)
+    assert str(some) == (
+        "view dependence pays for 12% of the Gaussians: +0.31 dB on held-out training views (for all of them: +0.35 dB)"
+    )
+    none = Finding(keeps & False, torch.zeros(100, 3), -0.1, 0.0)
+    assert str(none) == "view dependence does not pay (-0.10 dB on held-out training views): none is stored"
+    assert "does not pay" in str(Finding(torch.zeros(0, dtype=torch.bool), torch.zeros(0, 3), 0.0, 0.0))
+
+
+def test_it_does_not_touch_what_it_looks_at() -> None:
+    rest = 0.3 * noise(1)
+    model = balls(rest)
+    before = model.sh.clone()
+    find(model, balls(rest))
+    assert torch.equal(model.sh, before)

@@ -1,0 +1,168 @@
+"""Adam of a field: torch's own, with a schedule, rows that can be rearranged, and a state that can be stored."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.parameters import Parameters
+from dyngs.state import Role, tensors_of
+
+RATES = {"weight": 1e-2, "bias": 3e-3, "planes": 2e-2}
+SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}
+
+
+def start_values() -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return {name: torch.randn(shape, generator=generator) for name, shape in SHAPES.items()}
+
+
+def give_gradients(learned: Parameters, step: int) -> dict[str, Tensor]:
+    """New random gradients, the same for each step."""
+    generator = torch.Generator().manual_seed(step)
+    found = {}
+    for name, shape in SHAPES.items():
+        learned[name].grad = found[name] = torch.randn(shape, generator=generator)
+    return found
+
+
+@pytest.mark.parametrize("decay", [1.0, 0.01, 0.0])
+def test_it_is_adam_with_a_falling_rate(decay: float) -> None:
+    """The rate is log-linear from the first to the last; where the last is zero, linear."""
+    learned, num_steps = Parameters(start_values(), RATES, decay), 12
+    mine = {name: x.clone().requires_grad_() for name, x in start_values().items()}
+    adam = torch.optim.Adam([{"params": [x], "lr": RATES[name]} for name, x in mine.items()], eps=1e-15)
+    for step in range(1, num_steps + 1):
+        progress = (step - 1) / (num_steps - 1)
+        for name, grad in give_gradients(learned, step).items():
+            mine[name].grad = grad.clone()
+        factor = decay**progress if decay else 1 - progress
+        for group, name in zip(adam.param_groups, mine, strict=True):
+            group["lr"] = RATES[name] * factor
+        adam.step()
+        assert learned.step(step, progress) == 0
+    for name, x in mine.items():
+        torch.testing.assert_close(learned[name], x, rtol=1e-5, atol=1e-6)
+        assert learned[name].grad is None
+
+
+def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
+    learned, before = Parameters(start_values(), RATES), start_values()
+    give_gradients(learned, 1)
+    for name, row in (("weight", (2, 1)), ("planes", (1, 2, 3, 0))):
+        grad = learned[name].grad
+        assert grad is not None
+        grad[row] = float("nan")
+    assert learned.step(1, 0.0) == 2
+    same = {name: learned[name].detach() == x for name, x in before.items()}
+    assert same["weight"].all(1).tolist() == [False, False, True, False]
+    assert int(same["planes"].all(-1).sum()) == 1
+    assert same["planes"][1, 2, 3].all()
+    assert all(x.isfinite().all() for x in tensors_of(learned.state()).values())
+
+
+def test_what_has_no_gradient_stays() -> None:
+    learned = Parameters(start_values(), RATES)
+    learned["bias"].grad = torch.ones(3)
+    learned.step(1, 0.0)
+    for name, x in start_values().items():
+        assert torch.equal(learned[name].detach(), x) == (name != "bias")
+    assert learned.num_values == sum(x.numel() for x in start_values().values())
+    assert "bias" in learned
+    assert "slope" not in learned
+
+
+def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
+    """Those of the tensors that have that role; the parameters before stay as they were."""
+    roles = dict.fromkeys(SHAPES, Role.SHARED) | {"weight": Role.PER_MOVING}
+    learned = Parameters(start_values(), RATES, roles=roles)
+    give_gradients(learned, 1)
+    learned.step(1, 0.0)
+    before = {name: x.clone() for name, x in tensors_of(learned.state()).items()}
+    index, is_new = torch.tensor([3, 0, 0, 2, 3]), torch.tensor([False, False, True, False, True])
+    edited = learned.edited(Role.PER_MOVING, TopologyEdit(index, is_new))
+    after = tensors_of(edited.state())
+    assert torch.equal(after["weight"], before["weight"][index])
+    assert edited["weight"].requires_grad
+    assert edited["weight"].is_leaf
+    for name in ("exp_avg.weight", "exp_avg_sq.weight"):
+        assert torch.equal(after[name][~is_new], before[name][index][~is_new])
+        assert not after[name][is_new].any()
+    assert all(torch.equal(after[name], x) for name, x in before.items() if "weight" not in name)
+    assert learned.edited(Role.PER_GAUSSIAN, TopologyEdit(index, is_new)) is learned, "no tensor has that role"
+    edited["weight"].grad = torch.ones(5, 5)
+    edited.step(2, 0.5)
+    assert all(torch.equal(x, before[name]) for name, x in tensors_of(learned.state()).items())
+
+
+def test_rows_rearranged_take_their_moments_along() -> None:
+    """The source of a row that is new need not exist."""
+    learned = Parameters(start_values(), RATES)
+    give_gradients(learned, 1)
+    learned.step(1, 0.0)
+    before = {name: x.clone() for name, x in tensors_of(learned.state()).items()}
+    values = torch.randn(3, 5, generator=torch.Generator().manual_seed(2))
+    source, is_new = torch.tensor([2, 99, 0]), torch.tensor([False, True, False])
+    found = tensors_of(learned.rearranged({"weight": values}, source, is_new).state())
+    assert torch.equal(found["weight"], values)
+    for name in ("exp_avg.weight", "exp_avg_sq.weight"):
+        assert torch.equal(found[name], torch.stack([before[name][2], torch.zeros(5), before[name][0]]))
+    assert all(torch.equal(found[name], x) for name, x in before.items() if "weight" not in name)
+
+
+def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
+    first, second = (Parameters(start_values(), RATES, 0.1) for _ in range(2))
+    for step in (1, 2, 3):
+        give_gradients(first, step)
+        first.step(step, step / 6)
+    state = tensors_of(first.state())
+    second = second.restored(state)
+    for learned in (first, second):
+        for step in (4, 5):
+            give_gradients(learned, step)
+            learned.step(step, step / 6)
+    for name, x in tensors_of(first.state()).items():
+        assert torch.equal(tensors_of(second.state())[name], x), name
+    for name in ("bias", "exp_avg.bias"):
+        with pytest.raises(KeyError, match=name):
+            second.restored({n: x for n, x in state.items() if n != name})
+
+
+def test_a_restored_one_may_have_other_rows_where_it_is_told() -> None:
+    wide = Parameters(start_values() | {"weight": torch.randn(7, 5)}, RATES)
+    like, state = Parameters(start_values(), RATES), tensors_of(wide.state())
+    found = like.restored(state, {"weight": 7})
+    assert all(torch.equal(x, state[name]) for name, x in tensors_of(found.state()).items())
+    with pytest.raises(ValueError, match="weight"):
+        like.restored(state)
+
+
+def test_without_moments_they_are_zero() -> None:
+    """As in files for drawing."""
+    learned = Parameters(start_values(), RATES)
+    give_gradients(learned, 1)
+    learned.step(1, 0.0)
+    found = tensors_of(Parameters(start_values(), RATES).restored(learned.values()).state())
+    for name, x in learned.values().items():
+        assert torch.equal(found[name], x)
+        assert not found[f"exp_avg.{name}"].any()
+        assert not found[f"exp_avg_sq.{name}"].any()
+
+
+def test_values_have_the_roles_they_were_given_and_moments_are_for_training() -> None:
+    roles = {"weight": Role.PER_GAUSSIAN, "bias": Role.SHARED, "planes": Role.PER_MOVING}
+    for learned in (Parameters(start_values(), RATES, roles=roles), Parameters({}, {}, roles=roles)):
+        for name, x in learned.state().items():
+            assert x.role is roles.get(name, Role.TRAINING)
+
+
+def test_on_its_own_device_it_goes_on_alike() -> None:
+    first = Parameters(start_values(), RATES, 0.5)
+    give_gradients(first, 1)
+    first.step(1, 0.0)
+    second = first.to("cpu")
+    for name, x in tensors_of(first.state()).items():
+        assert torch.equal(tensors_of(second.state())[name], x), name
+    assert all(second[name].is_leaf and second[name].requires_grad for name in SHAPES)

@@ -1,0 +1,342 @@
+"""The one verb: that it is the ops in a row, its options, and that torch can compile it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from scenes import REFERENCE, Limits, Scene, draw, look_around, random_scene, weights
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0, RasterizeMode
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import Rendering, RenderOptions, contributions, render, sensitivities
+from dyngs.ops.projection import ProjectionOptions
+from dyngs.ops.rasterization import BlendOptions
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+EXACT = RenderOptions(alpha_min=0.0, transmittance_min=0.0)
+
+
+def leaves(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(**{name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()})
+
+
+def half_transparent_wall(z: float = 4.0) -> tuple[Gaussians, Scene]:
+    """One Gaussian so wide that alpha is 0.5 in every pixel, at depth z."""
+    scene = random_scene(n=1, views=1, degree=0)
+    gaussians = replace(
+        scene.gaussians,
+        means=torch.tensor([[0.0, 0.0, z]], dtype=torch.float64),
+        log_scales=torch.full((1, 3), 20.0, dtype=torch.float64),
+        logit_opacities=torch.zeros(1, dtype=torch.float64),
+    )
+    return gaussians, replace(scene, cam_from_world=torch.eye(4, dtype=torch.float64)[None])
+
+
+@pytest.mark.parametrize("mode", RasterizeMode)
+def test_is_the_three_ops_in_a_row(mode: RasterizeMode) -> None:
+    scene = random_scene(degree=2)
+    antialiased = mode == RasterizeMode.ANTIALIASED
+    limits = Limits(ProjectionOptions(eps2d=0.1, near=2.5, antialiased=antialiased), BlendOptions())
+    truth = draw(scene, REFERENCE, limits)
+    options = RenderOptions(near=2.5, eps2d=0.1, mode=mode)
+    ours = render(scene.gaussians, scene.cameras, options, background=scene.background)
+    torch.testing.assert_close(ours.rgb, truth.blended.color, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(ours.alpha, 1 - truth.blended.transmittance, rtol=1e-9, atol=1e-12)
+    assert ours.depth is None
+    assert torch.equal(ours.radii, truth.projection.radii)
+
+
+def test_a_shader_gives_the_colours() -> None:
+    """Instead of the harmonics; it sees what is drawn and where from, and its gradients go on."""
+    scene = random_scene(degree=1)
+    gaussians, asked = leaves(scene.gaussians), []
+
+    def shader(drawn: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+        asked.append((len(drawn), len(cameras), radii.shape))
+        return drawn.base_rgb.clamp_min(0).expand(len(cameras), -1, -1)
+
+    ours = render(gaussians, scene.cameras, shader=shader).rgb
+    plain = render(leaves(scene.gaussians), scene.cameras, RenderOptions(sh_degree=0)).rgb
+    torch.testing.assert_close(ours, plain, rtol=1e-12, atol=1e-12)
+    assert asked == [(20, 2, (2, 20, 2))]
+    ours.sum().backward()
+    assert gaussians.sh.grad is not None
+    assert gaussians.sh.grad[:, 0].any()
+    assert not gaussians.sh.grad[:, 1:].any()
+
+
+@pytest.mark.parametrize("depth", ["accumulated", "expected"])
+def test_gradcheck(depth: str) -> None:
+    """Through activations, cameras, colours, alpha, depth and background, without thresholds.
+
+    Wide Gaussians: where alpha is nearly zero, 1 - transmittance has no digits, and depth / alpha none either.
+    """
+    scene = random_scene(n=3, views=2, size=(4, 3), degree=1)
+    scene = replace(scene, scales=5 * scene.scales)
+    options = replace(EXACT, depth=depth, mode=RasterizeMode.ANTIALIASED)
+
+    def run(poses: Tensor, intrinsics: Tensor, background: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        cameras = replace(scene, cam_from_world=poses, intrinsics=intrinsics).cameras
+        image = render(Gaussians(*tensors), cameras, options, background=background)
+        assert image.depth is not None
+        return image.rgb, image.alpha, image.depth
+
+    tensors = (scene.cam_from_world, scene.intrinsics, scene.background, *scene.gaussians.tensors().values())
+    assert torch.autograd.gradcheck(run, [x.detach().clone().requires_grad_() for x in tensors])
+
+
+def test_depth_of_a_half_transparent_wall() -> None:
+    gaussians, scene = half_transparent_wall(z=4.0)
+    found = {}
+    for kind in ("accumulated", "expected"):
+        found[kind] = render(gaussians, scene.cameras, RenderOptions(depth=kind), background=torch.ones(3)).depth
+    torch.testing.assert_close(found["accumulated"], torch.full((1, 29, 37), 2.0).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(found["expected"], torch.full((1, 29, 37), 4.0).double(), rtol=1e-6, atol=0)
+
+
+def test_depth_where_nothing_is_drawn_is_zero_with_a_finite_gradient() -> None:
+    scene = random_scene(n=1, views=1)
+    scene.means[:] = torch.tensor([-0.9, -0.9, 0.0])
+    gaussians = leaves(replace(scene, scales=0.1 * scene.scales).gaussians)
+    image = render(gaussians, scene.cameras, RenderOptions(depth="expected"))
+    assert image.depth is not None
+    assert image.alpha[0, -1, -1] == image.depth[0, -1, -1] == 0
+    image.depth.sum().backward()
+    assert all(
+        x.grad is not None and x.grad.isfinite().all() for x in gaussians.tensors().values() if x is not gaussians.sh
+    )
+
+
+def test_alpha_of_a_half_transparent_wall() -> None:
+    gaussians, scene = half_transparent_wall()
+    alpha = render(gaussians, scene.cameras).alpha
+    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.5), rtol=1e-6, atol=0)
+
+
+def test_one_background_serves_every_view() -> None:
+    scene = random_scene()
+    one, gaussians = scene.background[0], scene.gaussians
+    shared = render(gaussians, scene.cameras, background=one).rgb
+    each = render(gaussians, scene.cameras, background=torch.stack([one, one])).rgb
+    assert torch.equal(shared, each)
+    black = render(gaussians, scene.cameras).rgb
+    assert torch.equal(black, render(gaussians, scene.cameras, background=torch.zeros(3)).rgb)
+
+
+def test_background_of_another_precision() -> None:
+    scene = random_scene()
+    half = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float16)
+    truth = render(scene.gaussians, scene.cameras, background=half.double()).rgb
+    assert torch.equal(render(scene.gaussians, scene.cameras, background=half).rgb, truth)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_sh_degree_limits_the_terms(degree: int) -> None:
+    scene = random_scene(degree=3)
+    cut = scene.gaussians.replace(sh=scene.sh[:, : (degree + 1) ** 2])
+    limited = render(scene.gaussians, scene.cameras, RenderOptions(sh_degree=degree)).rgb
+    assert torch.equal(limited, render(cut, scene.cameras).rgb)
+    assert torch.equal(render(cut, scene.cameras, RenderOptions(sh_degree=4)).rgb, limited)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    scene = random_scene()
+    halves = leaves(Gaussians(**{name: x.to(dtype) for name, x in scene.gaussians.tensors().items()}))
+    floats = Gaussians(**{name: x.detach().float() for name, x in halves.tensors().items()})
+    image = render(halves, scene.cameras.to(dtype=torch.float32))
+    assert image.rgb.dtype == torch.float32
+    assert torch.equal(image.rgb, render(floats, scene.cameras.to(dtype=torch.float32)).rgb)
+    image.rgb.sum().backward()
+    assert halves.means.grad is not None
+    assert halves.means.grad.dtype == dtype
+    assert halves.means.grad.isfinite().all()
+
+
+def test_mixed_precisions_follow_the_means() -> None:
+    scene = random_scene()
+    mixed = scene.to(torch.float32).gaussians.replace(sh=scene.sh, quats=scene.quats)
+    image = render(mixed, scene.cameras)
+    assert image.rgb.dtype == torch.float32
+    assert torch.equal(image.rgb, render(scene.to(torch.float32).gaussians, scene.cameras).rgb)
+
+
+def test_strided_gaussians_equal_contiguous_ones() -> None:
+    scene = random_scene().to(torch.float32)
+    packed = torch.cat([x.reshape(20, -1) for x in scene.gaussians.tensors().values()], 1)
+    widths = [3, 4, 3, 1, 12]
+    means, quats, log_scales, logits, sh = packed.split(widths, 1)
+    assert not means.is_contiguous()
+    views = Gaussians(means, quats, log_scales, logits[:, 0], sh.unflatten(1, (4, 3)))
+    assert torch.equal(render(views, scene.cameras).rgb, render(scene.gaussians, scene.cameras).rgb)
+
+
+def test_probe_collects_the_densification_signal() -> None:
+    scene = random_scene()
+    for absgrad in (False, True):
+        probe = torch.zeros(2, 20, 4, dtype=torch.float64, requires_grad=True)
+        image = render(scene.gaussians, scene.cameras, RenderOptions(absgrad=absgrad), probe=probe)
+        (image.rgb * weights(image.rgb)).sum().backward()
+        assert probe.grad is not None
+        assert probe.grad[..., :2].any()
+        assert probe.grad[..., 2:].any() == absgrad
+        if absgrad:
+            assert (probe.grad[..., 2:] >= probe.grad[..., :2].abs() - 1e-12).all()
+
+
+@pytest.mark.parametrize("shaded", [False, True])
+def test_sensitivity_of_a_half_transparent_wall(shaded: bool) -> None:
+    """dI/dG = o (c - B) with opacity 0.5, channels of 0.7 before a background of 0.3: (0.5 * 3 * 0.4)^2 per pixel."""
+    gaussians, scene = half_transparent_wall()
+    color = torch.full((1, 1, 3), 0.7, dtype=torch.float64)
+    if not shaded:
+        gaussians = gaussians.replace(sh=(color - 0.5) / SH_C0)
+    found = sensitivities(
+        gaussians,
+        scene.cameras,
+        background=torch.full((3,), 0.3, dtype=torch.float64),
+        shader=(lambda drawn, cameras, radii: color) if shaded else None,
+    )
+    pixels = scene.cameras.width * scene.cameras.height
+    torch.testing.assert_close(found, torch.full((1, 1), 0.36 * pixels, dtype=torch.float64), rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("mode", RasterizeMode)
+def test_contributions_are_the_shares_of_the_alpha(mode: RasterizeMode) -> None:
+    scene = random_scene()
+    options = RenderOptions(mode=mode)
+    sums = contributions(scene.gaussians, scene.cameras, options)
+    alpha = render(scene.gaussians, scene.cameras, options).alpha
+    torch.testing.assert_close(sums.sum(1), alpha.sum((1, 2)), rtol=1e-12, atol=0)
+
+
+def test_world_and_camera_moved_together_see_the_same() -> None:
+    """Base colours only: harmonics would have to be turned, too."""
+    scene = random_scene(degree=0)
+    motion = look_around(3)[2]  # 0.6 rad about y and a translation
+    c, s = 0.955336489125606, 0.29552020666133955
+    w, x, y, z = scene.quats.unbind(-1)
+    turned = torch.stack([c * w - s * y, c * x + s * z, c * y + s * w, c * z - s * x], -1)
+    moved = replace(
+        scene,
+        means=scene.means @ motion[:3, :3].T + motion[:3, 3],
+        quats=turned,
+        cam_from_world=scene.cam_from_world @ torch.linalg.inv(motion),
+    )
+    ours, truth = render(moved.gaussians, moved.cameras), render(scene.gaussians, scene.cameras)
+    torch.testing.assert_close(ours.rgb, truth.rgb, rtol=1e-9, atol=1e-11)
+
+
+def test_threads_do_not_matter(set_threads: Callable[[int], None]) -> None:
+    """Bitwise, activations and their derivatives included."""
+    scene = random_scene(n=40_000, size=(75, 50), seed=9).to(torch.float32)
+    scene = replace(scene, scales=0.05 * scene.scales, opacities=0.2 * scene.opacities)
+    found = []
+    for n in (1, 2, 8):
+        set_threads(n)
+        gaussians = leaves(scene.gaussians)
+        image = render(gaussians, scene.cameras, RenderOptions(depth="expected"), background=scene.background)
+        total = (image.rgb * weights(image.rgb)).sum() + image.alpha.sum()
+        found.append([image.rgb, image.alpha, image.depth])
+        found[-1] += torch.autograd.grad(total, list(gaussians.tensors().values()))
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def test_no_gaussians_leave_the_background() -> None:
+    scene = random_scene(n=0)
+    gaussians = leaves(scene.gaussians)
+    background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    for nonfinite in ("error", "skip", "trust"):
+        options = RenderOptions(depth="expected", nonfinite=nonfinite)
+        image = render(gaussians, scene.cameras, options, background=background)
+        assert torch.equal(image.rgb, background.expand(2, 29, 37, 3))
+        assert image.depth is not None
+        assert not image.alpha.any()
+        assert not image.depth.any()
+    image.rgb.sum().backward()
+    assert gaussians.sh.grad is not None
+    assert gaussians.sh.grad.shape == (0, 4, 3)
+
+
+def compiled_and_plain(scene: Scene, options: RenderOptions) -> list[list[Tensor]]:
+    """Image and gradients of ``render``, compiled and not."""
+
+    def run(means: Tensor, quats: Tensor, log_scales: Tensor, logits: Tensor, sh: Tensor) -> Rendering:
+        gaussians = Gaussians(means, quats, log_scales, logits, sh)
+        return render(gaussians, scene.cameras, options, background=scene.background)
+
+    found = []
+    for function in (torch.compile(run, fullgraph=True, backend="aot_eager"), run):
+        inputs = list(leaves(scene.gaussians).tensors().values())
+        image = function(*inputs)
+        total = (image.rgb * weights(image.rgb)).sum() + image.alpha.sum()
+        found.append([image.rgb, image.alpha, *torch.autograd.grad(total, inputs)])
+    return found
+
+
+def test_compiles_into_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of tile entries depends on the data: torch must be told to expect that. The check for NaN cannot be
+    part of a graph (it may raise), hence ``trust``."""
+    monkeypatch.setattr("torch._dynamo.config.capture_dynamic_output_shape_ops", True)
+    scene = random_scene()
+    compiled, plain = compiled_and_plain(scene, RenderOptions(nonfinite="trust", mode=RasterizeMode.ANTIALIASED))
+    for x, y in zip(compiled, plain, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-14)
+
+
+VERBS = [render, contributions, sensitivities]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("focal", [0.0, -20.0, 1e-7, 1e13])
+def test_focal_lengths_that_show_nothing_are_refused(verb: Callable[..., object], focal: float) -> None:
+    scene = random_scene()
+    scene.intrinsics[1, 1, 1] = focal
+    with pytest.raises(DyngsError, match=r"intrinsics: focal lengths must be positive.*camera 1 has"):
+        verb(scene.gaussians, scene.cameras)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_names_what_is_not_finite(verb: Callable[..., object]) -> None:
+    scene = random_scene()
+    scene.means[3, 1] = math.nan
+    with pytest.raises(DyngsError, match=r"means holds 1 NaN or infinite value\(s\) in 1 of 20 rows"):
+        verb(scene.gaussians, scene.cameras)
+    skipped = verb(scene.gaussians, scene.cameras, RenderOptions(nonfinite="skip"))
+    found = skipped.rgb if isinstance(skipped, Rendering) else skipped
+    assert isinstance(found, Tensor)
+    assert found.isfinite().all()
+
+
+@pytest.mark.parametrize("shape", [(2,), (4,), (3, 3), (1, 3), (2, 1), (2, 29, 37, 3), ()])
+def test_background_and_probe_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    scene = random_scene()
+    with pytest.raises(DyngsError, match=r"background must be \(3,\) or \(2, 3\), got"):
+        render(scene.gaussians, scene.cameras, background=torch.zeros(shape))
+    with pytest.raises(DyngsError, match=r"probe must be \(2, 20, 4\), got"):
+        render(scene.gaussians, scene.cameras, probe=torch.zeros(shape))
+
+
+def test_a_rendering_in_another_precision() -> None:
+    scene = random_scene()
+    found = render(scene.gaussians, scene.cameras, RenderOptions(depth="expected")).to(dtype=torch.float32)
+    assert found.rgb.dtype == found.transmittance.dtype == torch.float32
+    assert found.depth is not None
+    assert found.depth.dtype == torch.float32
+    assert found.radii.dtype == torch.int32
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_cameras_on_another_device_are_refused(verb: Callable[..., object]) -> None:
+    scene = random_scene()
+    with pytest.raises(DyngsError, match=r"the cameras are on meta, the Gaussians on cpu; move one of them"):
+        verb(scene.gaussians, scene.cameras.to(device="meta"))

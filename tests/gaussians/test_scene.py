@@ -1,0 +1,283 @@
+"""What holds for every kind of scene: stored, edited, in parts and moved it draws what it drew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scene_kinds import KINDS, PERSON, onlooker, restored, scene_of_kind
+from tiny_fields import KINDS as FIELDS
+from tiny_fields import busy_config, write_tiny_capture
+from torch import Tensor
+
+from dyngs.build import assemble, restored_scene
+from dyngs.config import FixedStrategy, StaticModel
+from dyngs.data.loader import Image
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.scene import Scene
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.training import HumanTraining
+from dyngs.state import Role, part_of, tensors_of
+from dyngs.static.rates import Rates
+
+TIMES = (None, 0.0, 0.37, 0.5, 1.0)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+def assert_alike(found: Gaussians, expected: Gaussians, atol: float = 1e-6) -> None:
+    for name, x in expected.tensors().items():
+        torch.testing.assert_close(getattr(found, name), x, rtol=0, atol=atol, msg=lambda m, name=name: f"{name}: {m}")
+
+
+def image(scene: Scene, time: float | None) -> Tensor:
+    with torch.no_grad():
+        return scene.render(onlooker(), time).rgb
+
+
+def names_with(scene: Scene, role: Role) -> set[str]:
+    return {name for name, x in scene.state().items() if x.role is role}
+
+
+def leaves(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(**{name: x.detach().clone().requires_grad_() for name, x in gaussians.tensors().items()})
+
+
+# --- what is stored ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drawing", [False, True], ids=["state", "drawing state"])
+def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
+    """To the bit, but for skinning weights whose corrections are stored within them."""
+    scene = scene_of_kind(kind)
+    state = scene.drawing_state() if drawing else scene.state()
+    found = replace(restored(kind, state), colour=network_of(part_of(tensors_of(state), "model.colour")))
+    assert type(found) is type(scene)
+    assert found.times == scene.times
+    assert torch.equal(found.rows, scene.rows)
+    for time in TIMES:
+        atol = 1e-5 if drawing and kind == "human" else 0.0
+        torch.testing.assert_close(image(found, time), image(scene, time), rtol=0, atol=atol)
+    assert float(image(scene, 0.37).std()) > 0.01, "something is seen"
+
+
+def test_what_is_stored_is_stored_again_alike(kind: str) -> None:
+    scene = scene_of_kind(kind)
+    again = replace(restored(kind, scene.state()), colour=scene.colour).state()
+    assert again.keys() == scene.state().keys()
+    for name, x in scene.state().items():
+        assert again[name].role is x.role, name
+        assert torch.equal(again[name].tensor, x.tensor), name
+
+
+def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
+    """Also after an edit."""
+    scene = scene_of_kind(kind)
+    copied = TopologyEdit(torch.tensor([8, 1, 1, 5, 0]), torch.tensor([False, False, True, False, False]))
+    for one in (scene, scene.edited(copied), scene.part("moving"), scene.part("still")):
+        for name, x in one.state().items():
+            assert isinstance(x.role, Role), name
+            if x.role is Role.PER_GAUSSIAN:
+                assert len(x.tensor) == len(one), name
+            if x.role is Role.PER_MOVING:
+                assert len(x.tensor) == one.num_moving, name
+    assert {f"gaussians.{name}" for name in scene.gaussians.tensors()} <= names_with(scene, Role.PER_GAUSSIAN)
+    assert (kind in ("control_nodes", "trajectory")) == bool(names_with(scene, Role.PER_MOVING))
+    assert scene.drawing_state().keys() == scene.state().keys() - names_with(scene, Role.TRAINING) - WITHIN_OTHERS
+    assert all(not x.tensor.requires_grad for x in scene.state().values())
+
+
+WITHIN_OTHERS = {"model.learned.weights"}
+"""Stored within other tensors where a scene is stored for drawing alone."""
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.sampled_from(KINDS), st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=14), st.sampled_from(TIMES)
+)
+def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
+    kind: str, rows: list[tuple[int, bool]], time: float | None
+) -> None:
+    scene = scene_of_kind(kind)
+    source = torch.tensor([row for row, _ in rows], dtype=torch.long)
+    before = scene.at(time)
+    edited = scene.edited(TopologyEdit(source, torch.tensor([new for _, new in rows], dtype=torch.bool)))
+    assert len(edited) == len(rows)
+    assert edited.times == scene.times
+    assert_alike(edited.unmasked().at(time), scene.unmasked().at(time).select(source))
+    if scene.masks is not None:
+        seen = torch.isin(source, scene.masks.active(scene.masks.interval(time or 0.0)))
+        assert_alike(edited.at(time), scene.unmasked().at(time).select(source[seen]))
+    assert_alike(scene.at(time), before, atol=0.0)
+
+
+def test_a_selection_is_an_edit_that_copies_nothing(kind: str) -> None:
+    scene = scene_of_kind(kind)
+    chosen = torch.arange(len(scene)) % 3 == 1
+    by_bools, by_index = scene.select(chosen), scene.select(torch.nonzero(chosen)[:, 0])
+    for time in TIMES:
+        assert_alike(by_bools.at(time), by_index.at(time), atol=0.0)
+        assert_alike(by_bools.unmasked().at(time), scene.unmasked().at(time).select(chosen))
+
+
+def test_what_moves_and_what_is_still_make_the_scene(kind: str) -> None:
+    scene = scene_of_kind(kind)
+    moving, still = scene.part("moving"), scene.part("still")
+    moves = torch.zeros(len(scene), dtype=torch.bool)
+    moves[scene.rows] = True
+    assert (len(moving), len(still)) == (int(moves.sum()), int((~moves).sum()))
+    assert moving.moving_fraction == (1.0 if len(moving) else 0.0)
+    assert still.moving_fraction == 0.0
+    for time in TIMES:
+        whole = scene.unmasked().at(time)
+        assert_alike(moving.at(time), whole.select(moves))
+        assert_alike(still.at(time), whole.select(~moves))
+
+
+def test_rows_are_those_that_move(kind: str) -> None:
+    scene = scene_of_kind(kind).unmasked()
+    moved = (scene.at(0.0).means != scene.at(0.37).means).any(1)
+    assert torch.equal(torch.nonzero(moved)[:, 0], scene.rows)
+    assert scene.is_static == (len(scene.rows) == 0)
+    assert scene.num_moving == len(scene.rows)
+    assert scene.moving_fraction == pytest.approx(len(scene.rows) / len(scene))
+    assert torch.isin(scene.offset_rows, scene.rows).all()
+
+
+# --- times ------------------------------------------------------------------------------------------------------------
+
+
+def test_times_are_clamped_and_must_be_numbers(kind: str) -> None:
+    scene = scene_of_kind(kind)
+    assert list(scene.times) == sorted(set(scene.times))
+    for outside, inside in ((None, 0.0), (-1e30, 0.0), (1.0001, 1.0), (float("inf"), 1.0)):
+        assert_alike(scene.at(outside), scene.at(inside), atol=0.0)
+        assert torch.equal(image(scene, outside), image(scene, inside))
+    with pytest.raises(DyngsError, match="not a number; give one from 0 to 1"):
+        scene.moment(float("nan"))
+
+
+# --- drawing ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_moment_may_be_drawn_again(kind: str) -> None:
+    scene = scene_of_kind(kind)
+    with torch.no_grad():
+        moment = scene.moment(0.37)
+        assert torch.equal(scene.render(onlooker(), moment).rgb, image(scene, 0.37))
+    assert moment.penalties == {}
+    assert not scene.at(0.37).means.requires_grad
+
+
+def test_the_background_is_that_of_the_scene_unless_another_is_given(kind: str) -> None:
+    scene, red = scene_of_kind(kind), torch.tensor([1.0, 0.0, 0.0])
+    given_later = scene.render(onlooker(), 0.5, background=red).rgb
+    assert torch.equal(replace(scene, background=red).render(onlooker(), 0.5).rgb, given_later)
+    assert not torch.equal(given_later.detach(), image(scene, 0.5))
+
+
+def test_images_are_differentiable_in_the_gaussians(kind: str) -> None:
+    """Gradients reach the tensors of the scene, and the values are those without gradients."""
+    scene = scene_of_kind(kind)
+    scene = scene.with_gaussians(leaves(scene.gaussians))
+    rgb = scene.render(onlooker(), 0.37).rgb
+    torch.testing.assert_close(rgb.detach(), image(scene, 0.37), rtol=0, atol=1e-5)
+    rgb.square().sum().backward()
+    for name in ("means", "log_scales", "logit_opacities", "sh"):
+        grad = getattr(scene.gaussians, name).grad
+        assert grad is not None, name
+        assert grad.isfinite().all(), name
+        assert grad.any(), name
+
+
+def test_a_changed_scene_is_drawn_as_it_is_now(kind: str) -> None:
+    """What is trained is changed in place, and drawn in between."""
+    scene = scene_of_kind(kind)
+    scene.at(0.37)
+    scene.gaussians.means.data += 0.25
+    if isinstance(scene, HumanScene):
+        scene.learned["weights"].data += torch.arange(float(scene.learned["weights"].shape[1]))
+    scene.changed()
+    assert_alike(scene.at(0.37), restored(kind, scene.state()).at(0.37), atol=0.0)
+
+
+# --- devices ----------------------------------------------------------------------------------------------------------
+
+
+def test_on_its_own_device_it_stays_as_it_is(kind: str) -> None:
+    scene = scene_of_kind(kind)
+    before = tensors_of(scene.state())
+    moved = scene.to("cpu")
+    assert type(moved) is type(scene)
+    assert moved.state().keys() == scene.state().keys()
+    assert all(torch.equal(x.tensor, before[name]) for name, x in moved.state().items())
+    assert all(torch.equal(image(moved, time), image(scene, time)) for time in TIMES)
+
+
+def test_all_that_is_computed_with_moves_to_a_device(kind: str) -> None:
+    """Here one that keeps no values; what is read number by number stays on the CPU."""
+    moved = scene_of_kind(kind).to("meta")
+    on_cpu = {name for name, x in moved.state().items() if x.tensor.device.type == "cpu"}
+    assert on_cpu <= {
+        *("model.times", "model.clip.times", "model.parents", "model.field.numbers", "model.colour.sees"),
+        *("model.masks.times", "model.masks.count"),
+    }
+    assert all(x.tensor.device.type == "meta" for name, x in moved.state().items() if name not in on_cpu)
+    assert moved.rows.device.type == "meta"
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", ["static", *FIELDS])
+def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
+    """The same class, which draws the same."""
+    capture = write_tiny_capture(tmp_path / "capture")
+    config = busy_config(capture, tmp_path, "mlp" if model == "static" else model, filter_3d=True)
+    config = config.model_copy(update={"strategy": FixedStrategy()})
+    if model == "static":
+        config = config.model_copy(update={"model": StaticModel(sh_degree=1)})
+    trainer = assemble(config)
+    for _ in range(11):
+        trainer.step()
+    loaded = restored_scene(trainer.checkpoint(), config.model)
+    assert type(loaded) is type(trainer.scene)
+    assert loaded.moving_fraction == trainer.scene.moving_fraction
+    assert (loaded.moving_fraction > 0) == (model != "static")
+    assert loaded.options == trainer.scene.options
+    view = trainer.images[0]
+    behind = trainer.scene.background
+    for time in (0.0, 0.37):
+        with torch.no_grad():
+            drawn = [scene.render(view.cameras, time, background=behind).rgb for scene in (loaded, trainer.scene)]
+        assert torch.equal(*drawn)
+        in_training = trainer.training.moment(trainer.scene, replace(view, time=time), config.train.steps)
+        assert_alike(in_training.gaussians.detach(), loaded.at(time))
+
+
+def test_a_person_is_trained_as_it_is_played() -> None:
+    scene = scene_of_kind("human")
+    assert isinstance(scene, HumanScene)
+    training = HumanTraining(PERSON, (0, 1, 2), Rates(10))
+    for frame, time in enumerate(scene.times):
+        view = Image("view", onlooker(), torch.zeros(28, 36, 3), None, None, time, frame)
+        moment = training.moment(scene, view, 10)
+        torch.testing.assert_close(moment.gaussians.means.detach(), scene.at(time).means, rtol=0, atol=1e-5)
+        # Axes of discs may be others, their images not; what is played has its poses as axis-angle vectors.
+        drawn = scene.render(onlooker(), moment).rgb.detach()
+        torch.testing.assert_close(drawn, image(scene, time), rtol=0, atol=1e-4)
+        assert set(moment.penalties) >= {"offset", "pose"}

@@ -1,0 +1,144 @@
+"""Tensors that lie on a device of their own, computed with on the CPU: what a GPU does not forgive shows without one.
+
+As torch does with real ones, an operator refuses tensors of both devices (but for numbers, and for indices and copies,
+for which torch takes both), and NumPy gets none. Whatever makes the host wait for a GPU is counted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._pytree import tree_flatten, tree_map
+
+aten: Any = torch.ops.aten
+GPU = torch.device("meta")
+"""The only device beside the CPU that autograd takes where torch was built without CUDA."""
+TAKES_BOTH = (aten._to_copy, aten.copy_, aten.index, aten.index_put_, aten.index_put, aten._index_put_impl_)
+READS_BACK = {
+    aten._local_scalar_dense: "item",
+    aten.nonzero: "nonzero",
+    aten.masked_select: "masked_select",
+    aten.equal: "equal",
+    aten.unique_consecutive: "unique",
+    aten._unique2: "unique",
+    aten.unique_dim: "unique",
+    aten.repeat_interleave: "repeat_interleave",
+    aten.bincount: "bincount",
+}
+
+
+class MixedDevices(RuntimeError):
+    """An operator was given tensors of both devices."""
+
+
+class OnGpu(Tensor):
+    """A tensor of the GPU; ``held`` is where its numbers are."""
+
+    held: Tensor
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> OnGpu:
+        made = Tensor._make_wrapper_subclass(
+            cls, held.size(), strides=held.stride(), storage_offset=held.storage_offset(), dtype=held.dtype, device=GPU
+        )
+        made.held = held
+        return made
+
+    def __getitem__(self, index: Any) -> Tensor:
+        return super().__getitem__(_indices(self, index))
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        super().__setitem__(_indices(self, index), value)
+
+    def __repr__(self, *, tensor_contents: object = None) -> str:
+        return f"OnCard({self.held!r})"
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return computed(func, args, kwargs or {}, Counter())
+
+
+def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) -> Any:
+    """The result of an operator, on the device where torch would put it."""
+    packet = func.overloadpacket
+    given = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
+    on_gpu = any(isinstance(x, OnGpu) for x in given)
+    both = on_gpu and any(not isinstance(x, OnGpu) and x.ndim > 0 for x in given)
+    if both and (packet not in TAKES_BOTH or not (isinstance(args[0], OnGpu) or packet is aten.copy_)):
+        shapes = [(str(x.device), tuple(x.shape)) for x in given]
+        raise MixedDevices(f"{func}: {shapes}")
+    device = kwargs.get("device")
+    if device is not None:
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    to_gpu = on_gpu if device is None else torch.device(device) == GPU
+    note(packet, args, kwargs, on_gpu, to_gpu, waits)
+
+    def taken(x: Any) -> Any:
+        return x.held if isinstance(x, OnGpu) else x
+
+    result = func(*tree_map(taken, args), **tree_map(taken, kwargs))
+    if not to_gpu:
+        return result
+    wrapped = tree_map(lambda x: OnGpu(x) if isinstance(x, Tensor) and not isinstance(x, OnGpu) else x, result)
+    return return_and_correct_aliasing(func, args, kwargs, wrapped) if on_gpu else wrapped
+
+
+def note(packet: Any, args: Any, kwargs: dict[str, Any], on_gpu: bool, to_gpu: bool, waits: Counter[str]) -> None:
+    """Count what makes the host wait: numbers read from the GPU, sizes that depend on them; and what is queued."""
+    if on_gpu and packet in READS_BACK:
+        waits[READS_BACK[packet]] += 1
+    elif on_gpu and not to_gpu:
+        waits["to the CPU"] += 1
+    elif to_gpu and not on_gpu and packet in (aten._to_copy, aten.copy_):
+        queued = kwargs.get("non_blocking") or (packet is aten.copy_ and len(args) > 2 and args[2])
+        waits["queued to the GPU" if queued else "to the GPU"] += 1
+    elif packet is aten.copy_ and isinstance(args[1], OnGpu) and not isinstance(args[0], OnGpu):
+        waits["to the CPU"] += 1
+    elif packet is aten.index and any(x is not None and x.dtype == torch.bool for x in args[1]) and on_gpu:
+        waits["mask"] += 1
+
+
+class PretendGpu(TorchDispatchMode):
+    """The GPU is there inside this mode; ``waits`` counts by what the host waits for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return computed(func, args, kwargs or {}, self.waits)
+
+
+@contextmanager
+def pretend_gpu() -> Iterator[PretendGpu]:
+    """Inside, tensors may lie on ``CARD``, where all ops compute."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "tensor", made)
+        patch.setattr(torch, "as_tensor", lambda x, **how: x.to(**how) if isinstance(x, Tensor) else made(x, **how))
+        patch.setattr(
+            Tensor, "new_tensor", lambda x, data, **how: made(data, **{"device": x.device, "dtype": x.dtype} | how)
+        )
+        with PretendGpu() as gpu:
+            yield gpu
+
+
+def _indices(x: Tensor, index: Any) -> Any:
+    """``index`` with tensors in place of lists, for which torch would make some without numbers."""
+    if isinstance(index, tuple):
+        return tuple(_indices(x, each) for each in index)
+    return made(index, device=x.device) if isinstance(index, list) else index
+
+
+_torch_tensor = torch.tensor
+
+
+def made(data: Any, *, device: Any = None, requires_grad: bool = False, **how: Any) -> Tensor:
+    """``torch.tensor``, which as it is makes one without numbers where the device is called meta."""
+    return _torch_tensor(data, **how).to(device or "cpu").requires_grad_(requires_grad)

@@ -1,0 +1,272 @@
+"""Corrections of cameras: their gradients, what they leave alone, and that they find cameras that were disturbed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dyngs.build import assemble
+from dyngs.camera import Cameras
+from dyngs.config import CameraConfig, Config, DataConfig, RandomInit, RunConfig, TrainConfig
+from dyngs.data.capture import View
+from dyngs.errors import DyngsError
+from dyngs.training.corrections.camera_refinement import (
+    MIN_POSES,
+    STARTS,
+    CameraCorrections,
+    CameraRefinement,
+    common_motions,
+    corrected,
+    slopes,
+    watched,
+)
+from dyngs.training.trainer import Trainer
+
+SIZE = 2.5
+
+
+def turned(vector: Tensor) -> Tensor:
+    """Return the rotation by ``vector``, rad."""
+    x, y, z = vector.tolist()
+    return torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
+
+
+def random_view(index: int, generator: torch.Generator, **changes: object) -> View:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = turned(torch.randn(3, generator=generator, dtype=torch.float64))
+    pose[:3, 3] = torch.randn(3, generator=generator, dtype=torch.float64)
+    intrinsics = np.array([[300.0, 0, 160], [0, 290, 120], [0, 0, 1]])
+    view = View(f"{index}", Path(f"{index}.png"), pose.numpy(), intrinsics, 320, 240)
+    return replace(view, **changes)  # type: ignore[arg-type]
+
+
+def random_views(count: int, seed: int = 0) -> list[View]:
+    generator = torch.Generator().manual_seed(seed)
+    return [random_view(i, generator) for i in range(count)]
+
+
+def camera_of(view: View) -> Cameras:
+    return Cameras(
+        torch.as_tensor(view.cam_from_world)[None], torch.as_tensor(view.intrinsics)[None], view.width, view.height
+    )
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_slopes_are_the_gradients_of_a_correction(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    camera = camera_of(random_view(0, generator))
+    weights = torch.randn(3, 4, generator=generator, dtype=torch.float64)
+    by_lens = torch.randn(4, generator=generator, dtype=torch.float64)
+
+    def loss(camera: Cameras) -> Tensor:
+        k = camera.intrinsics[0]
+        of_lens = torch.stack([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])  # all that the rasterizer takes of it
+        return (camera.cam_from_world[0, :3] * weights).sum() + (of_lens * by_lens).sum()
+
+    leaf = watched(camera)
+    by_pose, by_intrinsics = torch.autograd.grad(loss(leaf), [leaf.cam_from_world, leaf.intrinsics])
+    pose, lens = (torch.zeros(n, dtype=torch.float64, requires_grad=True) for n in (6, 3))
+    truth = torch.autograd.grad(loss(corrected(camera, pose, lens, SIZE)), [pose, lens])
+    for ours, theirs in zip(slopes(camera, by_pose, by_intrinsics, SIZE), truth, strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_no_correction_changes_nothing() -> None:
+    views = random_views(MIN_POSES)
+    camera = camera_of(views[0])
+    same = CameraCorrections(views, SIZE).applied(0, camera)
+    assert torch.equal(same.cam_from_world, camera.cam_from_world)
+    assert torch.equal(same.intrinsics, camera.intrinsics)
+
+
+def test_a_correction_means_the_same_at_every_scale() -> None:
+    """The same point of the world moves by the same fraction of the image."""
+    view = random_views(1)[0]
+    small = replace(view, intrinsics=np.diag([0.5, 0.5, 1.0]) @ view.intrinsics, width=160, height=120)
+    pose, lens = torch.tensor([0.01, -0.02, 0.03, 0.1, 0.2, -0.1]), torch.tensor([0.05, 0.01, -0.02])
+    large, little = (corrected(camera_of(v), pose, lens, SIZE) for v in (view, small))
+    torch.testing.assert_close(large.cam_from_world, little.cam_from_world)
+    torch.testing.assert_close(0.5 * large.intrinsics[0, :2], little.intrinsics[0, :2])
+
+
+def test_views_of_a_fixed_camera_share_their_correction() -> None:
+    views = random_views(3)
+    views.append(replace(views[1], name="later"))
+    corrections = CameraCorrections(views, SIZE)
+    assert [corrections.rows(i)[0] for i in range(4)] == [0, 1, 2, 1]
+    assert corrections.poses.shape == (3, 6)
+
+
+def test_a_lens_of_few_poses_stays() -> None:
+    few, many = random_views(MIN_POSES - 1), random_views(MIN_POSES)
+    assert CameraCorrections(few, SIZE).rows(0) == (0, None)
+    assert CameraCorrections(many, SIZE).rows(0) == (0, 0)
+    standing = [replace(many[0], name=f"{i}") for i in range(MIN_POSES)]
+    assert CameraCorrections(standing, SIZE).rows(0) == (0, None)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_common_motions_change_no_image(seed: int) -> None:
+    """A similarity of the world that scene and cameras follow together is one of them: to first order."""
+    views, small = random_views(6, seed), 1e-5
+    generator = torch.Generator().manual_seed(seed)
+    turn, shift = (torch.randn(3, generator=generator, dtype=torch.float64) for _ in range(2))
+    grown = 1 + 0.7 * small
+    found = []
+    centers = np.stack([np.linalg.inv(view.cam_from_world)[:3, 3] for view in views])
+    for view, center in zip(views, centers, strict=True):
+        camera = torch.as_tensor(view.cam_from_world)
+        pivot = torch.as_tensor(centers.mean(0))
+        moved = turned(small * turn) @ (grown * (torch.as_tensor(center) - pivot)) + pivot + small * shift
+        rotation = camera[:3, :3] @ turned(small * turn).T
+        change = rotation @ camera[:3, :3].T  # of the camera's axes
+        vector = (
+            torch.stack([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
+        )
+        translation = -rotation @ moved - change @ camera[:3, 3]
+        found.append(torch.cat([vector, translation / SIZE]) / small)
+    correction, basis = torch.stack(found).view(-1), common_motions(views, SIZE).double()
+    assert basis.shape == (36, 7)
+    torch.testing.assert_close(basis @ (basis.T @ correction), correction, rtol=0, atol=1e-4 * float(correction.norm()))
+
+
+def test_one_camera_stays() -> None:
+    """Its motion is one of the whole scene."""
+    corrections = CameraCorrections(random_views(1), SIZE)
+    corrections.poses += torch.randn(1, 6, generator=torch.Generator().manual_seed(0))
+    corrections.remove_common_motion()
+    assert float(corrections.poses.abs().max()) < 1e-6
+
+
+def points_seen(camera: Cameras, points: Tensor) -> Tensor:
+    """Return where points (N, 3) are seen, px."""
+    local = points @ camera.cam_from_world[0, :3, :3].T + camera.cam_from_world[0, :3, 3]
+    pixels = local @ camera.intrinsics[0].T
+    return pixels[:, :2] / pixels[:, 2:]
+
+
+def test_disturbed_cameras_are_found() -> None:
+    """Known points in view of cameras that were disturbed, whose errors in pixels are the loss."""
+    generator, steps = torch.Generator().manual_seed(3), 1500
+    points = torch.randn(40, 3, generator=generator)
+    truth, views = [], []
+    for view in random_views(MIN_POSES, 5):
+        pose = view.cam_from_world.copy()
+        pose[:3, 3] = [0, 0, 8]
+        disturbed = pose.copy()
+        noise = torch.randn(6, generator=generator, dtype=torch.float64)
+        disturbed[:3, :3] = turned(0.009 * noise[:3]).numpy() @ pose[:3, :3]
+        disturbed[:3, 3] += 0.02 * noise[3:].numpy()
+        truth.append(points_seen(camera_of(replace(view, cam_from_world=pose)), points.double()))
+        views.append(replace(view, cam_from_world=disturbed))
+    refinement = CameraRefinement(views, SIZE, steps)
+    errors = []
+    for step in range(1, steps + 1):
+        index = step % len(views)
+        camera = watched(refinement.corrections.applied(index, camera_of(views[index])))
+        error = (points_seen(camera, points.double()) - truth[index]).norm(dim=-1).mean()
+        error.backward()
+        refinement.optimize(step, index, camera)
+        errors.append(float(error.detach()))
+    first, last = (np.mean(errors[part]) for part in (slice(0, int(STARTS * steps)), slice(-8, None)))
+    assert last < 0.2 * first
+
+
+def test_state_goes_on_and_that_of_others_is_refused() -> None:
+    views = random_views(MIN_POSES)
+    one, other = (CameraRefinement(views, SIZE, 100) for _ in range(2))
+
+    def steps(refinement: CameraRefinement, first: int, last: int) -> None:
+        for step in range(first, last):
+            camera = watched(refinement.corrections.applied(step % MIN_POSES, camera_of(views[step % MIN_POSES])))
+            (camera.cam_from_world[0, :3].sin().sum() + camera.intrinsics.sum() / 300).backward()
+            refinement.optimize(step, step % MIN_POSES, camera)
+
+    steps(one, 1, 60)
+    other.load_state({name: x.clone() for name, x in one.state().items()})
+    steps(one, 60, 100)
+    steps(other, 60, 100)
+    assert all(torch.equal(x, other.state()[name]) for name, x in one.state().items())
+    assert float(one.corrections.poses.abs().max()) > 0
+    with pytest.raises((KeyError, ValueError, DyngsError)):
+        CameraRefinement(views[1:], SIZE, 100).load_state(one.state())
+
+
+def trainer_of(root: Path, refine: str) -> Trainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=root),
+            camera=CameraConfig(refine=refine),  # type: ignore[arg-type]
+            init=RandomInit(num_random=60),
+            train=TrainConfig(steps=40),
+            run=RunConfig(threads=1),
+        )
+    )
+
+
+def test_a_resumed_run_has_the_same_bytes(still: Path) -> None:
+    whole, first, second = (trainer_of(still, "always") for _ in range(3))
+    for _ in range(24):
+        whole.step()
+    for _ in range(12):
+        first.step()
+    second.restore(first.checkpoint())
+    for _ in range(12):
+        second.step()
+    ends = whole.checkpoint().tensors, second.checkpoint().tensors
+    assert ends[0].keys() == ends[1].keys()
+    assert bool(ends[0]["cameras.poses"].any())
+    assert all(torch.equal(x, ends[1][name]) for name, x in ends[0].items())
+
+
+def test_images_of_a_trainer_have_the_corrected_cameras(still: Path) -> None:
+    trainer = trainer_of(still, "always")
+    assert trainer.refinement is not None
+    given = [trainer.images.shrunk(0, divisor).cameras for divisor in (1, 2, 2)]
+    trainer.refinement.corrections.poses[0, 0] = 0.1
+    found = [trainer.images.shrunk(0, divisor).cameras for divisor in (1, 2, 2)]
+    for before, after in zip(given, found, strict=True):
+        assert torch.equal(after.cam_from_world, trainer.refinement.corrections.applied(0, before).cam_from_world)
+        assert not torch.equal(after.cam_from_world, before.cam_from_world)
+
+
+@pytest.mark.parametrize("refine", ["never", "auto"])
+def test_without_refinement_nothing_is_kept_for_it(refine: str, still: Path) -> None:
+    """Auto is decided before a run begins."""
+    trainer = trainer_of(still, refine)
+    assert trainer.refinement is None
+    assert not any(name.startswith("cameras") for name in trainer.state())
+
+
+def test_a_view_that_was_not_trained_on_has_what_is_known_of_its_camera() -> None:
+    """The pose of a camera that stands still, a lens of many poses, and nothing else; training views have both."""
+    views = random_views(MIN_POSES)
+    found = CameraCorrections(views, SIZE)
+    found.poses += 0.01
+    found.lenses += 0.02
+    generator = torch.Generator().manual_seed(1)
+    other = random_view(99, generator)
+    zoomed = random_view(98, generator, intrinsics=np.diag([200.0, 200.0, 1.0]))
+    same_place = replace(other, cam_from_world=views[2].cam_from_world)
+    for index, view in enumerate(views):
+        torch.testing.assert_close(
+            found.applied_to(view, camera_of(view)).cam_from_world, found.applied(index, camera_of(view)).cam_from_world
+        )
+    np.testing.assert_array_equal(found.corrected_view(zoomed).cam_from_world, zoomed.cam_from_world)
+    np.testing.assert_array_equal(found.corrected_view(zoomed).intrinsics, zoomed.intrinsics)
+    np.testing.assert_array_equal(found.corrected_view(other).cam_from_world, other.cam_from_world)
+    lens = found.corrected_view(views[0]).intrinsics
+    np.testing.assert_array_equal(found.corrected_view(other).intrinsics, lens)
+    assert abs(lens[0, 0] / other.intrinsics[0, 0] - np.exp(0.02)) < 1e-6
+    np.testing.assert_array_equal(
+        found.corrected_view(same_place).cam_from_world, found.corrected_view(views[2]).cam_from_world
+    )
+    assert np.abs(found.corrected_view(views[2]).cam_from_world - views[2].cam_from_world).max() > 1e-3

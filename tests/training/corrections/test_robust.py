@@ -1,0 +1,187 @@
+"""Masks found in training: what one image shows and the others do not is left out, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from flat_wall import BLACK, SIZE, cameras_before_wall, learned, places, seen_from, with_block, with_depth
+from torch import Tensor
+
+from dyngs.build import assemble
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.data.loader import Image
+from dyngs.gaussians.rendering import Rendering
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.training.corrections.robust import EVERY, WARM_UP, RobustMasks
+from dyngs.training.trainer import Trainer
+
+COUNT, STEPS = 8, 100
+AFTER = round(WARM_UP * STEPS) + 1
+ROWS, COLUMNS = slice(12, 42), slice(20, 44)
+
+
+def masks_of(images: list[Image]) -> RobustMasks:
+    return RobustMasks(images, [image.cameras for image in images], STEPS)  # type: ignore[arg-type]
+
+
+def masked_images(images: list[Image], drawn: list[Tensor], masks: RobustMasks | None = None) -> list[Image]:
+    """Return all images after a round of training on them."""
+    masks = masks or masks_of(images)
+    return [
+        masks.masked(i, AFTER, image, rgb, BLACK, with_depth)
+        for i, (image, rgb) in enumerate(zip(images, drawn, strict=True))
+    ]
+
+
+def busy_wall(which: tuple[int, ...] = (1, 4)) -> list[Image]:
+    """Return images of the wall, some with a block in front."""
+    images = seen_from(cameras_before_wall(COUNT))
+    return [with_block(x, ROWS, COLUMNS) if i in which else x for i, x in enumerate(images)]
+
+
+def test_what_stands_in_front_of_some_views_is_left_out() -> None:
+    images = busy_wall()
+    found = masked_images(images, [learned(image.cameras) for image in images])
+    for i, image in enumerate(found):
+        if i not in (1, 4):
+            assert image.mask is None
+            continue
+        assert image.mask is not None
+        assert not bool(image.mask[ROWS, COLUMNS].any())
+        far = torch.ones(SIZE[1], SIZE[0], dtype=torch.bool)
+        far[ROWS.start - 7 : ROWS.stop + 7, COLUMNS.start - 7 : COLUMNS.stop + 7] = False
+        assert bool((image.mask[far] == 1).all())
+
+
+def test_it_has_no_gradient() -> None:
+    image = busy_wall()[1]
+    drawn = [learned(x.cameras) for x in busy_wall()]
+    mask = masked_images(busy_wall(), drawn)[1].mask
+    rendered = drawn[1].requires_grad_()
+    l1_ssim_loss(rendered, image.rgb_premultiplied, 0.2, mask).backward()
+    assert rendered.grad is not None
+    assert not bool(rendered.grad[ROWS, COLUMNS].any())
+    assert bool(rendered.grad[0].any())
+
+
+def test_nothing_is_left_out_where_views_agree() -> None:
+    images = busy_wall(())
+    found = masked_images(images, [learned(image.cameras) for image in images])
+    assert all(image.mask is None for image in found)
+
+
+def test_what_is_not_learned_yet_counts() -> None:
+    """A hole in the model errs as much as a passer-by, but there the other views look like the image."""
+    images, drawn = busy_wall(()), []
+    for image in images:
+        x, y = places(image.cameras)
+        rgb = learned(image.cameras)
+        rgb[((x - 0.5).square() + y.square()) < 0.5] = 0.0
+        drawn.append(rgb)
+    assert all(image.mask is None for image in masked_images(images, drawn))
+
+
+def test_all_counts_while_the_run_warms_up() -> None:
+    images = busy_wall()
+    masks = masks_of(images)
+    drawn = learned(images[1].cameras)
+    assert masks.masked(1, AFTER - 1, images[1], drawn, BLACK, with_depth) is images[1]
+
+
+def test_a_image_is_looked_at_now_and_then_and_its_mask_stays_in_between() -> None:
+    images = busy_wall()
+    masks, drawn = masks_of(images), learned(images[1].cameras)
+    found: list[Tensor] = []
+    looks: list[int] = []
+
+    def counted(cameras: Cameras) -> Rendering:
+        looks.append(len(found))
+        return with_depth(cameras)
+
+    for _ in range(EVERY + 1):
+        mask = masks.masked(1, AFTER, images[1], drawn, BLACK, counted).mask
+        assert mask is not None
+        found.append(mask)
+    assert looks == [0, EVERY]
+    assert all(torch.equal(mask, found[0]) for mask in found)
+
+
+def test_the_images_own_mask_stays() -> None:
+    own = torch.ones(SIZE[1], SIZE[0])
+    own[:, :10] = 0
+    images = [replace(image, mask=own) for image in busy_wall()]
+    found = masked_images(images, [learned(image.cameras) for image in images])
+    for i in (0, 1):
+        mask = found[i].mask
+        assert mask is not None
+        assert not bool(mask[:, :10].any())
+    assert not bool(found[1].mask[ROWS, COLUMNS].any())  # type: ignore[index]
+    assert torch.equal(found[0].mask, own)  # type: ignore[arg-type]
+
+
+def test_smaller_images_have_the_same_cells() -> None:
+    images = busy_wall()
+    masks = masks_of(images)
+    masks.masked(1, AFTER, images[1], learned(images[1].cameras), BLACK, with_depth)
+    half = images[1].shrunk(2)
+    mask = masks.masked(1, AFTER, half, half.rgb_premultiplied, BLACK, with_depth).mask
+    assert mask is not None
+    assert mask.shape == (SIZE[1] // 2, SIZE[0] // 2)
+    assert not bool(mask[ROWS.start // 2 : ROWS.stop // 2, COLUMNS.start // 2 : COLUMNS.stop // 2].any())
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("visits", torch.zeros(3, dtype=torch.int64)),
+        ("left_out", torch.full((COUNT, 40, 40), 7, dtype=torch.uint8)),
+        ("histogram", torch.zeros(5, dtype=torch.float64)),
+    ],
+)
+def test_a_state_of_other_images_is_refused(name: str, wrong: Tensor) -> None:
+    masks = masks_of(busy_wall())
+    with pytest.raises(ValueError, match=name):
+        masks.load_state(masks.state() | {name: wrong})
+
+
+def trainer_of(root: Path, choice: str, model: DynamicModel | None = None) -> Trainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=root),
+            model=model or StaticModel(sh_degree=0),
+            init=RandomInit(num_random=60),
+            train=TrainConfig(steps=40, robust=choice),  # type: ignore[arg-type]
+            run=RunConfig(threads=1),
+        )
+    )
+
+
+def test_a_resumed_run_has_the_same_bytes(still: Path) -> None:
+    whole, first, second = (trainer_of(still, "always") for _ in range(3))
+    for _ in range(30):
+        whole.step()
+    for _ in range(15):
+        first.step()
+    second.restore(first.checkpoint())
+    for _ in range(15):
+        second.step()
+    ends = whole.checkpoint().tensors, second.checkpoint().tensors
+    assert ends[0].keys() == ends[1].keys()
+    assert "robust.left_out" in ends[0]
+    assert all(torch.equal(x, ends[1][name]) for name, x in ends[0].items())
+
+
+@pytest.mark.parametrize("choice", ["never", "auto"])
+def test_without_masks_nothing_is_kept_for_them(still: Path, choice: str) -> None:
+    """Auto is decided before a run begins."""
+    trainer = trainer_of(still, choice)
+    assert trainer.robust is None
+    assert not any(name.startswith("robust") for name in trainer.state())
+
+
+def test_what_moves_has_none(moving: Path) -> None:
+    assert trainer_of(moving, "always", DynamicModel(sh_degree=0)).robust is None

@@ -1,0 +1,201 @@
+"""A run that goes on to another number of steps: it does so to the same bytes however it is stopped, of every kind."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+from tiny_fields import busy_config, write_tiny_capture
+from tiny_people import TINY
+
+from dyngs.api.train import train
+from dyngs.config import (
+    AutoColour,
+    BudgetConfig,
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    HumanModel,
+    McmcStrategy,
+    RandomInit,
+    RunConfig,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.config.io import load_resolved
+from dyngs.config.kinds import harmonics_measured_after
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.errors import DyngsError
+from dyngs.human.synthetic.capture import write_human_capture
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.static.rates import Rates
+from dyngs.training.extend import told, with_length
+from dyngs.training.schedule import active_sh_degree, deform_schedule, image_divisor
+from dyngs.training.trainer import StepReport, Trainer
+
+KINDS = ("default", "mcmc", "control_nodes", "human")
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("captures")
+    write_still_capture(root / "still", StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    write_tiny_capture(root / "moving")
+    write_human_capture(root / "person", TINY)
+    return root
+
+
+def _config(captures: Path, folder: Path, kind: str, **changes: object) -> Config:
+    if kind == "control_nodes":
+        return busy_config(captures / "moving", folder, kind).model_copy(update=changes)
+    person, still = kind == "human", "person" if kind == "human" else "still"
+    strategies = {
+        "default": DefaultStrategy(start=1, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150),
+        "mcmc": McmcStrategy(start=1, stop=15_000, every=3, max_gaussians=90, min_opacity=0.45),
+        "human": DefaultStrategy(grow=False),
+    }
+    config = Config(
+        data=DataConfig(root=captures / still),
+        model=HumanModel(resolution=16, sh_degree=0) if person else StaticModel(sh_degree=2),
+        init=RandomInit(num_random=60),
+        strategy=strategies[kind],
+        train=TrainConfig(steps=12, log_every=1),
+        run=RunConfig(dir=folder, threads=1),
+    )
+    return config.model_copy(update=changes)
+
+
+def _to(folder: Path, steps: int) -> Path:
+    return train(load_resolved(folder, [f"train.steps={steps}"]), resume_from=folder)
+
+
+def _stop_after(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Trainer.step
+
+    def stepping(trainer: Trainer) -> StepReport:
+        if trainer.done + 1 == step:
+            signal.raise_signal(signal.SIGINT)
+        return real(trainer)
+
+    monkeypatch.setattr(Trainer, "step", stepping)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_finished_run_goes_on_to_the_same_bytes_also_when_it_is_stopped(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    one, other = tmp_path / "one", tmp_path / "other"
+    config = _config(captures, one, kind)
+    done = train(config) and config.train.steps
+    shutil.copytree(one, other)
+    capsys.readouterr()
+    _to(one, 2 * done)
+    assert f"from step {done} to {2 * done} instead of {done}" in capsys.readouterr().out
+    with monkeypatch.context() as patch:
+        _stop_after(done + 5, patch)
+        with pytest.raises(KeyboardInterrupt, match="--resume"):
+            _to(other, 2 * done)
+    assert load_run(other).step == done + 5
+    train(load_resolved(other), resume_from=other)
+    _to(one, 2 * done)  # has them: nothing to do
+    ends = [checkpoint_paths(folder)[-1] for folder in (one, other)]
+    assert [end.name for end in ends] == [f"step_{2 * done:07d}.safetensors"] * 2
+    assert ends[0].read_bytes() == ends[1].read_bytes()
+    assert (one / "config.yaml").read_bytes() == (other / "config.yaml").read_bytes()
+
+
+def test_gaussians_are_added_again_where_the_new_schedule_says_so(captures: Path, tmp_path: Path) -> None:
+    run = train(_config(captures, tmp_path / "run", "default"))
+    before = len(load_run(run).scene)
+    _to(run, 48)
+    assert len(load_run(run).scene) > before
+
+
+def test_a_run_that_was_stopped_may_become_longer_or_shorter(
+    captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        _stop_after(6, patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(_config(captures, run, "default"))
+    with pytest.raises(DyngsError, match="6 steps are done"):
+        _to(run, 6)
+    for steps in (20, 9):
+        copy = tmp_path / str(steps)
+        shutil.copytree(run, copy)
+        _to(copy, steps)
+        assert load_run(copy).step == load_resolved(copy).train.steps == steps
+
+
+def test_limits_hold_on_but_that_of_time(captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = BudgetConfig(max_gaussians=70, max_mb=1.0)
+    run = train(_config(captures, tmp_path / "run", "default", budget=asked, train=TrainConfig(steps=12, minutes=5)))
+    capsys.readouterr()
+    _to(run, 24)
+    assert "train.minutes holds no longer" in capsys.readouterr().out
+    assert load_resolved(run).budget == asked
+    assert load_resolved(run).train.minutes is None
+    assert load_run(run).step == 24
+    assert len(load_run(run).scene) <= 70
+    assert load_run(run / "export").step == 24
+
+
+def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path: Path) -> None:
+    run = train(_config(captures, tmp_path / "run", "default"))
+    before = (run / "config.yaml").read_bytes()
+    with pytest.raises(DyngsError, match="12 steps are done already"):
+        _to(run, 7)
+    assert (run / "config.yaml").read_bytes() == before
+    config = _config(captures, run, "default")
+    with pytest.raises(DyngsError, match="pruned"):
+        with_length(config, 20, 40)
+    (run / "checkpoints" / "step_0000012.safetensors").unlink()
+    (run / "timing.json").unlink()
+    with pytest.raises(DyngsError, match="no checkpoint"):
+        _to(run, 24)
+
+
+def test_what_has_begun_keeps_its_step() -> None:
+    options = TrainConfig(steps=1000, initial_downscale=4, hold_out_every=8)
+    model = DynamicModel(time_window=0.1, time_window_grows_from=0.4, time_window_full_at=0.6, motion_from=0.35)
+    config = Config(data=DataConfig(root=Path("x")), model=model, colour=AutoColour(measure_at=0.3), train=options)
+    old = deform_schedule(model, Rates(1000))
+    assert old.fine == 350
+    for done in (360, 500, 700, 1000):
+        for steps in (done + 10, 1050, 9000):
+            if steps == 9000 and done < 1000:
+                with pytest.raises(DyngsError, match="1,000 before anything moves"):
+                    with_length(config, done, steps)
+                continue
+            new = with_length(config, done, steps)
+            assert isinstance(new.model, DynamicModel)
+            now = deform_schedule(new.model, Rates(steps))
+            assert now.fine == (350 if steps < 9000 else 1000)
+            assert harmonics_measured_after(new) == 300
+            assert image_divisor(new.train, done) <= image_divisor(options, done)
+            assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
+            if done >= old.opens and steps < 9000:
+                assert (now.opens, now.full) == (old.opens, min(old.full, steps))
+            assert new.train.hold_out_every == (0 if done >= 900 else 8)
+            assert told(config, new, done).count("\n") == 0
+
+
+def test_exposures_that_are_learned_stay_so() -> None:
+    options = TrainConfig(steps=1000, exposure="always")
+    config = Config(data=DataConfig(root=Path("x")), train=options)
+    assert with_length(config, 1000, 3000).train.exposure == "always"
+    with pytest.raises(DyngsError, match="exposures were learned after"):
+        with_length(config, 1000, 1_000_000)
+
+
+def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
+    model = DynamicModel(motion_from=0.5)
+    config = Config(data=DataConfig(root=Path("x")), model=model, colour=AutoColour(), train=TrainConfig(steps=10_000))
+    new = with_length(config, 4000, 5000)
+    assert isinstance(new.model, DynamicModel)
+    assert deform_schedule(new.model, Rates(5000)).fine == 4001
+    assert harmonics_measured_after(new) == 4001
