@@ -1,5 +1,5 @@
 // What all bindings share: the type of arrays, C-contiguous ones of NumPy and torch, in the memory of the device whose module
-// this is: the CPU's, or with DYNGS_CARD that of a CUDA card. With DYNGS_EMULATED the card's memory is the CPU's, too.
+// this is: the CPU's, or with DYNGS_GPU that of a CUDA GPU. With DYNGS_EMULATED the GPU's memory is the CPU's, too.
 // And the last line of defence before raw pointers: `checked` returns an array's pointer, null where it is left out, and
 // refuses other sizes.
 #pragma once
@@ -17,17 +17,17 @@ namespace nb = nanobind;
 
 namespace dyngs {
 
-#if defined(DYNGS_CARD) && !defined(DYNGS_EMULATED)
+#if defined(DYNGS_GPU) && !defined(DYNGS_EMULATED)
 using Device = nb::device::cuda;
 #else
 using Device = nb::device::cpu;
 #endif
 
-// On a card there is no float64, and bindings check sizes only: reading indices back would wait for it.
-#if defined(DYNGS_CARD)
-inline constexpr bool kOnCard = true;
+// On a GPU there is no float64, and bindings check sizes only: reading indices back would wait for it.
+#if defined(DYNGS_GPU)
+inline constexpr bool kOnGpu = true;
 #else
-inline constexpr bool kOnCard = false;
+inline constexpr bool kOnGpu = false;
 #endif
 
 template <class T, class... Config>
@@ -44,7 +44,7 @@ inline auto array(const char* name) { return nb::arg(name).noconvert(); }
 template <class F>
 void for_each_scalar(F&& bind) {
   bind.template operator()<float>();
-  if constexpr (!kOnCard) bind.template operator()<double>();
+  if constexpr (!kOnGpu) bind.template operator()<double>();
 }
 
 template <class T>

@@ -18,7 +18,7 @@ void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gau
   if (by_means.ndim() != 2) throw nb::value_error("offsets: arrays of different sizes");
   const int64_t n = logit_opacities.size(), count = by_means.shape(0);
   const auto wrong = [n](int64_t row) { return row < 0 || row >= n; };
-  const bool all_exist = rows ? kOnCard || std::none_of(rows->data(), rows->data() + rows->size(), wrong) : count <= n;
+  const bool all_exist = rows ? kOnGpu || std::none_of(rows->data(), rows->data() + rows->size(), wrong) : count <= n;
   if (!all_exist) throw nb::index_error("offsets: no such Gaussian");
   const RowOffsets<S> from{count,
                            checked(rows, count, "offsets: rows"),

@@ -82,7 +82,7 @@ void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, co
       (g_coords && g_coords->shape(0) != coords.shape(0)) || g_features.shape(1) != levels.size() * planes.channels)
     throw nb::value_error("hexplane_backward: arrays of different sizes");
   const auto missing = [&points](int32_t i) { return i < 0 || i >= points.count; };
-  if (!kOnCard && std::any_of(order.data(), order.data() + points.count, missing))
+  if (!kOnGpu && std::any_of(order.data(), order.data() + points.count, missing))
     throw nb::index_error("hexplane_backward: no such point");
   nb::gil_scoped_release release;
   hexplane_backward<S>(planes, points, order.data(), g_features.data(), grads, g_coords ? g_coords->data() : nullptr,

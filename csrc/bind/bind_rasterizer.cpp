@@ -20,7 +20,7 @@ void expect_rank(const A& array, size_t rank, const char* name) {
             .c_str());
 }
 
-// A picture's side, or a number of threads.
+// A image's side, or a number of threads.
 int within(int64_t value, int64_t most, const char* name) {
   if (value < 1 || value > most)
     throw nb::value_error(
@@ -223,7 +223,7 @@ Entries checked_entries(const EntryArrays& arrays, const Splats<S>& s) {
   const Entries entries{checked(tile_offsets, tiles + 1, "tile_offsets"),
                         checked(slot_ranges, 2 * splats, "slot_ranges"), gaussians.data(),
                         checked(slots, count, "slots"), count};
-  if (kOnCard) return entries;
+  if (kOnGpu) return entries;
   if (!in_order(entries, tiles, splats))
     throw nb::value_error("tile_offsets or slot_ranges name entries that are not there");
   if (!all_within(entries.gaussians, count, splats)) throw nb::value_error("gaussians name splats that are not there");

@@ -15,7 +15,7 @@ void write_inputs(const std::tuple<Rows<const S>, Rows<const S>, Rows<const S>>&
   const auto& [means, quats, log_scales] = geometry;
   const size_t n = means.shape(0), rows = picked.shape(0);
   const auto wrong = [n](int64_t i) { return i < 0 || i >= static_cast<int64_t>(n); };
-  if (!kOnCard && std::any_of(picked.data(), picked.data() + rows, wrong))
+  if (!kOnGpu && std::any_of(picked.data(), picked.data() + rows, wrong))
     throw nb::index_error("shading: no such Gaussian");
   const Shading<S> in{static_cast<int64_t>(rows),
                       picked.data(),

@@ -24,7 +24,7 @@ template <class S>
 SkinPoints<S> points_input(const PointArrays<S>& arrays, int64_t num_nodes) {
   const auto& [coords, followed] = arrays;
   const int64_t count = followed.shape(0), per_point = followed.shape(1);
-  if (!kOnCard && !follow_within(followed.data(), count * per_point, num_nodes))
+  if (!kOnGpu && !follow_within(followed.data(), count * per_point, num_nodes))
     throw nb::index_error("skinning: a point follows a node that does not exist");
   return {checked(coords, count, 3, kOp), followed.data(), count, per_point};
 }

@@ -77,7 +77,7 @@ bool keep_freed_memory() {
 void bind_train(nb::module_& module) {
   module.def("l1_ssim", l1_ssim_arrays, array("rendered"), array("target"), array("mask").none(),
              array("gradient").none(), array("loss"), nb::arg("ssim_weight"), nb::arg("num_threads"),
-             "Writes the loss of two (H, W, 3) pictures, and its gradient by `rendered` unless that is None.");
+             "Writes the loss of two (H, W, 3) images, and its gradient by `rendered` unless that is None.");
   module.def("adam_step", adam_step_arrays, array("param"), array("grad"), array("exp_avg"), array("exp_avg_sq"),
              array("column_rates"), array("rows").none(), array("skipped"), nb::arg("options"), nb::arg("num_threads"),
              "Adam step on (N, C) arrays in place; adds the number of rows skipped for a non-finite gradient.");

@@ -1,4 +1,4 @@
-// The extension module for CUDA cards: the bindings of csrc/bind, compiled for arrays in a card's memory, over the kernels of
+// The extension module for CUDA GPUs: the bindings of csrc/bind, compiled for arrays in a GPU's memory, over the kernels of
 // csrc/cuda. Compiled against their emulation (csrc/tests) it is a module for arrays of the CPU, which the tests run.
 #include "bind/arrays.hpp"
 #include "bind_cuda/queue.hpp"
@@ -42,7 +42,7 @@ NB_MODULE(DYNGS_MODULE, module) {
   module.def(
       "use_queue",
       [](int device, uintptr_t stream) { dyngs::cuda::use_queue(device, reinterpret_cast<void*>(stream)); },
-      nb::arg("device"), nb::arg("stream"), "Makes all later calls of this thread go to a cudaStream_t of a card.");
+      nb::arg("device"), nb::arg("stream"), "Makes all later calls of this thread go to a cudaStream_t of a GPU.");
 #if !defined(DYNGS_EMULATED)
   module.def("runtime_version", dyngs::runtime_version);
   module.def("driver_version", dyngs::driver_version);

@@ -1,4 +1,4 @@
-// The ops of core/api.hpp that the bindings call, on a card: those of cuda/api.hpp, queued where use_queue says, with memory
+// The ops of core/api.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued where use_queue says, with memory
 // that torch lends. They compute in float32; dyngs/ops/native.py refuses float64.
 #include "core/api.hpp"
 

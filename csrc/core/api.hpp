@@ -134,7 +134,7 @@ struct Entries {
 // A sum per Gaussian that is taken while drawing. The numbers are those of dyngs/ops.
 enum class Tally {
   kNone,
-  kWeights,        // alpha T: its share of the picture
+  kWeights,        // alpha T: its share of the image
   kPixels,         // pixels that it was blended into
   kLanes,          // pixels that were computed for it, blended or not
   kSquaredSlopes,  // squares of d(sum of channels) / dG, G the 2D Gaussian's value at the pixel, before its opacity

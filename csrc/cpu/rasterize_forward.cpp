@@ -191,7 +191,7 @@ void rasterize_forward(const Splats<S>& s, const Entries& entries, const Image<S
     case Tally::kPixels: return blend_with_tally<S, Tally::kPixels>(s, entries, image);
     case Tally::kLanes: return blend_with_tally<S, Tally::kLanes>(s, entries, image);
     case Tally::kSquaredSlopes:
-      blend(s, entries, image);  // the light behind a Gaussian is taken from the finished picture
+      blend(s, entries, image);  // the light behind a Gaussian is taken from the finished image
       return blend_with_tally<S, Tally::kSquaredSlopes>(s, entries, image);
     case Tally::kNone: return blend(s, entries, image);
   }

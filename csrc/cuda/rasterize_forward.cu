@@ -181,7 +181,7 @@ void rasterize_forward(const Splats<float>& s, const Entries& entries, const Ima
     case Tally::kPixels: return blend_with_tally<Tally::kPixels>(s, entries, image, workspace, stream);
     case Tally::kLanes: return blend_with_tally<Tally::kLanes>(s, entries, image, workspace, stream);
     case Tally::kSquaredSlopes:
-      blend(s, entries, image, stream);  // the light behind a Gaussian is that of the finished picture
+      blend(s, entries, image, stream);  // the light behind a Gaussian is that of the finished image
       return blend_with_tally<Tally::kSquaredSlopes>(s, entries, image, workspace, stream);
     case Tally::kNone: return blend(s, entries, image, stream);
   }
