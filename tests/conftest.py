@@ -32,7 +32,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.human.fit import fitted_capture
 from dyngs.human.fit.capture_fit import FitEffort
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.ops.native import core
+from dyngs.ops.native import built_isas, core
 
 SHARED = Path(__file__).parents[1] / "../shared/data"
 
@@ -79,9 +79,9 @@ def scene() -> Scene:
 
 @pytest.fixture(params=["v2", "v3", "v4"])
 def isa(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The rasterizer runs on the kernels of this instruction set."""
-    if request.param > core.best_isa():
-        pytest.skip(f"this processor has no {request.param}")
+    """The ops run on the kernels of this instruction set."""
+    if request.param not in built_isas() or request.param > core.best_isa():
+        pytest.skip(f"{request.param} is not compiled, or not of this processor")
     module = import_module(f"dyngs.ops._core_{request.param}")
     monkeypatch.setattr("dyngs.ops.native.core", module)
     return request.param

@@ -92,7 +92,7 @@ def build_module(base: Path, folder: Path) -> ModuleType:
         pytest.skip("Python's headers are not here")
     sources = Path(nanobind.source_dir())
     includes = (nanobind.include_dir(), sources / "../ext/robin_map/include", python)
-    names = {"DYNGS_CARD": 1, "DYNGS_EMULATED": 1, "DYNGS_MODULE": NAME, "NB_DOMAIN": "dyngs_emulated"}
+    names = {"DYNGS_GPU": 1, "DYNGS_EMULATED": 1, "DYNGS_MODULE": NAME, "NB_DOMAIN": "dyngs_emulated"}
     flags = ["-O0", "-fvisibility=hidden", *(f"-I{x}" for x in includes), *(f"-D{k}={v}" for k, v in names.items())]
     own = [*sorted((ROOT / "csrc/bind_cuda").glob("*.cpp")), *BINDINGS, ROOT / "csrc/cpu/memory.cpp"]
     objects = compiled(folder, [*own, sources / "nb_combined.cpp"], flags)

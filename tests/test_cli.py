@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -521,8 +522,25 @@ def test_synth_leaves_a_used_folder_alone(capture: Path, capsys: Capture) -> Non
 def test_doctor(capsys: Capture) -> None:
     assert main(["doctor"]) == 0
     text = capsys.readouterr().out
-    assert "instruction set v" in text
+    assert re.search(r"instruction set v\d \(\S+\), compiled: v\d", text)
     assert "broken" not in text
+
+
+def test_doctor_reports_kernels_that_this_processor_cannot_run() -> None:
+    environment = ENVIRONMENT | {"DYNGS_ISA": "v9"}
+    command = [sys.executable, "-m", "dyngs", "doctor"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert re.search(r"native core +broken +DYNGS_ISA=v9", done.stdout)
+    assert done.stderr.startswith("dyngs: error: this installation cannot work: native core")
+
+
+def test_doctor_reports_a_faster_instruction_set(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setattr("dyngs.ops.native.built_isas", lambda: ("v2",))
+    monkeypatch.setattr("dyngs.ops.native.core", SimpleNamespace(best_isa=lambda: "v4"))
+    assert main(["doctor"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "compiled: v2; this processor also runs v4 (AVX-512): install again on it for more speed" in text
 
 
 def test_one_openmp_runtime() -> None:

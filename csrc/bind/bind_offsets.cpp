@@ -1,33 +1,14 @@
 // Python binding of the offsets of a deformation field. Argument unpacking only.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
-
 #include <algorithm>
-#include <optional>
-#include <tuple>
 
 #include "bind/arrays.hpp"
 #include "core/api.hpp"
-
-namespace nb = nanobind;
 
 namespace dyngs {
 namespace {
 
 template <class S>
-using Maybe = std::optional<Array<const S>>;
-
-template <class A>
-auto checked(const A& array, int64_t count) -> decltype(array.data()) {
-  if (static_cast<int64_t>(array.size()) != count) throw nb::value_error("offsets: arrays of different sizes");
-  return array.data();
-}
-template <class T>
-const T* checked(const std::optional<Array<const T>>& array, int64_t count) {
-  return array ? checked(*array, count) : nullptr;
-}
+using Maybe = MaybeArray<const S>;
 
 template <class S>
 void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gaussians, const Maybe<int64_t>& rows,
@@ -37,20 +18,19 @@ void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gau
   if (by_means.ndim() != 2) throw nb::value_error("offsets: arrays of different sizes");
   const int64_t n = logit_opacities.size(), count = by_means.shape(0);
   const auto wrong = [n](int64_t row) { return row < 0 || row >= n; };
-  const bool all_exist =
-      rows ? !kReadable || std::none_of(rows->data(), rows->data() + rows->size(), wrong) : count <= n;
+  const bool all_exist = rows ? kOnGpu || std::none_of(rows->data(), rows->data() + rows->size(), wrong) : count <= n;
   if (!all_exist) throw nb::index_error("offsets: no such Gaussian");
   const RowOffsets<S> from{count,
-                           checked(rows, count),
-                           checked(by_means, 3 * count),
-                           checked(by_quats, 4 * count),
-                           checked(by_log_scales, 3 * count),
-                           checked(by_logit_opacities, count),
-                           checked(by_colors, 3 * count)};
+                           checked(rows, count, "offsets: rows"),
+                           checked(by_means, 3 * count, "offsets: by_means"),
+                           checked(by_quats, 4 * count, "offsets: by_quats"),
+                           checked(by_log_scales, 3 * count, "offsets: by_log_scales"),
+                           checked(by_logit_opacities, count, "offsets: by_logit_opacities"),
+                           checked(by_colors, 3 * count, "offsets: by_colors")};
   const int64_t stride = n ? static_cast<int64_t>(sh.size()) / n : 0;
-  const MovedGaussians<S> to{checked(means, 3 * n),
-                             checked(quats, 4 * n),
-                             checked(log_scales, 3 * n),
+  const MovedGaussians<S> to{checked(means, 3 * n, "offsets: means"),
+                             checked(quats, 4 * n, "offsets: quats"),
+                             checked(log_scales, 3 * n, "offsets: log_scales"),
                              logit_opacities.data(),
                              sh.data(),
                              stride};
@@ -62,8 +42,7 @@ void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gau
 }  // namespace
 
 void bind_offsets(nb::module_& module) {
-  module.def("add_offsets", add<float>);
-  module.def("add_offsets", add<double>);
+  for_each_scalar([&]<class S>() { module.def("add_offsets", add<S>); });
 }
 
 }  // namespace dyngs

@@ -1,17 +1,10 @@
 // Python bindings of the fused multilayer perceptron. Argument unpacking only.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
-#include <optional>
-#include <string>
 #include <vector>
 
 #include "bind/arrays.hpp"
 #include "core/api.hpp"
-
-namespace nb = nanobind;
 
 namespace dyngs {
 namespace {
@@ -32,57 +25,42 @@ Perceptron<S> network(const std::vector<int64_t>& widths, int64_t skip, const Ar
   return {widths, skip, params.data(), threads};
 }
 
-// Refuses arrays whose size is not `count`: the last line of defence before raw pointers.
-template <class T>
-T* checked(const Array<T>& array, int64_t count, const char* name) {
-  if (static_cast<int64_t>(array.size()) != count)
-    throw nb::value_error((std::string("perceptron: ") + name + " has " + std::to_string(array.size()) +
-                           " elements, expected " + std::to_string(count))
-                              .c_str());
-  return array.data();
-}
-template <class T>
-T* checked(const std::optional<Array<T>>& array, int64_t count, const char* name) {
-  return array ? checked(*array, count, name) : nullptr;
-}
-
 template <class S>
-void forward(Array<const S> x, Array<const S> params, Array<S> y, std::optional<Array<S>> kept,
+void forward(Array<const S> x, Array<const S> params, Array<S> y, MaybeArray<S> kept,
              const std::vector<int64_t>& widths, int64_t skip, int threads) {
   const Perceptron<S> net = network(widths, skip, params, threads);
   const int64_t rows = x.size() / widths.front();
-  checked(params, net.num_params(), "params");
-  const S* from = checked(x, rows * widths.front(), "x");
-  S* to = checked(y, rows * widths.back(), "y");
-  S* keep = checked(kept, rows * net.kept_per_row(), "kept");
+  checked(params, net.num_params(), "perceptron: params");
+  const S* from = checked(x, rows * widths.front(), "perceptron: x");
+  S* to = checked(y, rows * widths.back(), "perceptron: y");
+  S* keep = checked(kept, rows * net.kept_per_row(), "perceptron: kept");
   nb::gil_scoped_release release;
   perceptron_forward(net, rows, from, to, keep);
 }
 
 template <class S>
-void backward(Array<const S> x, Array<const S> params, Array<const S> grad_y, std::optional<Array<const S>> kept,
-              std::optional<Array<S>> grad_x, Array<S> grad_params, const std::vector<int64_t>& widths, int64_t skip,
+void backward(Array<const S> x, Array<const S> params, Array<const S> grad_y, MaybeArray<const S> kept,
+              MaybeArray<S> grad_x, Array<S> grad_params, const std::vector<int64_t>& widths, int64_t skip,
               int threads) {
   const Perceptron<S> net = network(widths, skip, params, threads);
   const int64_t rows = x.size() / widths.front();
-  checked(params, net.num_params(), "params");
-  const S* from = checked(x, rows * widths.front(), "x");
-  const S* grad = checked(grad_y, rows * widths.back(), "grad_y");
-  const S* keep = checked(kept, rows * net.kept_per_row(), "kept");
-  S* to_x = checked(grad_x, rows * widths.front(), "grad_x");
-  S* to_params = checked(grad_params, net.num_params(), "grad_params");
+  checked(params, net.num_params(), "perceptron: params");
+  const S* from = checked(x, rows * widths.front(), "perceptron: x");
+  const S* grad = checked(grad_y, rows * widths.back(), "perceptron: grad_y");
+  const S* keep = checked(kept, rows * net.kept_per_row(), "perceptron: kept");
+  S* to_x = checked(grad_x, rows * widths.front(), "perceptron: grad_x");
+  S* to_params = checked(grad_params, net.num_params(), "perceptron: grad_params");
   nb::gil_scoped_release release;
   perceptron_backward(net, rows, from, grad, keep, to_x, to_params);
 }
 
 template <class S>
-void bind(nb::module_& module) {
-  module.def("perceptron_forward", forward<S>, nb::arg("x").noconvert(), nb::arg("params").noconvert(),
-             nb::arg("y").noconvert(), nb::arg("kept").noconvert().none(), nb::arg("widths"), nb::arg("skip"),
-             nb::arg("num_threads"), "Writes the outputs of (M, K) rows, and what the backward pass can use again.");
-  module.def("perceptron_backward", backward<S>, nb::arg("x").noconvert(), nb::arg("params").noconvert(),
-             nb::arg("grad_y").noconvert(), nb::arg("kept").noconvert().none(), nb::arg("grad_x").noconvert().none(),
-             nb::arg("grad_params").noconvert(), nb::arg("widths"), nb::arg("skip"), nb::arg("num_threads"),
+void bind_perceptron_of(nb::module_& module) {
+  module.def("perceptron_forward", forward<S>, array("x"), array("params"), array("y"), array("kept").none(),
+             nb::arg("widths"), nb::arg("skip"), nb::arg("num_threads"),
+             "Writes the outputs of (M, K) rows, and what the backward pass can use again.");
+  module.def("perceptron_backward", backward<S>, array("x"), array("params"), array("grad_y"), array("kept").none(),
+             array("grad_x").none(), array("grad_params"), nb::arg("widths"), nb::arg("skip"), nb::arg("num_threads"),
              "Writes the gradients by the rows and by the parameters.");
 }
 
@@ -96,7 +74,7 @@ void bind_perceptron(nb::module_& module) {
         return Perceptron<float>{widths, skip, nullptr, 1}.kept_per_row();
       },
       nb::arg("widths"), nb::arg("skip"), "Scalars per row that the forward pass can keep for the backward pass.");
-  bind<float>(module), bind<double>(module);
+  for_each_scalar([&]<class S>() { bind_perceptron_of<S>(module); });
 }
 
 }  // namespace dyngs

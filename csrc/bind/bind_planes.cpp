@@ -1,20 +1,12 @@
 // Python bindings of the HexPlane look-up and of the penalties of its planes. Argument unpacking only.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
-#include <optional>
-#include <tuple>
 #include <vector>
 
 #include "bind/arrays.hpp"
 #include "bind/results.hpp"
 #include "core/api.hpp"
-
-namespace nb = nanobind;
 
 namespace dyngs {
 namespace {
@@ -90,7 +82,7 @@ void hexplane_backward_arrays(const Array<const S, nb::shape<-1, 3>>& coords, co
       (g_coords && g_coords->shape(0) != coords.shape(0)) || g_features.shape(1) != levels.size() * planes.channels)
     throw nb::value_error("hexplane_backward: arrays of different sizes");
   const auto missing = [&points](int32_t i) { return i < 0 || i >= points.count; };
-  if (kReadable && std::any_of(order.data(), order.data() + points.count, missing))
+  if (!kOnGpu && std::any_of(order.data(), order.data() + points.count, missing))
     throw nb::index_error("hexplane_backward: no such point");
   nb::gil_scoped_release release;
   hexplane_backward<S>(planes, points, order.data(), g_features.data(), grads, g_coords ? g_coords->data() : nullptr,
@@ -111,22 +103,21 @@ void plane_penalty_arrays(const Levels<const S>& levels, const std::optional<Lev
 
 template <class S>
 void bind_planes_of(nb::module_& module) {
-  module.def("hexplane_forward", hexplane_forward_arrays<S>, nb::arg("coords").noconvert(),
-             nb::arg("levels").noconvert(), nb::arg("time"), nb::arg("features").noconvert(),
-             nb::arg("order").noconvert(), nb::arg("num_threads"),
+  module.def("hexplane_forward", hexplane_forward_arrays<S>, array("coords"), array("levels"), nb::arg("time"),
+             array("features"), array("order"), nb::arg("num_threads"),
              "Writes (M, L * C) features of (M, 3) coordinates, and the order of visit for the backward pass.");
-  module.def("hexplane_backward", hexplane_backward_arrays<S>, nb::arg("coords").noconvert(),
-             nb::arg("levels").noconvert(), nb::arg("time"), nb::arg("order").noconvert(),
-             nb::arg("g_features").noconvert(), nb::arg("g_levels").noconvert(), nb::arg("g_coords").noconvert().none(),
-             nb::arg("num_threads"), "Writes the gradients by the planes and, unless None, by the coordinates.");
-  module.def("plane_penalty", plane_penalty_arrays<S>, nb::arg("levels").noconvert(),
-             nb::arg("g_levels").noconvert().none(), nb::arg("weights"), nb::arg("penalty").noconvert(),
-             nb::arg("num_threads"),
+  module.def("hexplane_backward", hexplane_backward_arrays<S>, array("coords"), array("levels"), nb::arg("time"),
+             array("order"), array("g_features"), array("g_levels"), array("g_coords").none(), nb::arg("num_threads"),
+             "Writes the gradients by the planes and, unless None, by the coordinates.");
+  module.def("plane_penalty", plane_penalty_arrays<S>, array("levels"), array("g_levels").none(), nb::arg("weights"),
+             array("penalty"), nb::arg("num_threads"),
              "Writes the weighted sum of the penalties of all planes, and its gradient unless that is None.");
 }
 
 }  // namespace
 
-void bind_planes(nb::module_& module) { bind_planes_of<float>(module), bind_planes_of<double>(module); }
+void bind_planes(nb::module_& module) {
+  for_each_scalar([&]<class S>() { bind_planes_of<S>(module); });
+}
 
 }  // namespace dyngs

@@ -1,46 +1,16 @@
 // Python bindings of projection, harmonics, binning and rasterization. Argument unpacking only: arrays come in contiguous
 // and of the right shape from dyngs/ops, which also allocates every output.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
-#include <nanobind/stl/tuple.h>
 
 #include <algorithm>
-#include <optional>
-#include <string>
-#include <tuple>
 
 #include "bind/arrays.hpp"
 #include "bind/results.hpp"
 #include "core/api.hpp"
 #include "cpu/memory.hpp"
 
-namespace nb = nanobind;
-
 namespace dyngs {
 namespace {
-
-template <class T>
-using MaybeArray = std::optional<Array<T>>;
-
-template <class T>
-T* data_or_null(const MaybeArray<T>& array) {
-  return array ? array->data() : nullptr;
-}
-
-// Refuses arrays whose size is not `count`: the last line of defence before raw pointers.
-template <class T>
-void expect(const Array<T>& array, int64_t count, const char* name) {
-  if (static_cast<int64_t>(array.size()) != count)
-    throw nb::value_error(
-        (std::string(name) + " has " + std::to_string(array.size()) + " elements, expected " + std::to_string(count))
-            .c_str());
-}
-template <class T>
-void expect(const MaybeArray<T>& array, int64_t count, const char* name) {
-  if (array) expect(*array, count, name);
-}
 
 template <class A>
 void expect_rank(const A& array, size_t rank, const char* name) {
@@ -50,7 +20,7 @@ void expect_rank(const A& array, size_t rank, const char* name) {
             .c_str());
 }
 
-// A picture's side, or a number of threads.
+// A image's side, or a number of threads.
 int within(int64_t value, int64_t most, const char* name) {
   if (value < 1 || value > most)
     throw nb::value_error(
@@ -92,9 +62,14 @@ struct GaussianArrays {
   GaussianViews<S> views() const {
     expect_rank(means, 2, "means"), expect_rank(viewmats, 3, "viewmats");
     const int64_t n = means.shape(0), v = viewmats.shape(0);
-    expect(means, 3 * n, "means"), expect(quats, 4 * n, "quats"), expect(scales, 3 * n, "scales");
-    expect(opacities, n, "opacities"), expect(viewmats, 16 * v, "viewmats"), expect(intrinsics, 9 * v, "intrinsics");
-    return {n, v, means.data(), quats.data(), scales.data(), opacities.data(), viewmats.data(), intrinsics.data()};
+    return {n,
+            v,
+            checked(means, 3 * n, "means"),
+            checked(quats, 4 * n, "quats"),
+            checked(scales, 3 * n, "scales"),
+            checked(opacities, n, "opacities"),
+            checked(viewmats, 16 * v, "viewmats"),
+            checked(intrinsics, 9 * v, "intrinsics")};
   }
 };
 
@@ -111,9 +86,9 @@ void bind_projection(nb::module_& module, const char* arrays_name) {
          Array<S> compensations, Array<int32_t> radii) {
         const GaussianViews<S> views = in.views();
         const int64_t rows = views.num_views * views.num_gaussians;
-        expect(means2d, 2 * rows, "means2d"), expect(depths, rows, "depths"), expect(factors, 3 * rows, "factors");
-        expect(compensations, rows, "compensations"), expect(radii, 2 * rows, "radii");
-        const Projected<S> out{means2d.data(), depths.data(), factors.data(), compensations.data(), radii.data()};
+        const Projected<S> out{checked(means2d, 2 * rows, "means2d"), checked(depths, rows, "depths"),
+                               checked(factors, 3 * rows, "factors"), checked(compensations, rows, "compensations"),
+                               checked(radii, 2 * rows, "radii")};
         nb::gil_scoped_release release;
         project_forward(views, settings.cast<S>(), out);
       },
@@ -126,19 +101,18 @@ void bind_projection(nb::module_& module, const char* arrays_name) {
     const int64_t n = views.num_gaussians, rows = views.num_views * n;
     const auto& [g_means2d, g_depths, g_factors, g_compensations] = grads;
     const auto& [means, quats, scales, viewmats, intrinsics] = out;
-    expect(radii, 2 * rows, "radii"), expect(g_means2d, 2 * rows, "means2d gradient");
-    expect(g_depths, rows, "depths gradient"), expect(g_factors, 3 * rows, "factors gradient");
-    expect(g_compensations, rows, "compensations gradient"), expect(means, 3 * n, "means gradient");
-    expect(quats, 4 * n, "quats gradient"), expect(scales, 3 * n, "scales gradient");
-    expect(viewmats, 16 * views.num_views, "viewmats gradient");
-    expect(intrinsics, 9 * views.num_views, "intrinsics gradient");
     if (viewmats.has_value() != intrinsics.has_value())
       throw nb::value_error("project_backward: the gradients of viewmats and intrinsics go together");
-    const ProjectedGrads<S> from{g_means2d.data(), g_depths.data(), g_factors.data(), g_compensations.data()};
-    const GaussianGrads<S> to{means.data(), quats.data(), scales.data(), data_or_null(viewmats),
-                              data_or_null(intrinsics)};
+    const int32_t* sizes = checked(radii, 2 * rows, "radii");
+    const ProjectedGrads<S> from{
+        checked(g_means2d, 2 * rows, "means2d gradient"), checked(g_depths, rows, "depths gradient"),
+        checked(g_factors, 3 * rows, "factors gradient"), checked(g_compensations, rows, "compensations gradient")};
+    const GaussianGrads<S> to{checked(means, 3 * n, "means gradient"), checked(quats, 4 * n, "quats gradient"),
+                              checked(scales, 3 * n, "scales gradient"),
+                              checked(viewmats, 16 * views.num_views, "viewmats gradient"),
+                              checked(intrinsics, 9 * views.num_views, "intrinsics gradient")};
     nb::gil_scoped_release release;
-    project_backward(views, settings.cast<S>(), radii.data(), from, to);
+    project_backward(views, settings.cast<S>(), sizes, from, to);
   });
 }
 
@@ -148,11 +122,17 @@ Harmonics<S> harmonics_input(const Array<const S>& means, const Array<const S>& 
   expect_rank(means, 2, "means"), expect_rank(centers, 2, "centers"), expect_rank(sh, 3, "sh");
   const int64_t n = means.shape(0), v = centers.shape(0);
   const int terms = static_cast<int>(sh.shape(1));
-  expect(means, 3 * n, "means"), expect(centers, 3 * v, "centers"), expect(sh, n * terms * 3, "sh");
-  expect(radii, 2 * v * n, "radii");
   if (degree < 0 || degree > 4 || (degree + 1) * (degree + 1) > terms)
     throw nb::value_error("harmonics: degree does not fit the stored terms");
-  return {n, v, terms, degree, means.data(), centers.data(), sh.data(), radii.data(), threads};
+  return {n,
+          v,
+          terms,
+          degree,
+          checked(means, 3 * n, "means"),
+          checked(centers, 3 * v, "centers"),
+          checked(sh, n * terms * 3, "sh"),
+          checked(radii, 2 * v * n, "radii"),
+          threads};
 }
 
 template <class S>
@@ -160,9 +140,9 @@ void bind_harmonics(nb::module_& module) {
   module.def("harmonics_forward", [](Array<const S> means, Array<const S> centers, Array<const S> sh,
                                      Array<const int32_t> radii, Array<S> colors, int degree, int threads) {
     const Harmonics<S> in = harmonics_input(means, centers, sh, radii, degree, threads);
-    expect(colors, 3 * in.num_views * in.num_gaussians, "colors");
+    S* to = checked(colors, 3 * in.num_views * in.num_gaussians, "colors");
     nb::gil_scoped_release release;
-    harmonics_forward(in, colors.data());
+    harmonics_forward(in, to);
   });
   module.def(
       "harmonics_backward", [](Array<const S> means, Array<const S> centers, Array<const S> sh,
@@ -171,13 +151,13 @@ void bind_harmonics(nb::module_& module) {
         const Harmonics<S> in = harmonics_input(means, centers, sh, radii, degree, threads);
         const auto& [colors, grads] = colors_and_grads;
         const auto& [g_means, g_sh, g_centers] = out;
-        expect(colors, 3 * in.num_views * in.num_gaussians, "colors");
-        expect(grads, 3 * in.num_views * in.num_gaussians, "colors gradient");
-        expect(g_means, 3 * in.num_gaussians, "means gradient");
-        expect(g_sh, 3 * in.num_gaussians * in.num_terms, "sh gradient");
-        expect(g_centers, 3 * in.num_views, "centers gradient");
+        const int64_t n = in.num_gaussians, v = in.num_views;
+        const S *forward = checked(colors, 3 * v * n, "colors"), *from = checked(grads, 3 * v * n, "colors gradient");
+        S* to_means = checked(g_means, 3 * n, "means gradient");
+        S* to_sh = checked(g_sh, 3 * n * in.num_terms, "sh gradient");
+        S* to_centers = checked(g_centers, 3 * v, "centers gradient");
         nb::gil_scoped_release release;
-        harmonics_backward(in, colors.data(), grads.data(), g_means.data(), g_sh.data(), data_or_null(g_centers));
+        harmonics_backward(in, forward, from, to_means, to_sh, to_centers);
       });
 }
 
@@ -189,18 +169,17 @@ struct SplatArrays {
   Splats<S> splats(const BlendSettings& settings) const {
     expect_rank(opacities, 2, "opacities");
     const int64_t v = opacities.shape(0), n = opacities.shape(1);
-    expect(means2d, 2 * v * n, "means2d"), expect(factors, 3 * v * n, "factors"), expect(radii, 2 * v * n, "radii");
     return {n,
             v,
             settings.width,
             settings.height,
             0,
-            means2d.data(),
-            factors.data(),
+            checked(means2d, 2 * v * n, "means2d"),
+            checked(factors, 3 * v * n, "factors"),
             opacities.data(),
             nullptr,
             nullptr,
-            radii.data(),
+            checked(radii, 2 * v * n, "radii"),
             static_cast<S>(settings.alpha_min),
             static_cast<S>(settings.alpha_max),
             static_cast<S>(settings.transmittance_min),
@@ -210,11 +189,9 @@ struct SplatArrays {
   Splats<S> with_colors(const BlendSettings& settings, const Array<const S>& colors) const {
     Splats<S> s = splats(settings);
     expect_rank(colors, 3, "colors");
-    if (colors.shape(2) > kMaxChannels) throw nb::value_error("rasterize: 1 to 40 channels");
+    if (colors.shape(2) < 1 || colors.shape(2) > kMaxChannels) throw nb::value_error("rasterize: 1 to 40 channels");
     s.channels = static_cast<int>(colors.shape(2));
-    if (s.channels < 1 || s.channels > kMaxChannels) throw nb::value_error("rasterize: 1 to 40 channels");
-    expect(colors, s.num_views * s.num_gaussians * s.channels, "colors");
-    s.colors = colors.data();
+    s.colors = checked(colors, s.num_views * s.num_gaussians * s.channels, "colors");
     return s;
   }
 };
@@ -241,12 +218,12 @@ bool in_order(const Entries& e, int64_t tiles, int64_t splats) {
 template <class S>
 Entries checked_entries(const EntryArrays& arrays, const Splats<S>& s) {
   const auto& [tile_offsets, slot_ranges, gaussians, slots] = arrays;
-  const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
-  const int64_t splats = s.num_views * s.num_gaussians, count = static_cast<int64_t>(gaussians.size());
-  expect(tile_offsets, tiles + 1, "tile_offsets"), expect(slot_ranges, 2 * splats, "slot_ranges");
-  expect(slots, count, "slots");
-  const Entries entries{tile_offsets.data(), slot_ranges.data(), gaussians.data(), slots.data(), count};
-  if (!kReadable) return entries;
+  const int64_t tiles = s.tiles(), splats = s.num_views * s.num_gaussians;
+  const auto count = static_cast<int64_t>(gaussians.size());
+  const Entries entries{checked(tile_offsets, tiles + 1, "tile_offsets"),
+                        checked(slot_ranges, 2 * splats, "slot_ranges"), gaussians.data(),
+                        checked(slots, count, "slots"), count};
+  if (kOnGpu) return entries;
   if (!in_order(entries, tiles, splats))
     throw nb::value_error("tile_offsets or slot_ranges name entries that are not there");
   if (!all_within(entries.gaussians, count, splats)) throw nb::value_error("gaussians name splats that are not there");
@@ -263,8 +240,7 @@ void bind_binning(nb::module_& module, const char* arrays_name) {
   module.def("bin_tiles",
              [](const Arrays& in, Array<const S> depths, const BlendSettings& settings, int64_t max_entries) {
                Splats<S> s = in.splats(settings);
-               expect(depths, s.num_views * s.num_gaussians, "depths");
-               s.depths = depths.data();
+               s.depths = checked(depths, s.num_views * s.num_gaussians, "depths");
                return binned(s, max_entries);
              });
 }
@@ -278,40 +254,39 @@ void bind_blending(nb::module_& module) {
     const Splats<S> s = in.with_colors(settings, colors);
     const int64_t pixels = s.num_views * s.width * s.height;
     const auto& [color, transmittance, stop, tally] = out;
-    expect(background, s.num_views * s.channels, "background"), expect(color, pixels * s.channels, "color");
-    expect(transmittance, pixels, "transmittance"), expect(stop, pixels, "stop");
-    expect(tally, s.num_views * s.num_gaussians, "tally");
     if (tallied < 0 || tallied > 4 || tally.has_value() != (tallied > 0))
       throw nb::value_error("rasterize: a tally needs its array");
-    const Image<S> image{color.data(),        transmittance.data(),       stop.data(), data_or_null(background),
-                         data_or_null(tally), static_cast<Tally>(tallied)};
-    const Entries checked = checked_entries(entries, s);
+    const Image<S> image{checked(color, pixels * s.channels, "color"),
+                         checked(transmittance, pixels, "transmittance"),
+                         checked(stop, pixels, "stop"),
+                         checked(background, s.num_views * s.channels, "background"),
+                         checked(tally, s.num_views * s.num_gaussians, "tally"),
+                         static_cast<Tally>(tallied)};
+    const Entries listed = checked_entries(entries, s);
     nb::gil_scoped_release release;
-    rasterize_forward(s, checked, image);
+    rasterize_forward(s, listed, image);
   });
-  module.def("rasterize_backward",
-             [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background, const EntryArrays& entries,
-                const BlendSettings& settings,
-                std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const int32_t>> grads,
-                std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, MaybeArray<S>> out, bool absolute) {
-               const Splats<S> s = in.with_colors(settings, colors);
-               const int64_t pixels = s.num_views * s.width * s.height, rows = s.num_views * s.num_gaussians;
-               const auto& [g_color, g_transmittance, transmittance, stop] = grads;
-               const auto& [means2d, factors, opacities, g_colors, probe] = out;
-               expect(background, s.num_views * s.channels, "background");
-               expect(g_color, pixels * s.channels, "color gradient");
-               expect(g_transmittance, pixels, "transmittance gradient"), expect(stop, pixels, "stop");
-               expect(transmittance, pixels, "transmittance"), expect(means2d, 2 * rows, "means2d gradient");
-               expect(factors, 3 * rows, "factors gradient"), expect(opacities, rows, "opacities gradient");
-               expect(g_colors, rows * s.channels, "colors gradient"), expect(probe, 4 * rows, "probe gradient");
-               const ImageGrads<S> from{g_color.data(), g_transmittance.data(), transmittance.data(), stop.data(),
-                                        data_or_null(background)};
-               const SplatGrads<S> to{means2d.data(),  factors.data(),      opacities.data(),
-                                      g_colors.data(), data_or_null(probe), absolute};
-               const Entries checked = checked_entries(entries, s);
-               nb::gil_scoped_release release;
-               rasterize_backward(s, checked, from, to);
-             });
+  module.def(
+      "rasterize_backward", [](const Arrays& in, Array<const S> colors, MaybeArray<const S> background,
+                               const EntryArrays& entries, const BlendSettings& settings,
+                               std::tuple<Array<const S>, Array<const S>, Array<const S>, Array<const int32_t>> grads,
+                               std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, MaybeArray<S>> out, bool absolute) {
+        const Splats<S> s = in.with_colors(settings, colors);
+        const int64_t pixels = s.num_views * s.width * s.height, rows = s.num_views * s.num_gaussians;
+        const auto& [g_color, g_transmittance, transmittance, stop] = grads;
+        const auto& [means2d, factors, opacities, g_colors, probe] = out;
+        const ImageGrads<S> from{checked(g_color, pixels * s.channels, "color gradient"),
+                                 checked(g_transmittance, pixels, "transmittance gradient"),
+                                 checked(transmittance, pixels, "transmittance"), checked(stop, pixels, "stop"),
+                                 checked(background, s.num_views * s.channels, "background")};
+        const SplatGrads<S> to{
+            checked(means2d, 2 * rows, "means2d gradient"), checked(factors, 3 * rows, "factors gradient"),
+            checked(opacities, rows, "opacities gradient"), checked(g_colors, rows * s.channels, "colors gradient"),
+            checked(probe, 4 * rows, "probe gradient"),     absolute};
+        const Entries listed = checked_entries(entries, s);
+        nb::gil_scoped_release release;
+        rasterize_backward(s, listed, from, to);
+      });
 }
 
 }  // namespace
@@ -340,24 +315,22 @@ void bind_rasterizer(nb::module_& module) {
                                  transmittance_min,
                                  within(threads, kMaxThreads, "threads")};
       });
-  bind_projection<float>(module, "GaussianArraysF32"), bind_projection<double>(module, "GaussianArraysF64");
-  bind_harmonics<float>(module), bind_harmonics<double>(module);
-  bind_binning<float>(module, "SplatArraysF32"), bind_binning<double>(module, "SplatArraysF64");
-  bind_blending<float>(module), bind_blending<double>(module);
+  for_each_scalar([&]<class S>() {
+    constexpr bool single = sizeof(S) == 4;
+    bind_projection<S>(module, single ? "GaussianArraysF32" : "GaussianArraysF64");
+    bind_harmonics<S>(module);
+    bind_binning<S>(module, single ? "SplatArraysF32" : "SplatArraysF64");
+    bind_blending<S>(module);
+    module.def("count_nonfinite", [](Array<const S> x, Array<int32_t> count, int threads) {
+      int32_t* to = checked(count, 1, "count");
+      nb::gil_scoped_release release;
+      write_count_nonfinite(x.data(), static_cast<int64_t>(x.size()), to, threads);
+    });
+  });
   module.attr("MAX_SIDE") = kMaxSide;
   module.def(
       "available_memory", [](const std::string& root) { return available_memory(root); }, nb::arg("root") = "",
       "Bytes that this process can still take; `root` stands before /proc and /sys.");
-  module.def("count_nonfinite", [](Array<const float> x, Array<int32_t> count, int threads) {
-    expect(count, 1, "count");
-    nb::gil_scoped_release release;
-    write_count_nonfinite(x.data(), static_cast<int64_t>(x.size()), count.data(), threads);
-  });
-  module.def("count_nonfinite", [](Array<const double> x, Array<int32_t> count, int threads) {
-    expect(count, 1, "count");
-    nb::gil_scoped_release release;
-    write_count_nonfinite(x.data(), static_cast<int64_t>(x.size()), count.data(), threads);
-  });
 }
 
 }  // namespace dyngs

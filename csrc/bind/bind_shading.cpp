@@ -1,29 +1,11 @@
 // Python bindings of a colour network's inputs. Argument unpacking only.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
-
 #include <algorithm>
-#include <optional>
-#include <tuple>
 
 #include "bind/arrays.hpp"
 #include "core/api.hpp"
 
-namespace nb = nanobind;
-
 namespace dyngs {
 namespace {
-
-template <class S>
-using Rows = Array<S, nb::ndim<2>>;
-
-template <class T>
-const T* checked(const Rows<const T>& rows, size_t count, size_t width) {
-  if (rows.shape(0) != count || rows.shape(1) != width) throw nb::value_error("shading: arrays of different sizes");
-  return rows.data();
-}
 
 template <class S>
 void write_inputs(const std::tuple<Rows<const S>, Rows<const S>, Rows<const S>>& geometry,
@@ -33,18 +15,18 @@ void write_inputs(const std::tuple<Rows<const S>, Rows<const S>, Rows<const S>>&
   const auto& [means, quats, log_scales] = geometry;
   const size_t n = means.shape(0), rows = picked.shape(0);
   const auto wrong = [n](int64_t i) { return i < 0 || i >= static_cast<int64_t>(n); };
-  if (kReadable && std::any_of(picked.data(), picked.data() + rows, wrong))
+  if (!kOnGpu && std::any_of(picked.data(), picked.data() + rows, wrong))
     throw nb::index_error("shading: no such Gaussian");
   const Shading<S> in{static_cast<int64_t>(rows),
                       picked.data(),
-                      checked(means, n, 3),
-                      checked(quats, n, 4),
-                      checked(log_scales, n, 3),
-                      checked(base, rows, 3),
-                      checked(eye, 1, 3),
-                      checked(box, 2, 3),
-                      frame ? checked(std::get<0>(*frame), n, 3) : nullptr,
-                      frame ? checked(std::get<1>(*frame), 3, 3) : nullptr,
+                      checked(means, n, 3, "shading"),
+                      checked(quats, n, 4, "shading"),
+                      checked(log_scales, n, 3, "shading"),
+                      checked(base, rows, 3, "shading"),
+                      checked(eye, 1, 3, "shading"),
+                      checked(box, 2, 3, "shading"),
+                      frame ? checked(std::get<0>(*frame), n, 3, "shading") : nullptr,
+                      frame ? checked(std::get<1>(*frame), 3, 3, "shading") : nullptr,
                       normals,
                       time.has_value(),
                       static_cast<S>(time.value_or(0)),
@@ -58,8 +40,7 @@ void write_inputs(const std::tuple<Rows<const S>, Rows<const S>, Rows<const S>>&
 }  // namespace
 
 void bind_shading(nb::module_& module) {
-  module.def("shading_inputs", write_inputs<float>);
-  module.def("shading_inputs", write_inputs<double>);
+  for_each_scalar([&]<class S>() { module.def("shading_inputs", write_inputs<S>); });
 }
 
 }  // namespace dyngs

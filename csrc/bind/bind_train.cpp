@@ -1,20 +1,11 @@
 // Python bindings of the training kernels: loss, Adam, memory behaviour. Argument unpacking only.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
-#include <nanobind/stl/tuple.h>
-
-#include <optional>
-#include <tuple>
-#if defined(__GLIBC__)
-#include <malloc.h>
-#endif
-
 #include "bind/arrays.hpp"
 #include "bind/results.hpp"
 #include "core/api.hpp"
 
-namespace nb = nanobind;
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
 
 namespace dyngs {
 namespace {
@@ -84,17 +75,14 @@ bool keep_freed_memory() {
 }  // namespace
 
 void bind_train(nb::module_& module) {
-  module.def("l1_ssim", l1_ssim_arrays, nb::arg("rendered").noconvert(), nb::arg("target").noconvert(),
-             nb::arg("mask").noconvert().none(), nb::arg("gradient").noconvert().none(), nb::arg("loss").noconvert(),
-             nb::arg("ssim_weight"), nb::arg("num_threads"),
-             "Writes the loss of two (H, W, 3) pictures, and its gradient by `rendered` unless that is None.");
-  module.def("adam_step", adam_step_arrays, nb::arg("param").noconvert(), nb::arg("grad").noconvert(),
-             nb::arg("exp_avg").noconvert(), nb::arg("exp_avg_sq").noconvert(), nb::arg("column_rates").noconvert(),
-             nb::arg("rows").noconvert().none(), nb::arg("skipped").noconvert(), nb::arg("options"),
-             nb::arg("num_threads"),
+  module.def("l1_ssim", l1_ssim_arrays, array("rendered"), array("target"), array("mask").none(),
+             array("gradient").none(), array("loss"), nb::arg("ssim_weight"), nb::arg("num_threads"),
+             "Writes the loss of two (H, W, 3) images, and its gradient by `rendered` unless that is None.");
+  module.def("adam_step", adam_step_arrays, array("param"), array("grad"), array("exp_avg"), array("exp_avg_sq"),
+             array("column_rates"), array("rows").none(), array("skipped"), nb::arg("options"), nb::arg("num_threads"),
              "Adam step on (N, C) arrays in place; adds the number of rows skipped for a non-finite gradient.");
-  module.def("seen_rows", seen_rows_arrays, nb::arg("grads").noconvert(), nb::arg("seen").noconvert(),
-             nb::arg("num_threads"), "Writes which rows of (N, C) gradients have an element other than zero.");
+  module.def("seen_rows", seen_rows_arrays, array("grads"), array("seen"), nb::arg("num_threads"),
+             "Writes which rows of (N, C) gradients have an element other than zero.");
   module.def("keep_freed_memory", keep_freed_memory,
              "Lets the allocator reuse freed blocks of any size instead of returning them to the system.");
 }

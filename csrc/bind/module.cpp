@@ -1,42 +1,13 @@
 // The extension module, one per instruction set: _core_v2, _core_v3, _core_v4, the baseline's bindings with the kernels of
 // that set. Separate shared objects, so that no inline function compiled for a newer processor can be linked into an older
 // one's code.
-#include <nanobind/nanobind.h>
-
 #include <exception>
 #include <new>
 #include <string>
 
+#include "bind/arrays.hpp"
 #include "core/isa.hpp"
 #include "cpu/memory.hpp"
-
-namespace nb = nanobind;
-
-namespace dyngs {
-void bind_planes(nb::module_& module);
-void bind_offsets(nb::module_& module);
-void bind_perceptron(nb::module_& module);
-void bind_posing(nb::module_& module);
-void bind_rasterizer(nb::module_& module);
-void bind_shading(nb::module_& module);
-void bind_skinning(nb::module_& module);
-void bind_train(nb::module_& module);
-
-namespace {
-
-// The newest of the compiled x86-64 levels that this processor runs. Only the baseline module is asked.
-const char* best_isa() {
-#if defined(DYNGS_HAS_v4)
-  if (runs_v4()) return "v4";
-#endif
-#if defined(DYNGS_HAS_v3)
-  if (runs_v3()) return "v3";
-#endif
-  return "v2";
-}
-
-}  // namespace
-}  // namespace dyngs
 
 // Turns a failed allocation into the one line of error that any other request too large gets.
 static void refuse_for_memory(const std::exception_ptr& exception, void*) {
@@ -52,12 +23,5 @@ static void refuse_for_memory(const std::exception_ptr& exception, void*) {
 NB_MODULE(DYNGS_MODULE, module) {
   nb::register_exception_translator(refuse_for_memory);
   module.def("best_isa", dyngs::best_isa);
-  dyngs::bind_planes(module);
-  dyngs::bind_offsets(module);
-  dyngs::bind_perceptron(module);
-  dyngs::bind_posing(module);
-  dyngs::bind_rasterizer(module);
-  dyngs::bind_shading(module);
-  dyngs::bind_skinning(module);
-  dyngs::bind_train(module);
+  dyngs::bind_ops(module);
 }

@@ -1,14 +1,10 @@
 // Results as the CPU hands them over.
 #include "bind/results.hpp"
 
-#include <nanobind/ndarray.h>
-
 #include <algorithm>
 #include <limits>
 #include <utility>
 #include <vector>
-
-namespace nb = nanobind;
 
 namespace dyngs {
 namespace {

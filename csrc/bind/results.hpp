@@ -1,16 +1,15 @@
-// Results that are handed over in another way on a card than on the CPU: numbers are left in its memory, because reading them
+// Results that are handed over in another way on a GPU than on the CPU: numbers are left in its memory, because reading them
 // back would wait for it, and the lists of tile entries are allocated by torch.
 #pragma once
 
-#include <nanobind/nanobind.h>
-
+#include "bind/arrays.hpp"
 #include "core/api.hpp"
 
 namespace dyngs {
 
-// The four arrays of bin_tiles, one-dimensional: of NumPy, or on a card tensors of bytes.
+// The four arrays of bin_tiles, one-dimensional: of NumPy, or on a GPU tensors of bytes.
 template <class S>
-nanobind::tuple binned(const Splats<S>& splats, int64_t max_entries);
+nb::tuple binned(const Splats<S>& splats, int64_t max_entries);
 
 void write_l1_ssim(const LossInput& input, double* loss, float* gradient, int threads);
 template <class S>

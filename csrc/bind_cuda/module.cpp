@@ -1,7 +1,6 @@
-// The extension module for CUDA cards: the bindings of csrc/bind, compiled for arrays in a card's memory, over the kernels of
+// The extension module for CUDA GPUs: the bindings of csrc/bind, compiled for arrays in a GPU's memory, over the kernels of
 // csrc/cuda. Compiled against their emulation (csrc/tests) it is a module for arrays of the CPU, which the tests run.
-#include <nanobind/nanobind.h>
-
+#include "bind/arrays.hpp"
 #include "bind_cuda/queue.hpp"
 #if !defined(DYNGS_EMULATED)
 #include <cuda_runtime_api.h>
@@ -9,18 +8,7 @@
 #include "cuda/device.hpp"
 #endif
 
-namespace nb = nanobind;
-
 namespace dyngs {
-void bind_perceptron(nb::module_& module);
-void bind_planes(nb::module_& module);
-void bind_offsets(nb::module_& module);
-void bind_posing(nb::module_& module);
-void bind_rasterizer(nb::module_& module);
-void bind_shading(nb::module_& module);
-void bind_skinning(nb::module_& module);
-void bind_train(nb::module_& module);
-
 namespace {
 
 #if !defined(DYNGS_EMULATED)
@@ -54,7 +42,7 @@ NB_MODULE(DYNGS_MODULE, module) {
   module.def(
       "use_queue",
       [](int device, uintptr_t stream) { dyngs::cuda::use_queue(device, reinterpret_cast<void*>(stream)); },
-      nb::arg("device"), nb::arg("stream"), "Makes all later calls of this thread go to a cudaStream_t of a card.");
+      nb::arg("device"), nb::arg("stream"), "Makes all later calls of this thread go to a cudaStream_t of a GPU.");
 #if !defined(DYNGS_EMULATED)
   module.def("runtime_version", dyngs::runtime_version);
   module.def("driver_version", dyngs::driver_version);
@@ -62,12 +50,5 @@ NB_MODULE(DYNGS_MODULE, module) {
   module.def("note_memory", dyngs::note_memory);
   module.def("host_reads", [] { return dyngs::cuda::emulated::machine.host_reads; });
 #endif
-  dyngs::bind_perceptron(module);
-  dyngs::bind_planes(module);
-  dyngs::bind_offsets(module);
-  dyngs::bind_posing(module);
-  dyngs::bind_rasterizer(module);
-  dyngs::bind_shading(module);
-  dyngs::bind_skinning(module);
-  dyngs::bind_train(module);
+  dyngs::bind_ops(module);
 }

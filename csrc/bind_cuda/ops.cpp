@@ -1,15 +1,10 @@
-// The ops of core/api.hpp that the bindings call, on a card: those of cuda/api.hpp, queued where use_queue says, with memory
-// that torch lends. They compute in float32; float64 is refused.
+// The ops of core/api.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued where use_queue says, with memory
+// that torch lends. They compute in float32; dyngs/ops/native.py refuses float64.
 #include "core/api.hpp"
-
-#include <stdexcept>
-#include <type_traits>
 
 #include "bind/results.hpp"
 #include "bind_cuda/queue.hpp"
 #include "cuda/api.hpp"
-
-namespace nb = nanobind;
 
 namespace dyngs {
 namespace {
@@ -17,205 +12,154 @@ namespace {
 using cuda::Borrowed;
 using cuda::current_stream;
 
-template <class S>
-void require_float() {
-  if constexpr (!std::is_same_v<S, float>) throw std::invalid_argument("float64 is not there on a GPU; use float32");
-}
-
 }  // namespace
 
 // Projection and harmonics --------------------------------------------------------------------------------------------
 
-template <class S>
-void project_forward(const GaussianViews<S>& in, const ProjectOptions<S>& options, const Projected<S>& out) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) cuda::project_forward(in, options, out, current_stream());
+template <>
+void project_forward(const GaussianViews<float>& in, const ProjectOptions<float>& options,
+                     const Projected<float>& out) {
+  cuda::project_forward(in, options, out, current_stream());
 }
 
-template <class S>
-void project_backward(const GaussianViews<S>& in, const ProjectOptions<S>& options, const int32_t* radii,
-                      const ProjectedGrads<S>& grads, const GaussianGrads<S>& out) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::project_backward_workspace(in.num_gaussians, in.num_views));
-    cuda::project_backward(in, options, radii, grads, out, memory.lent(), current_stream());
-  }
+template <>
+void project_backward(const GaussianViews<float>& in, const ProjectOptions<float>& options, const int32_t* radii,
+                      const ProjectedGrads<float>& grads, const GaussianGrads<float>& out) {
+  const Borrowed memory(cuda::project_backward_workspace(in.num_gaussians, in.num_views));
+  cuda::project_backward(in, options, radii, grads, out, memory.lent(), current_stream());
 }
 
-template <class S>
-void harmonics_forward(const Harmonics<S>& in, S* colors) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) cuda::harmonics_forward(in, colors, current_stream());
+template <>
+void harmonics_forward(const Harmonics<float>& in, float* colors) {
+  cuda::harmonics_forward(in, colors, current_stream());
 }
 
-template <class S>
-void harmonics_backward(const Harmonics<S>& in, const S* colors, const S* grad_colors, S* grad_means, S* grad_sh,
-                        S* grad_centers) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::harmonics_backward_workspace(in.num_gaussians, in.num_views));
-    cuda::harmonics_backward(in, colors, grad_colors, grad_means, grad_sh, grad_centers, memory.lent(),
-                             current_stream());
-  }
+template <>
+void harmonics_backward(const Harmonics<float>& in, const float* colors, const float* grad_colors, float* grad_means,
+                        float* grad_sh, float* grad_centers) {
+  const Borrowed memory(cuda::harmonics_backward_workspace(in.num_gaussians, in.num_views));
+  cuda::harmonics_backward(in, colors, grad_colors, grad_means, grad_sh, grad_centers, memory.lent(), current_stream());
 }
 
 // Rasterization -------------------------------------------------------------------------------------------------------
 
-template <class S>
-nb::tuple binned(const Splats<S>& splats, int64_t max_entries) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const int64_t rows = splats.num_views * splats.num_gaussians;
-    const Borrowed counted(cuda::bin_count_workspace(rows));
-    int64_t count = 0;
-    {
-      const nb::gil_scoped_release release;
-      count = cuda::bin_count(splats, max_entries, counted.lent(), current_stream());
-    }
-    const int64_t tiles = ((splats.width + kTile - 1) / kTile) * int64_t{(splats.height + kTile - 1) / kTile};
-    const Borrowed tile_offsets((splats.num_views * tiles + 1) * int64_t{sizeof(int64_t)});
-    const Borrowed slot_ranges(2 * rows * int64_t{sizeof(int32_t)});
-    const Borrowed gaussians(count * int64_t{sizeof(int32_t)}), slots(count * int64_t{sizeof(int32_t)});
-    const Borrowed memory(cuda::bin_emit_workspace(count));
-    const cuda::EntryArrays out{tile_offsets.array<int64_t>(), slot_ranges.array<int32_t>(), gaussians.array<int32_t>(),
-                                slots.array<int32_t>()};
-    {
-      const nb::gil_scoped_release release;
-      cuda::bin_emit(splats, count, counted.lent(), out, memory.lent(), current_stream());
-    }
-    return nb::make_tuple(tile_offsets.tensor(), slot_ranges.tensor(), gaussians.tensor(), slots.tensor());
+template <>
+nb::tuple binned(const Splats<float>& splats, int64_t max_entries) {
+  const int64_t rows = splats.num_views * splats.num_gaussians;
+  const Borrowed counted(cuda::bin_count_workspace(rows));
+  int64_t count = 0;
+  {
+    const nb::gil_scoped_release release;
+    count = cuda::bin_count(splats, max_entries, counted.lent(), current_stream());
   }
-  return nb::tuple();
+  const Borrowed tile_offsets((splats.tiles() + 1) * int64_t{sizeof(int64_t)});
+  const Borrowed slot_ranges(2 * rows * int64_t{sizeof(int32_t)});
+  const Borrowed gaussians(count * int64_t{sizeof(int32_t)}), slots(count * int64_t{sizeof(int32_t)});
+  const Borrowed memory(cuda::bin_emit_workspace(count));
+  const cuda::EntryArrays out{tile_offsets.array<int64_t>(), slot_ranges.array<int32_t>(), gaussians.array<int32_t>(),
+                              slots.array<int32_t>()};
+  {
+    const nb::gil_scoped_release release;
+    cuda::bin_emit(splats, count, counted.lent(), out, memory.lent(), current_stream());
+  }
+  return nb::make_tuple(tile_offsets.tensor(), slot_ranges.tensor(), gaussians.tensor(), slots.tensor());
 }
 
-template <class S>
-void rasterize_forward(const Splats<S>& splats, const Entries& entries, const Image<S>& image) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::rasterize_forward_workspace(entries.count, image.tallied));
-    cuda::rasterize_forward(splats, entries, image, memory.lent(), current_stream());
-  }
+template <>
+void rasterize_forward(const Splats<float>& splats, const Entries& entries, const Image<float>& image) {
+  const Borrowed memory(cuda::rasterize_forward_workspace(entries.count, image.tallied));
+  cuda::rasterize_forward(splats, entries, image, memory.lent(), current_stream());
 }
 
-template <class S>
-void rasterize_backward(const Splats<S>& splats, const Entries& entries, const ImageGrads<S>& image,
-                        const SplatGrads<S>& out) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const bool absolute = out.probe != nullptr && out.absolute;
-    const Borrowed memory(cuda::rasterize_backward_workspace(entries.count, splats.channels, absolute));
-    cuda::rasterize_backward(splats, entries, image, out, memory.lent(), current_stream());
-  }
+template <>
+void rasterize_backward(const Splats<float>& splats, const Entries& entries, const ImageGrads<float>& image,
+                        const SplatGrads<float>& out) {
+  const bool absolute = out.probe != nullptr && out.absolute;
+  const Borrowed memory(cuda::rasterize_backward_workspace(entries.count, splats.channels, absolute));
+  cuda::rasterize_backward(splats, entries, image, out, memory.lent(), current_stream());
 }
 
 // Factored space-time grids -------------------------------------------------------------------------------------------
 
 // No order of the points is needed, so that none is written.
-template <class S>
-void hexplane_forward(const HexPlane<S>& planes, const PlanePoints<S>& points, S* features, int32_t*, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::hexplane_forward_workspace(planes));
-    cuda::hexplane_forward(planes, points, features, memory.lent(), current_stream());
-  }
+template <>
+void hexplane_forward(const HexPlane<float>& planes, const PlanePoints<float>& points, float* features, int32_t*, int) {
+  const Borrowed memory(cuda::hexplane_forward_workspace(planes));
+  cuda::hexplane_forward(planes, points, features, memory.lent(), current_stream());
 }
 
-template <class S>
-void hexplane_backward(const HexPlane<S>& planes, const PlanePoints<S>& points, const int32_t*, const S* g_features,
-                       std::span<const PlaneGrads<S>> grads, S* g_coords, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::hexplane_backward_workspace(planes, points.count));
-    cuda::hexplane_backward(planes, points, g_features, grads, g_coords, memory.lent(), current_stream());
-  }
+template <>
+void hexplane_backward(const HexPlane<float>& planes, const PlanePoints<float>& points, const int32_t*,
+                       const float* g_features, std::span<const PlaneGrads<float>> grads, float* g_coords, int) {
+  const Borrowed memory(cuda::hexplane_backward_workspace(planes, points.count));
+  cuda::hexplane_backward(planes, points, g_features, grads, g_coords, memory.lent(), current_stream());
 }
 
-template <class S>
-void write_plane_penalty(const HexPlane<S>& planes, const PenaltyWeights& weights, std::span<const PlaneGrads<S>> grads,
-                         double* penalty, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::plane_penalty_workspace(planes));
-    cuda::plane_penalty(planes, weights, grads, penalty, memory.lent(), current_stream());
-  }
+template <>
+void write_plane_penalty(const HexPlane<float>& planes, const PenaltyWeights& weights,
+                         std::span<const PlaneGrads<float>> grads, double* penalty, int) {
+  const Borrowed memory(cuda::plane_penalty_workspace(planes));
+  cuda::plane_penalty(planes, weights, grads, penalty, memory.lent(), current_stream());
 }
 
 // Perceptron ----------------------------------------------------------------------------------------------------------
 
 // The backward pass computes the activations again.
-template <class S>
-int64_t Perceptron<S>::kept_per_row() const {
+template <>
+int64_t Perceptron<float>::kept_per_row() const {
   return 0;
 }
 
-template <class S>
-void perceptron_forward(const Perceptron<S>& net, int64_t rows, const S* x, S* y, S*) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::perceptron_forward_workspace(net));
-    cuda::perceptron_forward(net, rows, x, y, memory.lent(), current_stream());
-  }
+template <>
+void perceptron_forward(const Perceptron<float>& net, int64_t rows, const float* x, float* y, float*) {
+  const Borrowed memory(cuda::perceptron_forward_workspace(net));
+  cuda::perceptron_forward(net, rows, x, y, memory.lent(), current_stream());
 }
 
-template <class S>
-void perceptron_backward(const Perceptron<S>& net, int64_t rows, const S* x, const S* grad_y, const S*, S* grad_x,
-                         S* grad_params) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::perceptron_backward_workspace(net, rows));
-    cuda::perceptron_backward(net, rows, x, grad_y, grad_x, grad_params, memory.lent(), current_stream());
-  }
+template <>
+void perceptron_backward(const Perceptron<float>& net, int64_t rows, const float* x, const float* grad_y, const float*,
+                         float* grad_x, float* grad_params) {
+  const Borrowed memory(cuda::perceptron_backward_workspace(net, rows));
+  cuda::perceptron_backward(net, rows, x, grad_y, grad_x, grad_params, memory.lent(), current_stream());
 }
 
 // Moving Gaussians ----------------------------------------------------------------------------------------------------
 
 bool follow_within(const int64_t*, int64_t, int64_t) { return true; }  // not readable, see bind/arrays.hpp
 
-template <class S>
-void skinning_forward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<S>& out, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::skinning_forward_workspace(nodes.count));
-    cuda::skinning_forward(nodes, points, out, memory.lent(), current_stream());
-  }
+template <>
+void skinning_forward(const SkinNodes<float>& nodes, const SkinPoints<float>& points, const Skinned<float>& out, int) {
+  const Borrowed memory(cuda::skinning_forward_workspace(nodes.count));
+  cuda::skinning_forward(nodes, points, out, memory.lent(), current_stream());
 }
 
-template <class S>
-void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<const S>& g,
-                       const SkinGrads<S>& grads, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::skinning_backward_workspace(nodes.count, points.count, points.nodes));
-    cuda::skinning_backward(nodes, points, g, grads, memory.lent(), current_stream());
-  }
+template <>
+void skinning_backward(const SkinNodes<float>& nodes, const SkinPoints<float>& points, const Skinned<const float>& g,
+                       const SkinGrads<float>& grads, int) {
+  const Borrowed memory(cuda::skinning_backward_workspace(nodes.count, points.count, points.nodes));
+  cuda::skinning_backward(nodes, points, g, grads, memory.lent(), current_stream());
 }
 
-template <class S>
-void pose_forward(const Posing<S>& in, const Posed<S>& out, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) cuda::pose_forward(in, out, current_stream());
+template <>
+void pose_forward(const Posing<float>& in, const Posed<float>& out, int) {
+  cuda::pose_forward(in, out, current_stream());
 }
 
-template <class S>
-void pose_backward(const Posing<S>& in, const Posed<const S>& posed, const PosedGrads<S>& g, const PosingGrads<S>& out,
-                   int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) {
-    const Borrowed memory(cuda::pose_backward_workspace(in.count, in.joints));
-    cuda::pose_backward(in, posed, g, out, memory.lent(), current_stream());
-  }
+template <>
+void pose_backward(const Posing<float>& in, const Posed<const float>& posed, const PosedGrads<float>& g,
+                   const PosingGrads<float>& out, int) {
+  const Borrowed memory(cuda::pose_backward_workspace(in.count, in.joints));
+  cuda::pose_backward(in, posed, g, out, memory.lent(), current_stream());
 }
 
-template <class S>
-void add_offsets(const RowOffsets<S>& offsets, const MovedGaussians<S>& gaussians, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) cuda::add_offsets(offsets, gaussians, current_stream());
+template <>
+void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& gaussians, int) {
+  cuda::add_offsets(offsets, gaussians, current_stream());
 }
 
-template <class S>
-void shading_inputs(const Shading<S>& in, S* out) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) cuda::shading_inputs(in, out, current_stream());
+template <>
+void shading_inputs(const Shading<float>& in, float* out) {
+  cuda::shading_inputs(in, out, current_stream());
 }
 
 // Training ------------------------------------------------------------------------------------------------------------
@@ -233,41 +177,9 @@ void seen_rows(const float* grads, int64_t num_rows, int64_t row_size, bool* see
   cuda::seen_rows(grads, num_rows, row_size, seen, current_stream());
 }
 
-template <class S>
-void write_count_nonfinite(const S* x, int64_t n, int32_t* count, int) {
-  require_float<S>();
-  if constexpr (std::is_same_v<S, float>) cuda::count_nonfinite(x, n, count, current_stream());
+template <>
+void write_count_nonfinite(const float* x, int64_t n, int32_t* count, int) {
+  cuda::count_nonfinite(x, n, count, current_stream());
 }
-
-// Of the formulas above, what the bindings call.
-#define DYNGS_INSTANTIATE(S)                                                                                        \
-  template void project_forward(const GaussianViews<S>&, const ProjectOptions<S>&, const Projected<S>&);            \
-  template void project_backward(const GaussianViews<S>&, const ProjectOptions<S>&, const int32_t*,                 \
-                                 const ProjectedGrads<S>&, const GaussianGrads<S>&);                                \
-  template void harmonics_forward(const Harmonics<S>&, S*);                                                         \
-  template void harmonics_backward(const Harmonics<S>&, const S*, const S*, S*, S*, S*);                            \
-  template nb::tuple binned(const Splats<S>&, int64_t);                                                             \
-  template void rasterize_forward(const Splats<S>&, const Entries&, const Image<S>&);                               \
-  template void rasterize_backward(const Splats<S>&, const Entries&, const ImageGrads<S>&, const SplatGrads<S>&);   \
-  template void hexplane_forward(const HexPlane<S>&, const PlanePoints<S>&, S*, int32_t*, int);                     \
-  template void hexplane_backward(const HexPlane<S>&, const PlanePoints<S>&, const int32_t*, const S*,              \
-                                  std::span<const PlaneGrads<S>>, S*, int);                                         \
-  template void write_plane_penalty(const HexPlane<S>&, const PenaltyWeights&, std::span<const PlaneGrads<S>>,      \
-                                    double*, int);                                                                  \
-  template struct Perceptron<S>;                                                                                    \
-  template void perceptron_forward(const Perceptron<S>&, int64_t, const S*, S*, S*);                                \
-  template void perceptron_backward(const Perceptron<S>&, int64_t, const S*, const S*, const S*, S*, S*);           \
-  template void skinning_forward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<S>&, int);                \
-  template void skinning_backward(const SkinNodes<S>&, const SkinPoints<S>&, const Skinned<const S>&,               \
-                                  const SkinGrads<S>&, int);                                                        \
-  template void pose_forward(const Posing<S>&, const Posed<S>&, int);                                               \
-  template void pose_backward(const Posing<S>&, const Posed<const S>&, const PosedGrads<S>&, const PosingGrads<S>&, \
-                              int);                                                                                 \
-  template void add_offsets(const RowOffsets<S>&, const MovedGaussians<S>&, int);                                   \
-  template void shading_inputs(const Shading<S>&, S*);                                                              \
-  template void write_count_nonfinite(const S*, int64_t, int32_t*, int)
-DYNGS_INSTANTIATE(float);
-DYNGS_INSTANTIATE(double);
-#undef DYNGS_INSTANTIATE
 
 }  // namespace dyngs

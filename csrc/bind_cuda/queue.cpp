@@ -26,7 +26,7 @@ void use_queue(int device, Stream stream) {
   queue = {device, stream};
 #if !defined(DYNGS_EMULATED)
   if (const cudaError_t error = cudaSetDevice(device); error != cudaSuccess)
-    throw std::runtime_error(std::string("card ") + std::to_string(device) + ": " + cudaGetErrorString(error));
+    throw std::runtime_error(std::string("GPU ") + std::to_string(device) + ": " + cudaGetErrorString(error));
 #endif
 }
 

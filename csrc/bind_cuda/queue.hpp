@@ -1,4 +1,4 @@
-// Where the calls of this module go, for each thread: a card, one of its streams, and torch, which lends memory of the card.
+// Where the calls of this module go, for each thread: a GPU, one of its streams, and torch, which lends memory of the GPU.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -11,7 +11,7 @@ namespace dyngs::cuda {
 void use_queue(int device, Stream stream);
 Stream current_stream();
 
-// `bytes` of the card's memory, a tensor of torch. It may be given back as soon as the work is queued: torch lends it anew
+// `bytes` of the GPU's memory, a tensor of torch. It may be given back as soon as the work is queued: torch lends it anew
 // only to what comes later on the stream.
 class Borrowed {
  public:

@@ -109,6 +109,9 @@ struct Splats {
   const int32_t* radii;  // (V, N, 2)
   S alpha_min, alpha_max, transmittance_min;
   int threads;
+
+  // Of all views.
+  int64_t tiles() const { return num_views * ((width + kTile - 1) / kTile) * int64_t{(height + kTile - 1) / kTile}; }
 };
 
 // The tiles that each Gaussian may be seen in, sorted by (view, tile, depth, index).
@@ -131,7 +134,7 @@ struct Entries {
 // A sum per Gaussian that is taken while drawing. The numbers are those of dyngs/ops.
 enum class Tally {
   kNone,
-  kWeights,        // alpha T: its share of the picture
+  kWeights,        // alpha T: its share of the image
   kPixels,         // pixels that it was blended into
   kLanes,          // pixels that were computed for it, blended or not
   kSquaredSlopes,  // squares of d(sum of channels) / dG, G the 2D Gaussian's value at the pixel, before its opacity

@@ -23,4 +23,7 @@ inline bool runs_v4() {
 #endif
 }
 
+// The newest level that this processor runs; v2, the baseline, is not tested.
+inline const char* best_isa() { return runs_v4() ? "v4" : runs_v3() ? "v3" : "v2"; }
+
 }  // namespace dyngs

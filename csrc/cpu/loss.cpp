@@ -2,8 +2,8 @@
 //
 // SSIM, its gradient and the letters d, s, G(.) are those of math/ssim.hpp.
 //
-// Precision. A tile with squares beyond kLargestSquaresInFloat anywhere, which no ordinary picture has, is computed again in
-// float64: 0.1% of Q are then reached at pictures of 1e5, and nothing overflows. The choice depends on the tile's pixels alone.
+// Precision. A tile with squares beyond kLargestSquaresInFloat anywhere, which no ordinary image has, is computed again in
+// float64: 0.1% of Q are then reached at images of 1e5, and nothing overflows. The choice depends on the tile's pixels alone.
 //
 // Channels are interleaved: a row is 3 * width numbers, and the horizontal taps lie 3 numbers apart.
 #include "core/api.hpp"
@@ -31,7 +31,7 @@ constexpr int kHalo = 2 * kRadius;             // a gradient depends on pixels t
 constexpr int kTileRows = 96;
 constexpr int kTilePixels = 256;
 
-// Pixels [row_begin, row_end) x [col_begin, col_end). Tiles depend on the picture only, never on the thread count.
+// Pixels [row_begin, row_end) x [col_begin, col_end). Tiles depend on the image only, never on the thread count.
 struct Tile {
   int64_t row_begin, row_end, col_begin, col_end;
 };
@@ -41,8 +41,8 @@ enum RingMap { kDifference, kSum, kWeight, kGradMean, kGradDifferenceSquare, kGr
 // Vertically blurred maps of the current batch; the adjoint pass reuses the first three.
 enum ScratchMap { kMeanD, kMeanS, kSquareD, kSquareS, kScratchMaps };
 
-// Row buffers of one thread. Number i of a row is number i of the picture's row minus 3 * (tile.col_begin - kHalo), so
-// that the tile itself starts at number kTileStart; everything outside the picture holds zeros.
+// Row buffers of one thread. Number i of a row is number i of the image's row minus 3 * (tile.col_begin - kHalo), so
+// that the tile itself starts at number kTileStart; everything outside the image holds zeros.
 constexpr int kTileStart = kChannels * kHalo;
 
 template <class T>

@@ -3,9 +3,9 @@
 // transpose, added up per tile entry, written to the entry's own slot, and finally summed per Gaussian in slot order: no
 // atomics, the same bytes for any thread count.
 //
-// The centre may lie far outside the picture, 1e5 px where the splat is 1 px wide. Moments about it would be differences of
+// The centre may lie far outside the image, 1e5 px where the splat is 1 px wide. Moments about it would be differences of
 // numbers 1e10 times larger than they are. So a tile sums moments in x, y about the point of the tile nearest to the centre,
-// a slot holds those with u and v about the point of the picture nearest to it, and only the total is moved to the centre.
+// a slot holds those with u and v about the point of the image nearest to it, and only the total is moved to the centre.
 #include <array>
 #include <memory>
 
@@ -33,9 +33,9 @@ Vec2<S> nearest_in_tile(const TileFrame<S>& frame, S x, S y) {
   const S x0 = static_cast<S>(frame.x0) + S(0.5), y0 = static_cast<S>(frame.y0) + S(0.5), side = S(kTile - 1);
   return {std::clamp(x, x0, x0 + side), std::clamp(y, y0, y0 + side)};
 }
-// The point nearest to (x, y) in the picture.
+// The point nearest to (x, y) in the image.
 template <class S>
-Vec2<S> nearest_in_picture(const Splats<S>& s, S x, S y) {
+Vec2<S> nearest_in_image(const Splats<S>& s, S x, S y) {
   return {std::clamp(x, S(0), static_cast<S>(s.width)), std::clamp(y, S(0), static_cast<S>(s.height))};
 }
 
@@ -211,7 +211,7 @@ template <class S>
 void write_moments(const Splats<S>& s, const TileFrame<S>& frame, const BlendGaussian<S>& g, const S* sum, S* to) {
   const double unscale = 1 / std::sqrt(0.5 * kLog2E);  // a BlendGaussian holds u, w, v times sqrt(log2(e) / 2)
   const double u = g.u * unscale, w = g.w * unscale, v = g.v * unscale;
-  const Vec2<S> anchor = nearest_in_tile(frame, g.x, g.y), near = nearest_in_picture(s, g.x, g.y);
+  const Vec2<S> anchor = nearest_in_tile(frame, g.x, g.y), near = nearest_in_image(s, g.x, g.y);
   const Vec2<double> far{double(g.x) - anchor.x, double(g.y) - anchor.y};  // 0 where the centre is in the tile
   blend_sums(sum, u, w, v, far, {double(near.x) - anchor.x, double(near.y) - anchor.y}, to);
 }
@@ -255,8 +255,7 @@ void tile_backward(const Splats<S>& s, const Layout& layout, const Entries& entr
 template <class S, int D>
 void all_tiles_backward(const Splats<S>& s, const Layout& layout, const Entries& entries, const ImageGrads<S>& image,
                         S* slots) {
-  const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
-  parallel_for(tiles, 1, s.threads, [&](int64_t begin, int64_t end) {
+  parallel_for(s.tiles(), 1, s.threads, [&](int64_t begin, int64_t end) {
     for (int64_t t = begin; t < end; ++t) tile_backward<S, D>(s, layout, entries, image, t, slots);
   });
 }
@@ -265,7 +264,7 @@ template <class S>
 void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const Layout& layout,
                     const SplatGrads<S>& out) {
   const S mean_x = s.means2d[2 * row], mean_y = s.means2d[2 * row + 1];
-  const Vec2<S> near = nearest_in_picture(s, mean_x, mean_y);
+  const Vec2<S> near = nearest_in_image(s, mean_x, mean_y);
   const S* factor = s.factors + 3 * row;
   const BlendSplatGrad<S> grad = splat_grad<S>(sum, factor[0], factor[1], factor[2], s.opacities[row],
                                                {double(mean_x) - near.x, double(mean_y) - near.y});

@@ -155,8 +155,7 @@ void blend_tile(const Splats<S>& s, const Entries& entries, const Image<S>& imag
 
 template <class S, int D, Tally kTally>
 void blend_all(const Splats<S>& s, const Entries& entries, const Image<S>& image, S* slot_sums) {
-  const int64_t tiles = s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
-  parallel_for(tiles, 1, s.threads, [&](int64_t begin, int64_t end) {
+  parallel_for(s.tiles(), 1, s.threads, [&](int64_t begin, int64_t end) {
     for (int64_t t = begin; t < end; ++t) blend_tile<S, D, kTally>(s, entries, image, t, slot_sums);
   });
 }
@@ -192,7 +191,7 @@ void rasterize_forward(const Splats<S>& s, const Entries& entries, const Image<S
     case Tally::kPixels: return blend_with_tally<S, Tally::kPixels>(s, entries, image);
     case Tally::kLanes: return blend_with_tally<S, Tally::kLanes>(s, entries, image);
     case Tally::kSquaredSlopes:
-      blend(s, entries, image);  // the light behind a Gaussian is taken from the finished picture
+      blend(s, entries, image);  // the light behind a Gaussian is taken from the finished image
       return blend_with_tally<S, Tally::kSquaredSlopes>(s, entries, image);
     case Tally::kNone: return blend(s, entries, image);
   }

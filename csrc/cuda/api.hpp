@@ -1,4 +1,4 @@
-// The ops of core/api.hpp on a CUDA card, in float32: the same structs with pointers to the card's memory (`threads` is not
+// The ops of core/api.hpp on a CUDA GPU, in float32: the same structs with pointers to the GPU's memory (`threads` is not
 // read), the same results up to rounding, and the same bytes whenever a call is repeated. Work is queued on `stream`; nothing
 // is allocated and nothing waits, but for the one number that bin_entries reads back. A function with a `workspace` takes
 // memory that the caller allocated, of at least as many bytes as its neighbour `..._workspace` says; its contents are of no use
@@ -11,7 +11,7 @@ namespace dyngs::cuda {
 
 using Stream = void*;  // a cudaStream_t
 
-// Memory of the card that is lent for one call.
+// Memory of the GPU that is lent for one call.
 struct Lent {
   void* memory;
   int64_t bytes;
@@ -60,7 +60,7 @@ void rasterize_backward(const Splats<float>& splats, const Entries& entries, con
 
 // Factored space-time grids -------------------------------------------------------------------------------------------
 
-// `levels` of HexPlane and `grads` are arrays of the host with pointers to the card's memory. No order of the points is needed.
+// `levels` of HexPlane and `grads` are arrays of the host with pointers to the GPU's memory. No order of the points is needed.
 int64_t hexplane_forward_workspace(const HexPlane<float>& planes);
 void hexplane_forward(const HexPlane<float>& planes, const PlanePoints<float>& points, float* features,
                       const Lent& workspace, Stream stream);
@@ -69,7 +69,7 @@ void hexplane_backward(const HexPlane<float>& planes, const PlanePoints<float>& 
                        std::span<const PlaneGrads<float>> grads, float* g_coords, const Lent& workspace, Stream stream);
 
 int64_t plane_penalty_workspace(const HexPlane<float>& planes);
-// Writes the penalty to `penalty` (one double on the card).
+// Writes the penalty to `penalty` (one double on the GPU).
 void plane_penalty(const HexPlane<float>& planes, const PenaltyWeights& weights,
                    std::span<const PlaneGrads<float>> grads, double* penalty, const Lent& workspace, Stream stream);
 
@@ -107,7 +107,7 @@ void shading_inputs(const Shading<float>& in, float* out, Stream stream);
 // Training ------------------------------------------------------------------------------------------------------------
 
 int64_t l1_ssim_loss_workspace(int64_t height, int64_t width);
-// Writes the loss to `loss` (one double on the card) and, unless null, its gradient (H, W, 3).
+// Writes the loss to `loss` (one double on the GPU) and, unless null, its gradient (H, W, 3).
 void l1_ssim_loss(const LossInput& input, double* loss, float* gradient, const Lent& workspace, Stream stream);
 
 // Adds to *skipped the rows that were asked for but had NaN, infinity or a gradient of 2^63 or more.

@@ -3,7 +3,7 @@
 // rows and then columns. Two passes: SSIM and its partial derivatives, kept in a workspace, then their blurs.
 //
 // Precision: as on the CPU, tiles with squares beyond kLargestSquaresInFloat are computed again in double, with neighbours from the
-// pictures themselves. Blocks of these two kernels (`fine`) find at once that there is nothing to do for all other tiles.
+// images themselves. Blocks of these two kernels (`fine`) find at once that there is nothing to do for all other tiles.
 //
 // Limits, H100 (3.35 TB/s, 67 TFLOP/s), per pixel of three channels: 24 bytes read and 36 written, then 36 + 24 read and 12
 // written, and a mask twice 4: 140 bytes, 42 ps; about 3 (26/16 x 88 + 44 + 26/16 x 33 + 33 + 80) = 1100 operations, 16 ps: bound
@@ -41,14 +41,14 @@ struct Buffers {
 };
 
 struct TilePixels {
-  int64_t x0, y0, columns, rows;  // first pixel; tiles of the picture
+  int64_t x0, y0, columns, rows;  // first pixel; tiles of the image
 };
 __device__ TilePixels place(const LossInput& in) {
   const int64_t columns = (in.width + kSide - 1) / kSide, rows = (in.height + kSide - 1) / kSide;
   return {blockIdx.x % columns * kSide, blockIdx.x / columns * kSide, columns, rows};
 }
 
-// The index of a pixel, or -1 outside the picture.
+// The index of a pixel, or -1 outside the image.
 __device__ int64_t pixel_at(const LossInput& in, int64_t x, int64_t y) {
   return x >= 0 && x < in.width && y >= 0 && y < in.height ? y * in.width + x : -1;
 }
@@ -61,7 +61,7 @@ template <class T>
 struct DiffSum {
   T d, s;
 };
-// Zeros outside the picture.
+// Zeros outside the image.
 template <class T>
 __device__ DiffSum<T> load(const LossInput& in, int64_t pixel, int channel) {
   if (pixel < 0) return {T(0), T(0)};

@@ -25,7 +25,7 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kColumns = 8;                        // of a thread; widths are padded to a multiple
 constexpr int kMostGroups = 32, kLeastGroups = 2;  // of 4 rows in a tile
-constexpr int kShared = 48 << 10;                  // bytes that every card grants
+constexpr int kShared = 48 << 10;                  // bytes that every GPU grants
 constexpr int kSide = 32, kSideThreads = 8;        // of the blocks of weights
 constexpr int kPiece = 4;                          // groups of rows that such a block takes at a time
 constexpr int kBlocks = 2112;                      // of weights and their sums: 16 per multiprocessor of an H100
@@ -342,7 +342,7 @@ void cut_rows(Net& net, const Perceptron<float>& from) {
 }
 
 Net plan(const Perceptron<float>& from, bool backward) {
-  if (!perceptron_fits(from)) throw std::length_error("a card's kernel takes up to 16 layers of up to 256 features");
+  if (!perceptron_fits(from)) throw std::length_error("a GPU's kernel takes up to 16 layers of up to 256 features");
   Net net{};
   net.count = static_cast<int>(from.layers()), net.skip = static_cast<int>(from.skip);
   net.inputs = static_cast<int>(from.widths[0]), net.features = padded(net.inputs);

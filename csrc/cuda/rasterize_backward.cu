@@ -5,7 +5,7 @@
 // shuffles per sum finish it. The sums of a block's warps are added in their order and written to the entry's slot; a second
 // kernel adds up the slots of each Gaussian.
 //
-// Moments are taken about the point of the tile nearest to the centre, sums about the point of the picture nearest to it, and
+// Moments are taken about the point of the tile nearest to the centre, sums about the point of the image nearest to it, and
 // only the total is moved to the centre: cpu/rasterize_backward.cpp says why.
 //
 // Limits, H100 (3.35 TB/s, 67 TFLOP/s), F = 6 + D sums. Per pair of a Gaussian and a pixel about 45 + 4 D operations (forward
@@ -67,8 +67,8 @@ __device__ Vec2<float> nearest_in_tile(const TilePlace& tile, const BlendGaussia
   const float x0 = static_cast<float>(tile.x0) + 0.5f, y0 = static_cast<float>(tile.y0) + 0.5f;
   return {clamp(g.x, x0, x0 + static_cast<float>(kTile - 1)), clamp(g.y, y0, y0 + static_cast<float>(kTile - 1))};
 }
-// The point nearest to (x, y) in the picture.
-__device__ Vec2<float> nearest_in_picture(const Splats<float>& s, float x, float y) {
+// The point nearest to (x, y) in the image.
+__device__ Vec2<float> nearest_in_image(const Splats<float>& s, float x, float y) {
   return {clamp(x, 0.f, static_cast<float>(s.width)), clamp(y, 0.f, static_cast<float>(s.height))};
 }
 
@@ -173,7 +173,7 @@ __device__ void finish_batch(const Splats<float>& s, const ImageGrads<float>& im
 __device__ void write_sums(const Splats<float>& s, const TilePlace& tile, const BlendGaussian<float>& g,
                            const float* moments, const Array<float>& slot) {
   const double unscale = 1 / sqrt(0.5 * kLog2E);  // a BlendGaussian holds u, w, v times sqrt(log2(e) / 2)
-  const Vec2<float> anchor = nearest_in_tile(tile, g), near = nearest_in_picture(s, g.x, g.y);
+  const Vec2<float> anchor = nearest_in_tile(tile, g), near = nearest_in_image(s, g.x, g.y);
   const Vec2<double> far{double{g.x} - double{anchor.x}, double{g.y} - double{anchor.y}};
   const Vec2<double> origin{double{near.x} - double{anchor.x}, double{near.y} - double{anchor.y}};
   float sums[kBlendSums];
@@ -276,7 +276,7 @@ __global__ void __launch_bounds__(kTileThreads)
 __device__ void write_gaussian(const Splats<float>& s, int64_t row, const double* sum, const SplatGrads<float>& out) {
   const Array<const float> m = global(s.means2d) + 2 * row, f = global(s.factors) + 3 * row;
   const float x = m[0], y = m[1], u = f[0], w = f[1], v = f[2], opacity = global(s.opacities)[row];
-  const Vec2<float> near = nearest_in_picture(s, x, y);
+  const Vec2<float> near = nearest_in_image(s, x, y);
   const BlendSplatGrad<float> grad =
       splat_grad<float>(sum, u, w, v, opacity, {double{x} - double{near.x}, double{y} - double{near.y}});
   global(out.means2d)[2 * row] = grad.mean.x, global(out.means2d)[2 * row + 1] = grad.mean.y;
@@ -328,7 +328,7 @@ void rasterize_backward(const Splats<float>& s, const Entries& entries, const Im
   auto* slots = Workspace(workspace.memory, workspace.bytes).take<float>(entries.count * fields);
   with_channels(s.channels, [&](auto cap) {
     constexpr int kCap = decltype(cap)::value;
-    launch("blend_backward", {count_tiles(s), kTileThreads}, stream,
+    launch("blend_backward", {s.tiles(), kTileThreads}, stream,
            out.absolute ? blend_backward_kernel<kCap, true> : blend_backward_kernel<kCap, false>, s, entries, image,
            slots);
   });

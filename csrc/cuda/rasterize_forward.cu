@@ -145,7 +145,7 @@ __global__ void __launch_bounds__(kTileThreads)
 template <int kCap, Tally kTally>
 void launch_blend(const Splats<float>& s, const Entries& entries, const Image<float>& image, float* slot_sums,
                   Stream stream) {
-  launch("blend", {count_tiles(s), kTileThreads}, stream, blend_kernel<kCap, kTally>, s, entries, image, slot_sums);
+  launch("blend", {s.tiles(), kTileThreads}, stream, blend_kernel<kCap, kTally>, s, entries, image, slot_sums);
 }
 
 void blend(const Splats<float>& s, const Entries& entries, const Image<float>& image, Stream stream) {
@@ -181,7 +181,7 @@ void rasterize_forward(const Splats<float>& s, const Entries& entries, const Ima
     case Tally::kPixels: return blend_with_tally<Tally::kPixels>(s, entries, image, workspace, stream);
     case Tally::kLanes: return blend_with_tally<Tally::kLanes>(s, entries, image, workspace, stream);
     case Tally::kSquaredSlopes:
-      blend(s, entries, image, stream);  // the light behind a Gaussian is that of the finished picture
+      blend(s, entries, image, stream);  // the light behind a Gaussian is that of the finished image
       return blend_with_tally<Tally::kSquaredSlopes>(s, entries, image, workspace, stream);
     case Tally::kNone: return blend(s, entries, image, stream);
   }

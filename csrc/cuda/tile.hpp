@@ -23,10 +23,6 @@ auto with_channels(int channels, const Visit& visit) {
   return visit(std::integral_constant<int, kMaxChannels>());
 }
 
-inline int64_t count_tiles(const Splats<float>& s) {
-  return s.num_views * ((s.width + kTile - 1) / kTile) * int64_t{(s.height + kTile - 1) / kTile};
-}
-
 // The tile of this block: its view, first pixel and entries.
 struct TilePlace {
   int view, x0, y0;

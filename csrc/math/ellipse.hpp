@@ -53,7 +53,7 @@ struct RowCover {
   MaskOf<R> any;
 };
 
-// The pixel columns that the ellipse covers in the `rows` pixel rows from `top` on, in a picture `width` px wide.
+// The pixel columns that the ellipse covers in the `rows` pixel rows from `top` on, in a image `width` px wide.
 template <class R>
 DYNGS_HD RowCover<R> columns_in_rows(const Ellipse<R>& e, R top, int rows, int width) {
   const R first = top + real<R>(0.5) - e.y;

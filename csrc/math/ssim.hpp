@@ -1,13 +1,13 @@
-// SSIM of two pictures at one pixel, from blurred maps, and its partial derivatives by these.
+// SSIM of two images at one pixel, from blurred maps, and its partial derivatives by these.
 //
-// With x the rendered and y the target picture, G the 11-tap Gaussian blur with zero padding, d = x - y and s = x + y:
+// With x the rendered and y the target image, G the 11-tap Gaussian blur with zero padding, d = x - y and s = x + y:
 //   P = (G(d)^2 + G(s)^2) / 2 + C1                      = mean_x^2 + mean_y^2 + C1
 //   V_d = G(d^2) - G(d)^2,  V_s = G(s^2) - G(s)^2
 //   Q = (V_d + V_s) / 2 + C2                            = var_x + var_y + C2
 //   P - G(d)^2 = 2 mean_x mean_y + C1,  Q - V_d = 2 cov_xy + C2
 //   SSIM = (1 - G(d)^2 / P) * (1 - V_d / Q)
 // which is the usual formula, but needs four blurs instead of five and has no cancellation where x is close to y:
-// equal pictures give exactly 0 loss.
+// equal images give exactly 0 loss.
 //
 // Gradient. Write SSIM = l * c with e = G(d)^2 / P = 1 - l and f = V_d / Q = 1 - c. The partial derivatives by the four
 // blurred maps are, per pixel,
@@ -43,7 +43,7 @@ SsimKernel<T> ssim_kernel() {
 }
 
 // G(d^2) + G(s^2) up to which float32 is precise: V = G(x^2) - G(x)^2 loses digits where x^2 is large beside C2; here 0.1% of Q.
-inline constexpr double kLargestSquaresInFloat = 16;  // pictures up to 2
+inline constexpr double kLargestSquaresInFloat = 16;  // images up to 2
 
 template <class R>
 struct SsimTerms {

@@ -118,16 +118,11 @@ inline void expect_vjp(const std::string& what, const Function& f, const Values&
 
 // Ends the program with the code that CTest knows for "skipped" where the processor lacks what it was compiled for.
 inline void skip_unless_supported() {
-#if defined(DYNGS_NEEDS_v4)
-  const bool runs = dyngs::runs_v4();
-#elif defined(DYNGS_NEEDS_v3)
-  const bool runs = dyngs::runs_v3();
-#else
-  const bool runs = true;
-#endif
-  if (runs) return;
+#if defined(DYNGS_NEEDS)
+  if (std::strcmp(dyngs::best_isa(), DYNGS_NEEDS) >= 0) return;
   std::printf("skipped: this processor lacks the instructions\n");
   std::exit(77);
+#endif
 }
 
 inline int report() {

@@ -85,7 +85,7 @@ class Machine {
   void run(const char* kernel, const Grid& grid, const std::function<void()>& body) {
     if (grid.blocks <= 0) return;
     if (grid.threads < 1 || grid.threads > kMostThreads || grid.blocks > INT32_MAX || grid.shared_bytes > kStaticShared)
-      throw Failure(std::string(kernel) + ": a launch that no card takes");
+      throw Failure(std::string(kernel) + ": a launch that no GPU takes");
     grid_ = grid, body_ = &body;
     shared_.clear(), used_shared_ = 0;
     running.kernel = kernel, running.launch += 1, ++launches;
@@ -141,7 +141,7 @@ class Machine {
 
  private:
   static constexpr int kMostThreads = 1024;
-  static constexpr int64_t kStaticShared = 48 << 10;  // what every card grants without being asked for more
+  static constexpr int64_t kStaticShared = 48 << 10;  // what every GPU grants without being asked for more
   enum class Operation { kSync, kBallot, kMatch, kShuffle };
 
   // An operation for which lanes of a warp wait; kept under the lowest lane of its mask.
@@ -166,7 +166,7 @@ class Machine {
   }
   Region* add_shared(const void* tag, const char* name, int64_t bytes, int64_t element) {
     auto memory = std::make_unique<double[]>(bytes / 8 + 2);
-    const uintptr_t odd = reinterpret_cast<uintptr_t>(memory.get()) % 16;  // aligned to 16 bytes as on a card
+    const uintptr_t odd = reinterpret_cast<uintptr_t>(memory.get()) % 16;  // aligned to 16 bytes as on a GPU
     char* begin = reinterpret_cast<char*>(memory.get()) + odd;
     auto region = std::make_unique<Region>(std::string("shared ") + name, begin, bytes, element, false, true);
     shared_.push_back({tag, std::move(memory), std::move(region), running.block});

@@ -1,10 +1,10 @@
-// The CUDA kernels of moving Gaussians, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a card
-// (tests/card.hpp): against the CPU's in float64, and bit by bit against themselves under other orders of blocks and threads.
+// The CUDA kernels of moving Gaussians, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a GPU
+// (tests/GPU.hpp): against the CPU's in float64, and bit by bit against themselves under other orders of blocks and threads.
 #include <memory>
 #include <utility>
 
-#include "tests/card.hpp"
 #include "tests/check.hpp"
+#include "tests/gpu.hpp"
 
 namespace {
 
@@ -59,7 +59,7 @@ SkinResults<double> skin_on_cpu(const SkinCase& c) {
   return r;
 }
 
-SkinResults<float> skin_on_card(const SkinCase& c, bool with_points = true) {
+SkinResults<float> skin_on_gpu(const SkinCase& c, bool with_points = true) {
   Memory<float> positions(as<float>(c.positions), "positions"), radii(as<float>(c.radii), "radii");
   Memory<float> motion(as<float>(c.motion), "motion"), values(as<float>(c.values), "values");
   Memory<float> coords(as<float>(c.coords), "coords"), g_offset(as<float>(c.g_offset), "g_offset");
@@ -83,34 +83,34 @@ SkinResults<float> skin_on_card(const SkinCase& c, bool with_points = true) {
 void test_skinning(int64_t nodes, int64_t width, int64_t points, int64_t per_point) {
   const SkinCase c = skin_case(nodes, width, points, per_point);
   const std::string what = std::to_string(points) + " points on " + std::to_string(nodes) + " nodes";
-  const SkinResults<float> card = skin_on_card(c);
+  const SkinResults<float> gpu = skin_on_gpu(c);
   const SkinResults<double> cpu = skin_on_cpu(c);
-  expect_close("weights, " + what, card.weights, cpu.weights, 2e-6);
-  expect_close("offset, " + what, card.offset, cpu.offset, 2e-6);
-  expect_close("gradient by points, " + what, card.by_points, cpu.by_points, 2e-6);
-  expect_close("gradient by motion, " + what, card.by_motion, cpu.by_motion, 1e-5);
+  expect_close("weights, " + what, gpu.weights, cpu.weights, 2e-6);
+  expect_close("offset, " + what, gpu.offset, cpu.offset, 2e-6);
+  expect_close("gradient by points, " + what, gpu.by_points, cpu.by_points, 2e-6);
+  expect_close("gradient by motion, " + what, gpu.by_motion, cpu.by_motion, 1e-5);
   if (width > 0) {
-    expect_close("blended, " + what, card.blended, cpu.blended, 2e-6);
-    expect_close("gradient by values, " + what, card.by_values, cpu.by_values, 1e-5);
+    expect_close("blended, " + what, gpu.blended, cpu.blended, 2e-6);
+    expect_close("gradient by values, " + what, gpu.by_values, cpu.by_values, 1e-5);
   }
   const auto expect_same = [&](const SkinResults<float>& again) {
-    expect_same_bits("weights again, " + what, again.weights, card.weights);
-    expect_same_bits("offset again, " + what, again.offset, card.offset);
-    expect_same_bits("blended again, " + what, again.blended, card.blended);
-    expect_same_bits("gradient by motion again, " + what, again.by_motion, card.by_motion);
-    expect_same_bits("gradient by values again, " + what, again.by_values, card.by_values);
+    expect_same_bits("weights again, " + what, again.weights, gpu.weights);
+    expect_same_bits("offset again, " + what, again.offset, gpu.offset);
+    expect_same_bits("blended again, " + what, again.blended, gpu.blended);
+    expect_same_bits("gradient by motion again, " + what, again.by_motion, gpu.by_motion);
+    expect_same_bits("gradient by values again, " + what, again.by_values, gpu.by_values);
   };
-  in_other_orders([&] { expect_same(skin_on_card(c)); });
-  expect_same(skin_on_card(c, false));
+  in_other_orders([&] { expect_same(skin_on_gpu(c)); });
+  expect_same(skin_on_gpu(c, false));
 }
 
 // Points so far away that the squares of all distances overflow follow all nodes alike, as on the CPU.
 void test_far_points() {
   SkinCase c = skin_case(6, 2, 20, 3);
   for (double& x : c.coords) x = static_cast<float>(x * 1e30);
-  const SkinResults<float> card = skin_on_card(c);
+  const SkinResults<float> gpu = skin_on_gpu(c);
   bool alike = true;
-  for (float weight : card.weights) alike &= weight == 1.f / 3.f;
+  for (float weight : gpu.weights) alike &= weight == 1.f / 3.f;
   expect(alike, "far points follow all nodes alike");
 }
 
@@ -160,7 +160,7 @@ PosedCase<double> pose_on_cpu(const PosingCase& c) {
 }
 
 // Without `all`: no gradient by the blended transforms, and none by the weights.
-PosedCase<float> pose_on_card(const PosingCase& c, bool all = true) {
+PosedCase<float> pose_on_gpu(const PosingCase& c, bool all = true) {
   Memory<float> means(as<float>(c.means)), quats(as<float>(c.quats)), log_scales(as<float>(c.log_scales));
   Memory<float> weights(as<float>(c.weights)), transforms(as<float>(c.transforms)), g_means(as<float>(c.g_means));
   Memory<float> g_quats(as<float>(c.g_quats)), g_logs(as<float>(c.g_log_scales)), g_blended(as<float>(c.g_blended));
@@ -183,30 +183,30 @@ PosedCase<float> pose_on_card(const PosingCase& c, bool all = true) {
 void test_posing(int64_t count, int64_t joints) {
   const PosingCase c = posing_case(count, joints);
   const std::string what = std::to_string(count) + " Gaussians on " + std::to_string(joints) + " joints";
-  const PosedCase<float> card = pose_on_card(c);
+  const PosedCase<float> gpu = pose_on_gpu(c);
   const PosedCase<double> cpu = pose_on_cpu(c);
-  expect_close("posed means, " + what, card.means, cpu.means, 2e-6);
-  expect_close("posed quaternions, " + what, card.quats, cpu.quats, 2e-5);
-  expect_close("posed scales, " + what, card.log_scales, cpu.log_scales, 2e-6);
-  expect_close("blended transforms, " + what, card.blended, cpu.blended, 2e-6);
-  expect_close("gradient by means at rest, " + what, card.by_means, cpu.by_means, 1e-5);
-  expect_close("gradient by quaternions at rest, " + what, card.by_quats, cpu.by_quats, 1e-4);
-  expect_close("gradient by scales at rest, " + what, card.by_log_scales, cpu.by_log_scales, 1e-4);
-  expect_close("gradient by weights, " + what, card.by_weights, cpu.by_weights, 1e-4);
-  expect_close("gradient by transforms, " + what, card.by_transforms, cpu.by_transforms, 1e-4);
+  expect_close("posed means, " + what, gpu.means, cpu.means, 2e-6);
+  expect_close("posed quaternions, " + what, gpu.quats, cpu.quats, 2e-5);
+  expect_close("posed scales, " + what, gpu.log_scales, cpu.log_scales, 2e-6);
+  expect_close("blended transforms, " + what, gpu.blended, cpu.blended, 2e-6);
+  expect_close("gradient by means at rest, " + what, gpu.by_means, cpu.by_means, 1e-5);
+  expect_close("gradient by quaternions at rest, " + what, gpu.by_quats, cpu.by_quats, 1e-4);
+  expect_close("gradient by scales at rest, " + what, gpu.by_log_scales, cpu.by_log_scales, 1e-4);
+  expect_close("gradient by weights, " + what, gpu.by_weights, cpu.by_weights, 1e-4);
+  expect_close("gradient by transforms, " + what, gpu.by_transforms, cpu.by_transforms, 1e-4);
   in_other_orders([&] {
-    const PosedCase<float> again = pose_on_card(c);
-    expect_same_bits("posed quaternions again, " + what, again.quats, card.quats);
-    expect_same_bits("gradient by scales again, " + what, again.by_log_scales, card.by_log_scales);
-    expect_same_bits("gradient by weights again, " + what, again.by_weights, card.by_weights);
-    expect_same_bits("gradient by transforms again, " + what, again.by_transforms, card.by_transforms);
+    const PosedCase<float> again = pose_on_gpu(c);
+    expect_same_bits("posed quaternions again, " + what, again.quats, gpu.quats);
+    expect_same_bits("gradient by scales again, " + what, again.by_log_scales, gpu.by_log_scales);
+    expect_same_bits("gradient by weights again, " + what, again.by_weights, gpu.by_weights);
+    expect_same_bits("gradient by transforms again, " + what, again.by_transforms, gpu.by_transforms);
   });
-  expect_same_bits("gradient by scales alone, " + what, pose_on_card(c, false).by_log_scales, card.by_log_scales);
+  expect_same_bits("gradient by scales alone, " + what, pose_on_gpu(c, false).by_log_scales, gpu.by_log_scales);
 }
 
 void test_nothing_posed() {
-  const PosedCase<float> card = pose_on_card(posing_case(0, 3));
-  expect(std::all_of(card.by_transforms.begin(), card.by_transforms.end(), [](float x) { return x == 0; }),
+  const PosedCase<float> gpu = pose_on_gpu(posing_case(0, 3));
+  expect(std::all_of(gpu.by_transforms.begin(), gpu.by_transforms.end(), [](float x) { return x == 0; }),
          "no Gaussians, no gradients by transforms");
 }
 
@@ -255,7 +255,7 @@ PlaneResults<double> planes_on_cpu(const PlaneCase& c) {
   return r;
 }
 
-PlaneResults<float> planes_on_card(const PlaneCase& c, bool with_coords = true) {
+PlaneResults<float> planes_on_gpu(const PlaneCase& c, bool with_coords = true) {
   std::vector<std::unique_ptr<Memory<float>>> arrays;
   const auto hold = [&arrays](auto&&... arguments) {
     arrays.push_back(std::make_unique<Memory<float>>(arguments...));
@@ -284,31 +284,31 @@ PlaneResults<float> planes_on_card(const PlaneCase& c, bool with_coords = true) 
 }
 
 void test_planes(const std::string& what, const PlaneCase& c) {
-  const PlaneResults<float> card = planes_on_card(c);
+  const PlaneResults<float> gpu = planes_on_gpu(c);
   const PlaneResults<double> cpu = planes_on_cpu(c);
-  expect_close("features, " + what, card.features, cpu.features, 2e-6);
-  expect_close("gradient by coordinates, " + what, card.g_coords, cpu.g_coords, 1e-5);
+  expect_close("features, " + what, gpu.features, cpu.features, 2e-6);
+  expect_close("gradient by coordinates, " + what, gpu.g_coords, cpu.g_coords, 1e-5);
   for (size_t l = 0; l < c.sizes.size(); ++l) {
-    expect_close("gradient by planes over space, " + what, card.g_space[l], cpu.g_space[l], 1e-5);
-    expect_close("gradient by planes over time, " + what, card.g_time[l], cpu.g_time[l], 1e-5);
+    expect_close("gradient by planes over space, " + what, gpu.g_space[l], cpu.g_space[l], 1e-5);
+    expect_close("gradient by planes over time, " + what, gpu.g_time[l], cpu.g_time[l], 1e-5);
   }
   const auto expect_same = [&](const PlaneResults<float>& again) {
-    expect_same_bits("features again, " + what, again.features, card.features);
+    expect_same_bits("features again, " + what, again.features, gpu.features);
     for (size_t l = 0; l < c.sizes.size(); ++l) {
-      expect_same_bits("gradient by planes over space again, " + what, again.g_space[l], card.g_space[l]);
-      expect_same_bits("gradient by planes over time again, " + what, again.g_time[l], card.g_time[l]);
+      expect_same_bits("gradient by planes over space again, " + what, again.g_space[l], gpu.g_space[l]);
+      expect_same_bits("gradient by planes over time again, " + what, again.g_time[l], gpu.g_time[l]);
     }
   };
-  in_other_orders([&] { expect_same(planes_on_card(c)); });
-  expect_same(planes_on_card(c, false));
+  in_other_orders([&] { expect_same(planes_on_gpu(c)); });
+  expect_same(planes_on_gpu(c, false));
 }
 
 void test_no_points() {
   const PlaneCase c = plane_case(2, 0, 0.5, {{3, 2}});
-  const PlaneResults<float> card = planes_on_card(c);
+  const PlaneResults<float> gpu = planes_on_gpu(c);
   const auto is_zero = [](float x) { return x == 0; };
-  expect(std::all_of(card.g_space[0].begin(), card.g_space[0].end(), is_zero) &&
-             std::all_of(card.g_time[0].begin(), card.g_time[0].end(), is_zero),
+  expect(std::all_of(gpu.g_space[0].begin(), gpu.g_space[0].end(), is_zero) &&
+             std::all_of(gpu.g_time[0].begin(), gpu.g_time[0].end(), is_zero),
          "no points, no gradients");
 }
 
@@ -334,7 +334,7 @@ Penalty penalty_on_cpu(const PlaneCase& c) {
 }
 
 // Without gradients, `space` and `time` of the result are empty.
-Penalty penalty_on_card(const PlaneCase& c, bool with_gradients) {
+Penalty penalty_on_gpu(const PlaneCase& c, bool with_gradients) {
   std::vector<std::unique_ptr<Memory<float>>> arrays;
   const auto hold = [&arrays](auto&&... arguments) {
     arrays.push_back(std::make_unique<Memory<float>>(arguments...));
@@ -361,18 +361,18 @@ Penalty penalty_on_card(const PlaneCase& c, bool with_gradients) {
 }
 
 void test_penalty(const PlaneCase& c) {
-  const Penalty card = penalty_on_card(c, true), cpu = penalty_on_cpu(c);
+  const Penalty gpu = penalty_on_gpu(c, true), cpu = penalty_on_cpu(c);
   const std::string what = "planes of " + std::to_string(c.sizes[0].first);
-  expect_close("penalty, " + what, Values{card.value}, Values{cpu.value}, 2e-6);
+  expect_close("penalty, " + what, Values{gpu.value}, Values{cpu.value}, 2e-6);
   for (size_t l = 0; l < c.sizes.size(); ++l) {
     if (c.sizes[l].first > 2)
-      expect_close("gradient of the penalty, space, " + what, card.g_space[l], cpu.g_space[l], 2e-5);
-    expect_close("gradient of the penalty, time, " + what, card.g_time[l], cpu.g_time[l], 2e-5);
+      expect_close("gradient of the penalty, space, " + what, gpu.g_space[l], cpu.g_space[l], 2e-5);
+    expect_close("gradient of the penalty, time, " + what, gpu.g_time[l], cpu.g_time[l], 2e-5);
   }
-  expect(penalty_on_card(c, false).value == card.value, "the penalty without its gradient, " + what);
+  expect(penalty_on_gpu(c, false).value == gpu.value, "the penalty without its gradient, " + what);
   in_other_orders([&] {
-    const Penalty again = penalty_on_card(c, true);
-    expect(again.value == card.value && again.g_time == card.g_time, "the penalty in another order, " + what);
+    const Penalty again = penalty_on_gpu(c, true);
+    expect(again.value == gpu.value && again.g_time == gpu.g_time, "the penalty in another order, " + what);
   });
 }
 
@@ -392,18 +392,17 @@ void test_offsets(bool picked, unsigned parts) {
   add_offsets<double>({m, picked ? rows.data() : nullptr, d3.data(), given(0, d4.data()), given(1, d3.data()),
                        given(2, d1.data()), given(3, d3.data())},
                       {cpu[0].data(), cpu[1].data(), cpu[2].data(), cpu[3].data(), cpu[4].data(), 12}, 1);
-  Memory<float> on_card[5] = {Memory<float>(as<float>(means)), Memory<float>(as<float>(quats)),
-                              Memory<float>(as<float>(scales)), Memory<float>(as<float>(opacities)),
-                              Memory<float>(as<float>(sh))};
+  Memory<float> on_gpu[5] = {Memory<float>(as<float>(means)), Memory<float>(as<float>(quats)),
+                             Memory<float>(as<float>(scales)), Memory<float>(as<float>(opacities)),
+                             Memory<float>(as<float>(sh))};
   Memory<float> by3(as<float>(d3)), by4(as<float>(d4)), by1(as<float>(d1));
   Memory<int64_t> which(rows);
   const auto* three = by3.get();
   cuda::add_offsets({m, picked ? which.get() : nullptr, three, given(0, by4.get()), given(1, three),
                      given(2, by1.get()), given(3, three)},
-                    {on_card[0].get(), on_card[1].get(), on_card[2].get(), on_card[3].get(), on_card[4].get(), 12},
-                    nullptr);
+                    {on_gpu[0].get(), on_gpu[1].get(), on_gpu[2].get(), on_gpu[3].get(), on_gpu[4].get(), 12}, nullptr);
   for (int k = 0; k < 5; ++k)
-    expect_close("offsets of parts " + std::to_string(parts) + ", array " + std::to_string(k), on_card[k].values(),
+    expect_close("offsets of parts " + std::to_string(parts) + ", array " + std::to_string(k), on_gpu[k].values(),
                  cpu[k], 1e-6);
 }
 
@@ -421,23 +420,23 @@ void test_shading(bool normals, bool timed, bool posed) {
   if (posed) in.places = places.data(), in.turn = turn.data();
   Values cpu(m * in.width());
   shading_inputs(in, cpu.data());
-  Memory<float> on_card[8] = {Memory<float>(as<float>(means)),  Memory<float>(as<float>(quats)),
-                              Memory<float>(as<float>(scales)), Memory<float>(as<float>(base)),
-                              Memory<float>(as<float>(eye)),    Memory<float>(as<float>(box)),
-                              Memory<float>(as<float>(places)), Memory<float>(as<float>(turn))};
+  Memory<float> on_gpu[8] = {Memory<float>(as<float>(means)),  Memory<float>(as<float>(quats)),
+                             Memory<float>(as<float>(scales)), Memory<float>(as<float>(base)),
+                             Memory<float>(as<float>(eye)),    Memory<float>(as<float>(box)),
+                             Memory<float>(as<float>(places)), Memory<float>(as<float>(turn))};
   Memory<int64_t> which(picked);
   Memory<float> out(m * in.width());
-  cuda::shading_inputs({m, which.get(), on_card[0].get(), on_card[1].get(), on_card[2].get(), on_card[3].get(),
-                        on_card[4].get(), on_card[5].get(), posed ? on_card[6].get() : nullptr,
-                        posed ? on_card[7].get() : nullptr, normals, timed, 0.25f, 1},
-                       out.get(), nullptr);
+  cuda::shading_inputs(
+      {m, which.get(), on_gpu[0].get(), on_gpu[1].get(), on_gpu[2].get(), on_gpu[3].get(), on_gpu[4].get(),
+       on_gpu[5].get(), posed ? on_gpu[6].get() : nullptr, posed ? on_gpu[7].get() : nullptr, normals, timed, 0.25f, 1},
+      out.get(), nullptr);
   expect_close("inputs of the colour network, width " + std::to_string(in.width()), out.values(), cpu, 2e-6);
 }
 
 }  // namespace
 
 int main() {
-  skip_without_card();
+  skip_without_gpu();
   test_skinning(5, 3, 40, 3), test_skinning(300, 7, 500, 4), test_skinning(2, 0, 300, 1);
   test_far_points();
   test_posing(1, 1), test_posing(150, 24), test_posing(700, 3), test_nothing_posed();

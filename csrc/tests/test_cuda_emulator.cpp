@@ -308,7 +308,7 @@ void test_waiting() {
               [&] { launch("dynamic", {1, 32, 32 * sizeof(int)}, nullptr, dynamic_shared, out.get()); });
   expect(out.values()[0] == 31, "dynamic shared memory");
   expect_failure("out of bounds", [&] { launch("dynamic", {1, 32, 64}, nullptr, dynamic_shared, out.get()); });
-  expect_failure("no card takes", [&] { launch("threads", {1, 2048}, nullptr, half_waits); });
+  expect_failure("no GPU takes", [&] { launch("threads", {1, 2048}, nullptr, half_waits); });
 }
 
 }  // namespace

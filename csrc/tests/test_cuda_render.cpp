@@ -1,31 +1,31 @@
-// The CUDA kernels from Gaussians to pictures and back, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a card
-// (tests/card.hpp): against the CPU's kernels in float64 and float32, and bit by bit against themselves under other orders of
+// The CUDA kernels from Gaussians to images and back, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a GPU
+// (tests/GPU.hpp): against the CPU's kernels in float64 and float32, and bit by bit against themselves under other orders of
 // blocks and threads.
 #include <functional>
 
-#include "tests/scene_on_card.hpp"
+#include "tests/scene_on_gpu.hpp"
 
 namespace {
 
 using namespace check;
 
 // The same tiles and the same order as the CPU's lists. Slots are numbers of places: contiguous for each splat, each once.
-void expect_same_lists(const std::string& what, const Binning& card, const Binning& cpu) {
-  expect_same_bits("tile offsets, " + what, card.tile_offsets, cpu.tile_offsets);
-  expect_same_bits("entries, " + what, card.gaussians, cpu.gaussians);
-  std::vector<int> used(card.slots.size());
+void expect_same_lists(const std::string& what, const Binning& gpu, const Binning& cpu) {
+  expect_same_bits("tile offsets, " + what, gpu.tile_offsets, cpu.tile_offsets);
+  expect_same_bits("entries, " + what, gpu.gaussians, cpu.gaussians);
+  std::vector<int> used(gpu.slots.size());
   bool own = true;
-  for (size_t i = 0; i < card.slots.size(); ++i) {
-    const int32_t slot = card.slots[i], row = card.gaussians[i];
+  for (size_t i = 0; i < gpu.slots.size(); ++i) {
+    const int32_t slot = gpu.slots[i], row = gpu.gaussians[i];
     ++used[slot];
-    own &= card.slot_ranges[2 * row] <= slot && slot < card.slot_ranges[2 * row + 1];
+    own &= gpu.slot_ranges[2 * row] <= slot && slot < gpu.slot_ranges[2 * row + 1];
   }
   int64_t covered = 0;
-  for (size_t row = 0; row < card.slot_ranges.size() / 2; ++row)
-    covered += card.slot_ranges[2 * row + 1] - card.slot_ranges[2 * row];
+  for (size_t row = 0; row < gpu.slot_ranges.size() / 2; ++row)
+    covered += gpu.slot_ranges[2 * row + 1] - gpu.slot_ranges[2 * row];
   expect(own, "every slot lies in its splat's range, " + what);
   expect(std::all_of(used.begin(), used.end(), [](int n) { return n == 1; }), "every slot is used once, " + what);
-  expect(covered == static_cast<int64_t>(card.slots.size()), "ranges cover the slots, " + what);
+  expect(covered == static_cast<int64_t>(gpu.slots.size()), "ranges cover the slots, " + what);
 }
 
 // Lists for splats that the CPU projected, so that both start from the same bits.
@@ -33,13 +33,13 @@ void test_lists(const std::string& what, const Scene& s) {
   const Inputs<float> in(s, 1);
   Drawn<float> d;
   project_all(in, d);
-  CardSplats held(d);
-  expect_same_lists(what, bin_on_card(held.splats(in, d)), bin_tiles(in.splats(d), kNoLimit));
+  GpuSplats held(d);
+  expect_same_lists(what, bin_on_gpu(held.splats(in, d)), bin_tiles(in.splats(d), kNoLimit));
 }
 
 void expect_same_drawing(const std::string& what, const Drawn<float>& a, const Drawn<float>& b) {
   expect_same_bits("means2d, " + what, a.means2d, b.means2d);
-  expect_same_bits("picture, " + what, a.color, b.color);
+  expect_same_bits("image, " + what, a.color, b.color);
   expect_same_bits("stop, " + what, a.stop, b.stop);
   expect_same_bits("probe, " + what, a.probe, b.probe);
   expect_same_bits("means gradient, " + what, a.g_means, b.g_means);
@@ -64,39 +64,39 @@ void expect_as(const std::string& what, const std::vector<A>& got, const std::ve
 
 // To which share of the largest value.
 struct Tolerance {
-  double picture = 2e-5, gradient = 2e-4;  // those that float32 on the CPU is held to (test_render.cpp)
+  double image = 2e-5, gradient = 2e-4;  // those that float32 on the CPU is held to (test_render.cpp)
 };
 
-// `card` against the CPU.
+// `GPU` against the CPU.
 template <class S>
-void expect_as_cpu(const std::string& what, const Scene& s, const Drawn<float>& card, const Drawn<S>& cpu,
+void expect_as_cpu(const std::string& what, const Scene& s, const Drawn<float>& gpu, const Drawn<S>& cpu,
                    const Tolerance& to) {
-  expect_as("means2d, " + what, card.means2d, cpu.means2d, 1e-6);
-  expect_as("factors, " + what, card.factors, cpu.factors, to.picture);
-  expect_as("compensations, " + what, card.compensations, cpu.compensations, to.picture);
-  expect_as("colours, " + what, card.colors, cpu.colors, 2e-6);
-  expect_as("picture, " + what, card.color, cpu.color, to.picture);
-  expect_as("transmittance, " + what, card.transmittance, cpu.transmittance, to.picture);
-  expect_as("means gradient, " + what, card.g_means, cpu.g_means, to.gradient);
-  expect_as("quats gradient, " + what, card.g_quats, cpu.g_quats, to.gradient);
-  expect_as("scales gradient, " + what, card.g_scales, cpu.g_scales, to.gradient);
-  expect_as("opacities gradient, " + what, card.g_opacities, cpu.g_opacities, to.gradient);
-  expect_as("features gradient, " + what, card.g_features, cpu.g_features, to.gradient);
-  expect_as("probe, " + what, card.probe, cpu.probe, to.gradient);
-  expect_as("viewmats gradient, " + what, card.g_viewmats, cpu.g_viewmats, to.gradient);
-  expect_as("intrinsics gradient, " + what, card.g_intrinsics, cpu.g_intrinsics, to.gradient);
+  expect_as("means2d, " + what, gpu.means2d, cpu.means2d, 1e-6);
+  expect_as("factors, " + what, gpu.factors, cpu.factors, to.image);
+  expect_as("compensations, " + what, gpu.compensations, cpu.compensations, to.image);
+  expect_as("colours, " + what, gpu.colors, cpu.colors, 2e-6);
+  expect_as("image, " + what, gpu.color, cpu.color, to.image);
+  expect_as("transmittance, " + what, gpu.transmittance, cpu.transmittance, to.image);
+  expect_as("means gradient, " + what, gpu.g_means, cpu.g_means, to.gradient);
+  expect_as("quats gradient, " + what, gpu.g_quats, cpu.g_quats, to.gradient);
+  expect_as("scales gradient, " + what, gpu.g_scales, cpu.g_scales, to.gradient);
+  expect_as("opacities gradient, " + what, gpu.g_opacities, cpu.g_opacities, to.gradient);
+  expect_as("features gradient, " + what, gpu.g_features, cpu.g_features, to.gradient);
+  expect_as("probe, " + what, gpu.probe, cpu.probe, to.gradient);
+  expect_as("viewmats gradient, " + what, gpu.g_viewmats, cpu.g_viewmats, to.gradient);
+  expect_as("intrinsics gradient, " + what, gpu.g_intrinsics, cpu.g_intrinsics, to.gradient);
   for (int k :
        {0, 3})  // not the pixels counted: in float more weights round to zero; nor the lanes: warps are not blocks
-    expect_as("tally " + std::to_string(k) + ", " + what, card.tallies[k], cpu.tallies[k], to.gradient);
+    expect_as("tally " + std::to_string(k) + ", " + what, gpu.tallies[k], cpu.tallies[k], to.gradient);
   if (s.channels != 3) return;
-  expect_as("sh gradient, " + what, card.g_sh, cpu.g_sh, to.gradient);
-  expect_as("centers gradient, " + what, card.g_centers, cpu.g_centers, to.gradient);
+  expect_as("sh gradient, " + what, gpu.g_sh, cpu.g_sh, to.gradient);
+  expect_as("centers gradient, " + what, gpu.g_centers, cpu.g_centers, to.gradient);
 }
 
 template <class S = double>
 void compare(const std::string& what, const Scene& s, const Tolerance& to = {}) {
   const Cotangents cotangents = random_cotangents(s);
-  expect_as_cpu(what, s, draw_on_card(s, &cotangents), draw<S>(s, 1, &cotangents), to);
+  expect_as_cpu(what, s, draw_on_gpu(s, &cotangents), draw<S>(s, 1, &cotangents), to);
 }
 
 Scene with_thresholds(Scene s) {
@@ -108,27 +108,27 @@ Scene with_thresholds(Scene s) {
 // least alpha that is drawn.
 void test_thresholds() {
   const Scene s = with_thresholds(random_scene(120, 41, 35, 3, 0.3));
-  const Drawn<float> card = draw_on_card(s, nullptr);
+  const Drawn<float> gpu = draw_on_gpu(s, nullptr);
   const Drawn<double> cpu = draw<double>(s, 1);
   int64_t far = 0;
   double largest = 0;
-  for (size_t i = 0; i < card.color.size(); ++i) {
-    const double error = std::abs(card.color[i] - cpu.color[i]);
+  for (size_t i = 0; i < gpu.color.size(); ++i) {
+    const double error = std::abs(gpu.color[i] - cpu.color[i]);
     if (!(error <= 2e-5)) ++far;
     largest = error <= largest ? largest : error;
   }
-  expect(far <= static_cast<int64_t>(card.color.size()) / 100, std::to_string(far) + " pixels differ with thresholds");
+  expect(far <= static_cast<int64_t>(gpu.color.size()) / 100, std::to_string(far) + " pixels differ with thresholds");
   expect(largest < 2.0 / 255, "with thresholds no pixel is further off than what is not drawn");
-  expect(std::any_of(card.stop.begin(), card.stop.end(), [](int32_t stop) { return stop < 1000; }),
+  expect(std::any_of(gpu.stop.begin(), gpu.stop.end(), [](int32_t stop) { return stop < 1000; }),
          "some pixels are full");
 }
 
 // Of Gaussians hardly wider than the low-pass, whose compensation decides how far they are seen.
 void test_extents() {
   const Scene s = with_thresholds(random_scene(200, 61, 50, 3, 0.01));
-  const std::vector<int32_t> card = draw_on_card(s, nullptr).radii, cpu = draw<float>(s, 1).radii;
+  const std::vector<int32_t> gpu = draw_on_gpu(s, nullptr).radii, cpu = draw<float>(s, 1).radii;
   int64_t differ = 0;
-  for (size_t i = 0; i < cpu.size(); ++i) differ += card[i] != cpu[i] ? 1 : 0;
+  for (size_t i = 0; i < cpu.size(); ++i) differ += gpu[i] != cpu[i] ? 1 : 0;
   expect(differ <= 4, std::to_string(differ) + " extents differ");  // they are rounded up
 }
 
@@ -152,10 +152,10 @@ void test_gradients_with_thresholds() {
 void test_parts() {
   const Scene s = random_scene(70, 37, 19, 3, 0.2);
   const Cotangents cotangents = random_cotangents(s);
-  const Drawn<float> all = draw_on_card(s, &cotangents);
-  OnCard card(s);
-  card.with_cameras = false, card.with_probe = false;
-  Drawn<float> some = draw_on_card(card, &cotangents);
+  const Drawn<float> all = draw_on_gpu(s, &cotangents);
+  OnGpu gpu(s);
+  gpu.with_cameras = false, gpu.with_probe = false;
+  Drawn<float> some = draw_on_gpu(gpu, &cotangents);
   expect(some.probe.empty() && some.g_viewmats.empty() && some.g_centers.empty(), "nothing that was not asked for");
   some.probe = all.probe, some.g_viewmats = all.g_viewmats, some.g_intrinsics = all.g_intrinsics;
   some.g_centers = all.g_centers;
@@ -163,18 +163,18 @@ void test_parts() {
 
   Scene black = s;
   black.background.assign(black.background.size(), 0);
-  const Drawn<float> on_black = draw_on_card(black, &cotangents);
-  OnCard none(black);
+  const Drawn<float> on_black = draw_on_gpu(black, &cotangents);
+  OnGpu none(black);
   none.with_background = false;
-  expect_same_drawing("without a background", draw_on_card(none, &cotangents), on_black);
+  expect_same_drawing("without a background", draw_on_gpu(none, &cotangents), on_black);
 }
 
 // Every order of blocks and threads gives the same bytes, with and without pixels that are full before the end.
 void test_orders() {
   const Scene s = with_thresholds(random_scene(150, 41, 35, 3, 0.3));
   const Cotangents cotangents = random_cotangents(s);
-  const Drawn<float> forward = draw_on_card(s, &cotangents);
-  in_other_orders([&] { expect_same_drawing("in another order", forward, draw_on_card(s, &cotangents)); });
+  const Drawn<float> forward = draw_on_gpu(s, &cotangents);
+  in_other_orders([&] { expect_same_drawing("in another order", forward, draw_on_gpu(s, &cotangents)); });
 }
 
 void test_all_lists() {
@@ -189,16 +189,16 @@ void test_all_lists() {
   for (int k = 0; k < 32; ++k) equal.viewmats[k] = k % 16 % 5 == 0 ? 1 : 0;
   test_lists("equal depths", equal);
   test_lists("more than 65536 tiles", with_thresholds(random_scene(8, 4099, 4200, 3, 0.0002)));
-  test_lists("a picture of one pixel", random_scene(5, 1, 1, 3, 0.5));
+  test_lists("a image of one pixel", random_scene(5, 1, 1, 3, 0.5));
 }
 
-#if !defined(DYNGS_ON_CARD)
-// The host waits for the card once per picture, for the number of entries.
+#if !defined(DYNGS_ON_GPU)
+// The host waits for the GPU once per image, for the number of entries.
 void test_host_reads() {
   const Scene s = random_scene(20, 37, 29, 3, 0.3);
   const Cotangents cotangents = random_cotangents(s);
   const int64_t before = cuda::emulated::machine.host_reads;
-  draw_on_card(s, &cotangents);
+  draw_on_gpu(s, &cotangents);
   expect(cuda::emulated::machine.host_reads == before + 1, "one number is read back");
 }
 #endif
@@ -208,10 +208,10 @@ void test_limit_of_entries() {
   const Inputs<float> in(s, 1);
   Drawn<float> d;
   project_all(in, d);
-  CardSplats held(d);
+  GpuSplats held(d);
   std::string message;
   try {
-    bin_on_card(held.splats(in, d), 3);
+    bin_on_gpu(held.splats(in, d), 3);
   } catch (const std::length_error& error) {
     message = error.what();
   }
@@ -296,7 +296,7 @@ void test_extremes() {
 }  // namespace
 
 int main() {
-  skip_without_card();
+  skip_without_gpu();
   for (int channels : {1, 3, 4, 7, 13, kMaxChannels})
     compare("D=" + std::to_string(channels), random_scene(40, 37, 19, channels, 0.2));
   test_all_lists();
@@ -305,7 +305,7 @@ int main() {
   test_gradients_with_thresholds();
   test_parts();
   test_orders();
-#if !defined(DYNGS_ON_CARD)
+#if !defined(DYNGS_ON_GPU)
   test_host_reads();
 #endif
   test_limit_of_entries();

@@ -1,28 +1,28 @@
-// The CUDA kernels of the loss and of the optimiser, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a card
-// (tests/card.hpp): against the CPU's, and bit by bit against themselves under other orders of blocks and threads.
+// The CUDA kernels of the loss and of the optimiser, run by the emulation of cuda_on_cpu.hpp with all its checks, or on a GPU
+// (tests/GPU.hpp): against the CPU's, and bit by bit against themselves under other orders of blocks and threads.
 #include <limits>
 
-#include "tests/card.hpp"
 #include "tests/check.hpp"
+#include "tests/gpu.hpp"
 
 namespace {
 
 using namespace dyngs;
 using namespace check;
 
-// A picture, its target and a mask, or none.
-struct Pictures {
+// A image, its target and a mask, or none.
+struct Images {
   int64_t height, width;
   std::vector<float> rendered, target, mask;
 };
 
-Pictures random_pictures(int64_t height, int64_t width, bool masked, double brightness = 0.5, double spread = 0.5) {
+Images random_images(int64_t height, int64_t width, bool masked, double brightness = 0.5, double spread = 0.5) {
   const double lo = brightness - spread, hi = brightness + spread;
-  Pictures p{height,
-             width,
-             as<float>(uniforms(3 * height * width, lo, hi)),
-             as<float>(uniforms(3 * height * width, lo, hi)),
-             {}};
+  Images p{height,
+           width,
+           as<float>(uniforms(3 * height * width, lo, hi)),
+           as<float>(uniforms(3 * height * width, lo, hi)),
+           {}};
   if (masked) p.mask = as<float>(uniforms(height * width, 0, 1));
   return p;
 }
@@ -32,7 +32,7 @@ struct Loss {
   std::vector<float> gradient;
 };
 
-Loss loss_on_cpu(const Pictures& p, float ssim_weight) {
+Loss loss_on_cpu(const Images& p, float ssim_weight) {
   Loss loss{0, std::vector<float>(p.rendered.size())};
   loss.value = l1_ssim_loss(
       {p.rendered.data(), p.target.data(), p.mask.empty() ? nullptr : p.mask.data(), p.height, p.width, ssim_weight},
@@ -40,7 +40,7 @@ Loss loss_on_cpu(const Pictures& p, float ssim_weight) {
   return loss;
 }
 
-Loss loss_on_card(const Pictures& p, float ssim_weight, bool with_gradient = true) {
+Loss loss_on_gpu(const Images& p, float ssim_weight, bool with_gradient = true) {
   Memory<float> rendered(p.rendered, "rendered"), target(p.target, "target"), mask(p.mask, "mask");
   Memory<float> gradient(static_cast<int64_t>(p.rendered.size()), "gradient");
   Memory<double> value(1, "loss");
@@ -51,37 +51,37 @@ Loss loss_on_card(const Pictures& p, float ssim_weight, bool with_gradient = tru
   return {value.values()[0], gradient.values()};
 }
 
-void test_loss(const std::string& name, const Pictures& p, float ssim_weight) {
+void test_loss(const std::string& name, const Images& p, float ssim_weight) {
   const std::string what = name + " " + std::to_string(p.width) + "x" + std::to_string(p.height);
-  const Loss card = loss_on_card(p, ssim_weight), cpu = loss_on_cpu(p, ssim_weight);
-  expect_close("loss, " + what, Values{card.value}, Values{cpu.value}, 2e-6);
-  expect_close("gradient of the loss, " + what, card.gradient, cpu.gradient, 2e-5);
-  expect(loss_on_card(p, ssim_weight, false).value == card.value, "the loss without its gradient, " + what);
+  const Loss gpu = loss_on_gpu(p, ssim_weight), cpu = loss_on_cpu(p, ssim_weight);
+  expect_close("loss, " + what, Values{gpu.value}, Values{cpu.value}, 2e-6);
+  expect_close("gradient of the loss, " + what, gpu.gradient, cpu.gradient, 2e-5);
+  expect(loss_on_gpu(p, ssim_weight, false).value == gpu.value, "the loss without its gradient, " + what);
   in_other_orders([&] {
-    const Loss again = loss_on_card(p, ssim_weight);
-    expect(again.value == card.value, "the loss in another order, " + what);
-    expect_same_bits("gradient in another order, " + what, again.gradient, card.gradient);
+    const Loss again = loss_on_gpu(p, ssim_weight);
+    expect(again.value == gpu.value, "the loss in another order, " + what);
+    expect_same_bits("gradient in another order, " + what, again.gradient, gpu.gradient);
   });
 }
 
-// Pictures that float32 cannot square: the tiles concerned, and those beside them, are computed in double.
-void test_bright_pictures() {
-  test_loss("1000 +- 0.1", random_pictures(20, 35, true, 1000, 0.1), 0.2f);
-  Pictures spot = random_pictures(40, 50, false);
+// Images that float32 cannot square: the tiles concerned, and those beside them, are computed in double.
+void test_bright_images() {
+  test_loss("1000 +- 0.1", random_images(20, 35, true, 1000, 0.1), 0.2f);
+  Images spot = random_images(40, 50, false);
   spot.rendered[3 * (17 * 50 + 15) + 1] = 1e30f;
   test_loss("one pixel of 1e30", spot, 0.2f);
-  Pictures spots = random_pictures(40, 50, false);  // the gradient reaches tiles that are themselves precise in float32
+  Images spots = random_images(40, 50, false);  // the gradient reaches tiles that are themselves precise in float32
   spots.rendered[3 * (8 * 50 + 8)] = spots.rendered[3 * (24 * 50 + 40) + 2] = 1e30f;
   test_loss("two pixels of 1e30", spots, 0.2f);
-  Pictures beside = random_pictures(33, 49, false);  // the bright pixel's window reaches four tiles
+  Images beside = random_images(33, 49, false);  // the bright pixel's window reaches four tiles
   beside.rendered[3 * (15 * 49 + 16)] = 300;
   test_loss("one pixel of 300", beside, 0.5f);
 }
 
 void test_empty_mask() {
-  Pictures p = random_pictures(18, 20, true);
+  Images p = random_images(18, 20, true);
   std::fill(p.mask.begin(), p.mask.end(), 0.f);
-  const Loss loss = loss_on_card(p, 0.2f);
+  const Loss loss = loss_on_gpu(p, 0.2f);
   expect(loss.value == 0, "a mask without weight costs nothing");
   expect(std::all_of(loss.gradient.begin(), loss.gradient.end(), [](float x) { return x == 0; }),
          "a mask without weight has no gradient");
@@ -121,7 +121,7 @@ Trained adam_on_cpu(const AdamCase& c) {
   return t;
 }
 
-Trained adam_on_card(const AdamCase& c) {
+Trained adam_on_gpu(const AdamCase& c) {
   const std::vector<float> zeros(c.start.size());
   Memory<float> param(c.start, "param"), first(zeros, "exp_avg"), second(zeros, "exp_avg_sq"), rates(c.rates, "rates");
   Memory<bool> asked(std::vector<bool>(c.asked.begin(), c.asked.end()), "rows");
@@ -140,15 +140,15 @@ Trained adam_on_card(const AdamCase& c) {
 void test_adam(int64_t rows, int64_t size, double share) {
   const std::string what = std::to_string(rows) + "x" + std::to_string(size) + ", share " + std::to_string(share);
   const AdamCase c = adam_case(rows, size, share);
-  const Trained card = adam_on_card(c), cpu = adam_on_cpu(c);
-  expect_close("Adam " + what, card.param, cpu.param, 1e-6);
-  expect_close("first moment " + what, card.first, cpu.first, 1e-6);
-  expect_close("second moment " + what, card.second, cpu.second, 1e-6);
-  expect(card.skipped == cpu.skipped, "rows left out " + what);
+  const Trained gpu = adam_on_gpu(c), cpu = adam_on_cpu(c);
+  expect_close("Adam " + what, gpu.param, cpu.param, 1e-6);
+  expect_close("first moment " + what, gpu.first, cpu.first, 1e-6);
+  expect_close("second moment " + what, gpu.second, cpu.second, 1e-6);
+  expect(gpu.skipped == cpu.skipped, "rows left out " + what);
   in_other_orders([&] {
-    const Trained again = adam_on_card(c);
-    expect_same_bits("Adam in another order " + what, again.param, card.param);
-    expect(again.skipped == card.skipped, "rows left out in another order " + what);
+    const Trained again = adam_on_gpu(c);
+    expect_same_bits("Adam in another order " + what, again.param, gpu.param);
+    expect(again.skipped == gpu.skipped, "rows left out in another order " + what);
   });
 }
 
@@ -178,14 +178,14 @@ void test_finite() {
 }  // namespace
 
 int main() {
-  skip_without_card();
+  skip_without_gpu();
   for (const float ssim_weight : {0.f, 0.2f, 1.f}) {
-    test_loss("plain", random_pictures(1, 1, false), ssim_weight);
-    test_loss("plain", random_pictures(20, 40, false), ssim_weight);
-    test_loss("masked", random_pictures(33, 19, true), ssim_weight);
+    test_loss("plain", random_images(1, 1, false), ssim_weight);
+    test_loss("plain", random_images(20, 40, false), ssim_weight);
+    test_loss("masked", random_images(33, 19, true), ssim_weight);
   }
-  test_loss("many tiles", random_pictures(260, 271, true), 0);
-  test_bright_pictures();
+  test_loss("many tiles", random_images(260, 271, true), 0);
+  test_bright_images();
   test_empty_mask();
   for (const double share : {1.0, 0.5, 0.1})
     test_adam(700, 3, share), test_adam(60, 48, share), test_adam(2500, 1, share);

@@ -1,5 +1,5 @@
-// The kernels from Gaussians to pictures and back, as a program without Python: it runs where the module cannot (other
-// processors under an emulator, sanitizers). Pictures against a plain loop over all Gaussians, gradients against central
+// The kernels from Gaussians to images and back, as a program without Python: it runs where the module cannot (other
+// processors under an emulator, sanitizers). Images against a plain loop over all Gaussians, gradients against central
 // differences, float against double, many threads against one. `test_render large` adds a scene that is sorted by
 // several threads, too.
 #include <cmath>
@@ -12,8 +12,8 @@ namespace {
 using namespace dyngs;
 using namespace check;
 
-// The picture by a loop over all pixels and all Gaussians, nearest first.
-Values plain_picture(const Scene& s, const Drawn<double>& d) {
+// The image by a loop over all pixels and all Gaussians, nearest first.
+Values plain_image(const Scene& s, const Drawn<double>& d) {
   Values color(s.pixels() * s.channels);
   for (int64_t v = 0; v < s.views; ++v) {
     std::vector<int64_t> order(s.n);
@@ -68,10 +68,10 @@ void test_small(int channels) {
   const Cotangents cotangents = random_cotangents(s);
   const std::string what = "D=" + std::to_string(channels);
   const Drawn<double> d = draw<double>(s, 1, &cotangents);
-  expect_close("picture, " + what, d.color, plain_picture(s, d), 1e-12);
+  expect_close("image, " + what, d.color, plain_image(s, d), 1e-12);
   test_gradients(s, cotangents, d);
   const Drawn<float> f = draw<float>(s, 1, &cotangents);
-  expect_close("float picture, " + what, f.color, d.color, 2e-5);
+  expect_close("float image, " + what, f.color, d.color, 2e-5);
   expect_close("float transmittance, " + what, f.transmittance, d.transmittance, 2e-5);
   expect_close("float means gradient, " + what, f.g_means, d.g_means, 2e-4);
   expect_close("float quats gradient, " + what, f.g_quats, d.g_quats, 2e-4);
@@ -87,7 +87,7 @@ void test_thresholds() {
   Scene s = random_scene(60, 37, 29, 3, 0.3);
   s.alpha_min = 1.0 / 255, s.transmittance_min = 1e-4;
   const Drawn<double> d = draw<double>(s, 1);
-  expect_close("picture with thresholds", d.color, plain_picture(s, d), 1e-12);
+  expect_close("image with thresholds", d.color, plain_image(s, d), 1e-12);
 }
 
 template <class S>
@@ -97,7 +97,7 @@ void test_threads(int64_t n, double size) {
   const Cotangents cotangents = random_cotangents(s);
   const Drawn<S> one = draw<S>(s, 1, &cotangents), four = draw<S>(s, 4, &cotangents);
   const std::string on = " on 4 threads, " + std::to_string(n) + " Gaussians";
-  expect_same_bits("picture" + on, one.color, four.color);
+  expect_same_bits("image" + on, one.color, four.color);
   expect_same_bits("stop" + on, one.stop, four.stop);
   expect_same_bits("means gradient" + on, one.g_means, four.g_means);
   expect_same_bits("quats gradient" + on, one.g_quats, four.g_quats);
@@ -131,7 +131,7 @@ void test_nothing_to_draw() {
   const Drawn<float> d = draw<float>(s, 2, &cotangents);
   expect(std::all_of(d.transmittance.begin(), d.transmittance.end(), [](float x) { return x == 1; }),
          "nothing is drawn");
-  expect(d.color[0] == static_cast<float>(s.background[0]), "an empty picture shows the background");
+  expect(d.color[0] == static_cast<float>(s.background[0]), "an empty image shows the background");
 }
 
 }  // namespace

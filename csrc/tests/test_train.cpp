@@ -12,7 +12,7 @@ namespace {
 using namespace dyngs;
 using namespace check;
 
-struct Pictures {
+struct Images {
   int64_t height, width;
   Values rendered, target, mask;
   double ssim_weight;
@@ -20,7 +20,7 @@ struct Pictures {
 
 // The blur of channel c around pixel (row, col) with zeros outside, of f(pixel index).
 template <class F>
-double blurred(const Pictures& p, int64_t row, int64_t col, F&& f) {
+double blurred(const Images& p, int64_t row, int64_t col, F&& f) {
   double sum = 0, total = 0;
   for (int i = -5; i <= 5; ++i)
     for (int j = -5; j <= 5; ++j) {
@@ -33,7 +33,7 @@ double blurred(const Pictures& p, int64_t row, int64_t col, F&& f) {
 }
 
 // The terms of one pixel in the sums of |x - y| and of 1 - SSIM.
-double pixel_loss(const Pictures& p, int64_t row, int64_t col) {
+double pixel_loss(const Images& p, int64_t row, int64_t col) {
   const double weight = p.mask[row * p.width + col];
   double loss = 0;
   for (int c = 0; c < 3; ++c) {
@@ -51,7 +51,7 @@ double pixel_loss(const Pictures& p, int64_t row, int64_t col) {
 }
 
 // The loss of the pixels at most 10 from (row, col), to which those around contribute, too; times 3 sum(mask).
-double plain_loss(const Pictures& p, int64_t row_begin, int64_t row_end, int64_t col_begin, int64_t col_end) {
+double plain_loss(const Images& p, int64_t row_begin, int64_t row_end, int64_t col_begin, int64_t col_end) {
   double loss = 0;
   for (int64_t row = std::max<int64_t>(row_begin, 0); row < std::min(row_end, p.height); ++row)
     for (int64_t col = std::max<int64_t>(col_begin, 0); col < std::min(col_end, p.width); ++col)
@@ -60,12 +60,12 @@ double plain_loss(const Pictures& p, int64_t row_begin, int64_t row_end, int64_t
 }
 
 void test_loss(int64_t height, int64_t width, double ssim_weight, bool masked) {
-  Pictures p{height,
-             width,
-             uniforms(3 * height * width, 0, 1),
-             uniforms(3 * height * width, 0, 1),
-             masked ? uniforms(height * width, 0, 1) : Values(height * width, 1),
-             ssim_weight};
+  Images p{height,
+           width,
+           uniforms(3 * height * width, 0, 1),
+           uniforms(3 * height * width, 0, 1),
+           masked ? uniforms(height * width, 0, 1) : Values(height * width, 1),
+           ssim_weight};
   const auto x = as<float>(p.rendered), y = as<float>(p.target), mask = as<float>(p.mask);
   const LossInput input{x.data(), y.data(), masked ? mask.data() : nullptr,
                         height,   width,    static_cast<float>(ssim_weight)};

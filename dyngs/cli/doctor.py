@@ -84,12 +84,15 @@ def examine() -> Iterator[Finding]:
 
 def _examine_core() -> Iterator[Finding]:
     try:
-        from dyngs.ops.native import active_isa
-
-        yield Finding("native core", f"instruction set {active_isa()}")
-    except ImportError as error:
-        yield Finding("native core", f"{error}; reinstall with `pip install --force-reinstall dyngs`", "broken")
+        from dyngs.ops.native import ISA_NAMES, active_isa, built_isas, core
+    except (ImportError, DyngsError) as error:
+        yield Finding("native core", str(error), "broken")
         return
+    isa, newest = active_isa(), core.best_isa()
+    value = f"instruction set {isa} ({ISA_NAMES[isa]}), compiled: {', '.join(built_isas())}"
+    if newest not in built_isas():
+        value += f"; this processor also runs {newest} ({ISA_NAMES[newest]}): install again on it for more speed"
+    yield Finding("native core", value)
     runtimes = openmp_runtimes()
     if runtimes is not None:
         names = ", ".join(path.name for path in runtimes)
@@ -100,7 +103,7 @@ def _examine_gpu() -> Iterator[Finding]:
     """Yield what there is of a CUDA GPU; without one dyngs works, too."""
     try:
         from dyngs.ops.device import findings, why_no_gpu
-    except ImportError:
+    except (ImportError, DyngsError):
         return
     reason = why_no_gpu()
     for name, value in findings().items():

@@ -1,13 +1,15 @@
 """The compiled cores for this processor and for CUDA GPUs, the number of threads, and tensors passed to a core.
 
-The wheel holds one module per x86-64 level; the newest that the processor runs is imported. ``DYNGS_ISA=v2|v3|v4``
-picks an older one, for tests. That for CUDA GPUs is there if dyngs was built with it (docs/gpu.md), has the same
-functions, and is imported when the first tensor on a GPU comes.
+There is one module per x86-64 level: all of them in a wheel, that of the compiling machine in an installation from
+source. The newest that the processor runs is imported; ``DYNGS_ISA=v2|v3|v4`` picks an older one, for tests. The module
+for CUDA GPUs is there if dyngs was built with it (docs/gpu.md), has the same functions, and is imported when the first
+tensor on a GPU comes.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import sys
 import threading
 import warnings
@@ -24,20 +26,51 @@ from torch.utils.dlpack import to_dlpack  # pyright: ignore[reportPrivateImportU
 
 from dyngs.errors import DyngsError
 
+_BASELINE = "SSE4.2" if platform.machine() in ("x86_64", "AMD64") else "NEON"
+ISA_NAMES = {"v2": _BASELINE, "v3": "AVX2", "v4": "AVX-512"}
+"""Instruction sets, x86-64 levels, oldest first."""
+
+
+def built_isas() -> tuple[str, ...]:
+    """Return the instruction sets for which kernels were compiled, oldest first."""
+    return tuple(isa for isa in ISA_NAMES if util.find_spec(f"dyngs.ops._core_{isa}") is not None)
+
+
+def choose_isa(built: tuple[str, ...], newest: str, requested: str | None) -> str:
+    """Return the instruction set to load.
+
+    Args:
+        built: instruction sets that were compiled, oldest first.
+        newest: that this processor runs.
+        requested: value of ``DYNGS_ISA``; None where unset.
+
+    Raises:
+        DyngsError: the processor runs none of these, or not the requested one.
+    """
+    usable = [isa for isa in built if isa <= newest]
+    if not usable:
+        raise DyngsError(
+            f"dyngs was compiled for processors with {ISA_NAMES[built[0]]}, which this one lacks; "
+            "install it again on this machine, or from a wheel, which has kernels for all"
+        )
+    if requested is None:
+        return usable[-1]
+    if requested not in usable:
+        raise DyngsError(
+            f"DYNGS_ISA={requested}: here run {', '.join(usable)}; unset the variable or choose one of these"
+        )
+    return requested
+
 
 def _load_core() -> tuple[ModuleType, str]:
+    built = built_isas() or ("v2",)
     try:
-        baseline = import_module("dyngs.ops._core_v2")
+        asked = import_module(f"dyngs.ops._core_{built[-1]}")  # all but its kernels runs on every processor
+        isa = choose_isa(built, asked.best_isa(), os.environ.get("DYNGS_ISA"))
+        return import_module(f"dyngs.ops._core_{isa}"), isa
     except ImportError as error:
         advice = "install with `pip install .`, and run Python outside the source folder, which hides the installed one"
         raise ImportError(f"the compiled core of dyngs is missing ({error}); {advice}") from error
-    best = baseline.best_isa()
-    isa = os.environ.get("DYNGS_ISA", best)
-    if isa not in ("v2", "v3", "v4") or isa > best:
-        raise DyngsError(
-            f"DYNGS_ISA={isa}: this processor runs v2 to {best}; unset the variable or choose one of these"
-        )
-    return (baseline if isa == "v2" else import_module(f"dyngs.ops._core_{isa}")), isa
 
 
 _CUDA_CORE = "dyngs.ops._core_cuda"
@@ -65,9 +98,15 @@ def cuda_core() -> ModuleType:
 
 
 def core_for(x: Tensor) -> ModuleType:
-    """Return the compiled core that computes where ``x`` lies; on a GPU it goes on in torch's current stream there."""
+    """Return the compiled core that computes where ``x`` lies; on a GPU it goes on in torch's current stream there.
+
+    Raises:
+        DyngsError: ``x`` is float64 on a GPU.
+    """
     if x.device.type == "cpu":
         return core
+    if x.dtype == torch.float64:
+        raise DyngsError("float64 is not there on a GPU; use float32")
     module = cuda_core()
     module.use_queue(x.get_device(), torch.cuda.current_stream(x.device).cuda_stream)
     return module

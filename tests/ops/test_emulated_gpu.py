@@ -273,11 +273,6 @@ def test_too_many_tile_entries_are_refused_as_on_the_cpu(gpu: Callable) -> None:
         assert refused() == expected
 
 
-def test_float64_is_refused_in_one_line(gpu: Callable) -> None:
-    with gpu(), pytest.raises((DyngsError, ValueError), match="float64 is not there on a GPU; use float32"):
-        count_nonfinite_op(torch.zeros(3, dtype=torch.float64))
-
-
 def test_the_limits_of_networks_are_those_of_the_kernel(gpu: Callable) -> None:
     def computed(*widths: int) -> Tensor:
         params = torch.zeros(sum((a + 1) * b for a, b in pairwise(widths)))

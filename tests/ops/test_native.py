@@ -6,21 +6,16 @@ import os
 import re
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
 from emulated_gpu import compiled, compiler, emulated_kernels, session_folder
 
-from dyngs.ops.native import active_isa, array, core, kernel_threads, num_threads
+from dyngs.errors import DyngsError
+from dyngs.ops.native import active_isa, array, built_isas, choose_isa, core, core_for, kernel_threads, num_threads
 
 ROOT = Path(__file__).parents[2]
-
-
-def best_isa() -> str:
-    """Return the newest level that this processor runs; only the baseline module knows it."""
-    return import_module("dyngs.ops._core_v2").best_isa()
 
 
 def import_with(isa: str) -> subprocess.CompletedProcess[str]:
@@ -37,15 +32,49 @@ def import_with(isa: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_best_kernels_are_loaded() -> None:
-    assert active_isa() == os.environ.get("DYNGS_ISA", best_isa())
+    assert active_isa() == choose_isa(built_isas(), core.best_isa(), os.environ.get("DYNGS_ISA"))
 
 
-def test_an_older_instruction_set_can_be_asked_for() -> None:
-    assert import_with("v2").stdout.split() == ["v2", "v2"]
+@pytest.mark.parametrize(
+    ("built", "newest", "requested", "chosen"),
+    [
+        (("v2", "v3", "v4"), "v4", None, "v4"),
+        (("v2", "v3", "v4"), "v3", None, "v3"),
+        (("v2", "v3", "v4"), "v4", "v2", "v2"),
+        (("v3",), "v4", None, "v3"),
+        (("v4",), "v4", "v4", "v4"),
+    ],
+)
+def test_the_newest_that_the_processor_runs_is_chosen(
+    built: tuple[str, ...], newest: str, requested: str | None, chosen: str
+) -> None:
+    assert choose_isa(built, newest, requested) == chosen
+
+
+@pytest.mark.parametrize(
+    ("built", "newest", "requested", "message"),
+    [
+        (("v4",), "v3", None, "dyngs was compiled for processors with AVX-512, which this one lacks; install it again"),
+        (("v3", "v4"), "v2", "v2", "dyngs was compiled for processors with AVX2, which this one lacks"),
+        (("v2", "v3", "v4"), "v3", "v4", "DYNGS_ISA=v4: here run v2, v3; unset the variable or choose one of these"),
+        (("v4",), "v4", "v2", "DYNGS_ISA=v2: here run v4"),
+    ],
+)
+def test_kernels_that_would_crash_are_refused(
+    built: tuple[str, ...], newest: str, requested: str | None, message: str
+) -> None:
+    with pytest.raises(DyngsError, match=f"^{re.escape(message)}"):
+        choose_isa(built, newest, requested)
+
+
+def test_each_compiled_instruction_set_can_be_requested() -> None:
+    for isa in built_isas():
+        if isa <= core.best_isa():
+            assert import_with(isa).stdout.split() == [isa, isa]
 
 
 def test_an_unknown_instruction_set_is_refused() -> None:
-    assert import_with("v9").stdout.startswith(f"DYNGS_ISA=v9: this processor runs v2 to {best_isa()}")
+    assert import_with("v9").stdout.startswith("DYNGS_ISA=v9: here run v")
 
 
 def test_kernels_follow_torch_unless_told_otherwise() -> None:
@@ -72,6 +101,11 @@ def test_array_detaches_and_copies_only_if_needed() -> None:
     assert torch.from_dlpack(array(x)).data_ptr() == x.data_ptr()
     assert not torch.from_dlpack(array(x)).requires_grad
     assert torch.from_dlpack(array(x[:, 0])).stride() == (1,)
+
+
+def test_float64_on_a_gpu_is_refused_in_one_line() -> None:
+    with pytest.raises(DyngsError, match=r"^float64 is not there on a GPU; use float32$"):
+        core_for(torch.zeros(3, dtype=torch.float64, device="meta"))
 
 
 def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:

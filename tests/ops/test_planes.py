@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from importlib import import_module
 
 import pytest
 import torch
@@ -127,15 +126,6 @@ def assert_equal(got: list[Tensor], expected: list[Tensor]) -> None:
     assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
 
 
-@pytest.fixture(params=["v2", "v3", "v4"])
-def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The planes run on the kernels of this instruction set."""
-    if request.param > core.best_isa():
-        pytest.skip(f"this processor has no {request.param}")
-    monkeypatch.setattr("dyngs.ops.native.core", import_module(f"dyngs.ops._core_{request.param}"))
-    return request.param
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     count=st.integers(0, 70),
@@ -154,7 +144,7 @@ def test_features_equal_grid_sample(
 
 
 @pytest.mark.parametrize("channels", [32, 19])
-def test_every_instruction_set_gives_the_same_features(instruction_set: str, channels: int) -> None:
+def test_every_instruction_set_gives_the_same_features(isa: str, channels: int) -> None:
     levels, coords = make_levels((16, 32), 9, channels), make_coords(300)
     expected = run_features(reference_features, coords, 0.37, levels)
     assert_all_close(run_features(hexplane_features, coords, 0.37, levels), expected, 1e-12)
@@ -305,7 +295,7 @@ def test_penalty_equals_reference(sizes: tuple[int, ...], times: int, channels: 
     assert_all_close(run_penalty(plane_penalty, levels), run_penalty(reference_penalty, levels), rounding)
 
 
-def test_every_instruction_set_gives_the_same_penalty(instruction_set: str) -> None:
+def test_every_instruction_set_gives_the_same_penalty(isa: str) -> None:
     levels = make_levels((16, 33), 20, 19)
     expected = run_penalty(reference_penalty, levels)
     assert_all_close(run_penalty(plane_penalty, levels), expected, 1e-13)

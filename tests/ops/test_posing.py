@@ -6,7 +6,6 @@ In the tests, N Gaussians follow J joints.
 from __future__ import annotations
 
 import math
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import core, kernel_threads
+from dyngs.ops.native import kernel_threads
 from dyngs.ops.posing import Posed, pose_by_joints, posing_backward_op, posing_op
 from dyngs.ops.quaternions import rotation_matrices
 
@@ -82,18 +81,9 @@ def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) ->
             assert (a.double() - b).abs().max() <= tolerance * max(1.0, b.abs().max().item())
 
 
-@pytest.fixture(params=["v2", "v3", "v4"])
-def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Posing runs on the kernels of this instruction set."""
-    if request.param > core.best_isa():
-        pytest.skip(f"this processor has no {request.param}")
-    monkeypatch.setattr("dyngs.ops.native.core", import_module(f"dyngs.ops._core_{request.param}"))
-    return request.param
-
-
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(count=st.integers(0, 40), joints=st.integers(1, 35), seed=st.integers(0, 1000))
-def test_double_equals_torch(instruction_set: str, count: int, joints: int, seed: int) -> None:
+def test_double_equals_torch(isa: str, count: int, joints: int, seed: int) -> None:
     case = random_case(count, joints, seed)
     short = min((x.detach().norm(dim=1).min().item() for x in case[1:2] if count), default=1.0)
     assert_close(results(posed, case), results(reference, case), 1e-11 / min(1.0, short))
@@ -158,7 +148,7 @@ def test_gradcheck() -> None:
     assert torch.autograd.gradcheck(outputs, random_case(5, 3, seed=5))
 
 
-def test_float_agrees_with_double(instruction_set: str) -> None:
+def test_float_agrees_with_double(isa: str) -> None:
     case = random_case(600, 24)
     single = [x.detach().float().requires_grad_() for x in case]
     assert_close(results(posed, single), results(posed, case), 1e-5)

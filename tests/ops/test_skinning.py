@@ -6,7 +6,6 @@ In the tests, M points follow B of S nodes with D values each.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
 
 import pytest
 import torch
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import core, kernel_threads
+from dyngs.ops.native import kernel_threads
 from dyngs.ops.skinning import blend_skinning, skinning_backward_op, skinning_op
 
 IDENTITY = torch.tensor([0, 0, 0, 1.0, 0, 0, 0], dtype=torch.float64)
@@ -97,15 +96,6 @@ def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) ->
             assert (a.double() - b).abs().max() <= tolerance * max(1.0, b.abs().max().item())
 
 
-@pytest.fixture(params=["v2", "v3", "v4"])
-def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Skinning runs on the kernels of this instruction set."""
-    if request.param > core.best_isa():
-        pytest.skip(f"this processor has no {request.param}")
-    monkeypatch.setattr("dyngs.ops.native.core", import_module(f"dyngs.ops._core_{request.param}"))
-    return request.param
-
-
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     count=st.integers(0, 40),
@@ -114,16 +104,14 @@ def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     width=st.integers(0, 11),
     seed=st.integers(0, 1000),
 )
-def test_double_equals_torch(
-    instruction_set: str, count: int, num_nodes: int, per_point: int, width: int, seed: int
-) -> None:
+def test_double_equals_torch(isa: str, count: int, num_nodes: int, per_point: int, width: int, seed: int) -> None:
     """With several parts in the backward pass or one, values that fill registers or not, nodes followed twice."""
     case = random_case(count, num_nodes, per_point, width, seed)
     short = case.motion.detach()[:, 3:].norm(dim=1).min()  # gradients grow as quaternions get shorter
     assert_close(results(blend_skinning, case), results(reference, case), 1e-12 / min(1.0, short.item()))
 
 
-def test_double_equals_torch_for_many_points(instruction_set: str) -> None:
+def test_double_equals_torch_for_many_points(isa: str) -> None:
     """More than one piece of the forward pass, all parts of the backward pass."""
     case = random_case(1500, 30, 4, 10)
     assert_close(results(blend_skinning, case), results(reference, case), 1e-12)
@@ -145,7 +133,7 @@ def test_gradcheck() -> None:
     assert torch.autograd.gradcheck(by_all, one.leaves())
 
 
-def test_float_agrees_with_double(instruction_set: str) -> None:
+def test_float_agrees_with_double(isa: str) -> None:
     """Exponents of at most some tens, rounded to 6e-8, put 1e-6 on the small weights; a node sums 100 followers."""
     case = random_case(600, 24, 4, 10)
     assert_close(results(blend_skinning, case.to(torch.float32)), results(blend_skinning, case), 1e-5)

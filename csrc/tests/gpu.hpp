@@ -1,4 +1,4 @@
-// Where the tests of the CUDA kernels run them: on the emulated card, or, with DYNGS_ON_CARD, on a real one.
+// Where the tests of the CUDA kernels run them: on the emulated GPU, or, with DYNGS_ON_GPU, on a real one.
 #pragma once
 
 #include <string>
@@ -6,7 +6,7 @@
 
 #include "core/api.hpp"
 #include "cuda/api.hpp"
-#if defined(DYNGS_ON_CARD)
+#if defined(DYNGS_ON_GPU)
 #include <cuda_runtime.h>
 
 #include <cstdio>
@@ -24,13 +24,13 @@ namespace check {
 
 using namespace dyngs;
 
-#if defined(DYNGS_ON_CARD)
+#if defined(DYNGS_ON_GPU)
 
 inline void succeed(cudaError_t error) {
   if (error != cudaSuccess) throw std::runtime_error(cudaGetErrorString(error));
 }
 
-// An allocation of the card's memory: that of the emulation, as far as tests use it.
+// An allocation of the GPU's memory: that of the emulation, as far as tests use it.
 template <class T>
 class Memory {
  public:
@@ -61,17 +61,17 @@ class Memory {
   int64_t count_;
 };
 
-// A card schedules as it likes: once more, and again.
+// A GPU schedules as it likes: once more, and again.
 template <class Run>
 void in_other_orders(const Run& run) {
   for (int k = 0; k < 3; ++k) run();
 }
 
-// Ends the program with the code that CTest knows for "skipped" where there is no card.
-inline void skip_without_card() {
+// Ends the program with the code that CTest knows for "skipped" where there is no GPU.
+inline void skip_without_gpu() {
   int count = 0;
   if (cudaGetDeviceCount(&count) == cudaSuccess && count > 0) return;
-  std::printf("skipped: no CUDA card here\n");
+  std::printf("skipped: no CUDA GPU here\n");
   std::exit(77);
 }
 
@@ -90,7 +90,7 @@ void in_other_orders(const Run& run) {
   cuda::emulated::machine.schedule = {};
 }
 
-inline void skip_without_card() {}
+inline void skip_without_gpu() {}
 
 #endif
 
