@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal, cast
 import numpy as np
 
 from dyngs.capture.frame_choice import STILL, FrameChoice, chosen_frames, measured
-from dyngs.capture.photos import Photo, digest_of, gather_photos, lay_out, link_or_copy
+from dyngs.capture.photos import Photo, copied, digest_of, gather_photos, lay_out
 from dyngs.capture.sfm_check import angles_deg, turning_fraction
 from dyngs.capture.sfm_features import FeatureTask, find_features, match_pairs, matched_images
 from dyngs.capture.sfm_mapping import Mapper, MappingTask, Model, better, mapped, needs_more
@@ -161,10 +161,12 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
         if source.is_file():
             images = _frames_of(source, capture, options, report)
         else:
-            images = _Images(gather_photos(source, capture / "images", out), is_video=False)
+            gathered, left_out = gather_photos(source, capture / "images", out)
+            images = _Images(gathered, is_video=False, notes=left_out)
     photos = images.photos
     if len(photos) < 3:
-        raise DyngsError(f"{source} has {len(photos)} images; structure from motion needs at least 3, better 30")
+        found = "; ".join((f"{source} has {len(photos)} image{'s' * (len(photos) != 1)}", *images.notes))
+        raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
     import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
@@ -201,15 +203,14 @@ def _feature_task(work: Path, images: _Images, options: SfmOptions) -> FeatureTa
     """Lay the images out for COLMAP."""
     folder, photos = work / "capture" / "images", images.photos
     found = {} if options.masks is None else find_masks(options.masks)
-    masks = {photo.name: mask for photo in photos if (mask := mask_of(photo.name, found)) is not None}
+    masks = {photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None}
     if options.masks is not None and not masks:
         raise DyngsError(f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)")
     names = lay_out(photos, folder, work / "images", masks)
     for name, mask in masks.items():
         target = folder.with_name("masks") / (name + mask.suffix)
-        target.parent.mkdir(parents=True, exist_ok=True)
         if not target.exists():
-            link_or_copy(inside(mask).resolve(), target)
+            copied(inside(mask).resolve(), target)
     return FeatureTask(
         work / "database.db", work / "images", names, photos, work / "masks" if masks else None,
         options.camera_model, _is_single(images, options), options.max_features, options.longest_side,
@@ -387,7 +388,7 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
             done, json.dumps({key: list(names) for key, names in fields.items()} | {"notes": [choice.summary()]})
         )
     stored = {key: tuple(map(str, cast("list[object]", value))) for key, value in read_json_object(done).items()}
-    photos = [Photo(name, read_header(images / name)) for name in stored["names"]]
+    photos = [Photo(name, read_header(images / name), name) for name in stored["names"]]
     return _Images(photos, True, stored["blurred"], stored["notes"])
 
 

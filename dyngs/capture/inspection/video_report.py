@@ -14,7 +14,7 @@ from dyngs.capture.multi_video.given import NAME, read_given
 from dyngs.capture.multi_video.planes import motion_of
 from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.images.video import opened_video, read_frames
+from dyngs.data.images.video import opened_video, orientation_of, read_frames
 from dyngs.errors import reading
 from dyngs.files.containment import inside
 
@@ -80,10 +80,10 @@ def video_facts(path: Path) -> VideoFacts:
     film = open_film(inside(path))
     looked = _look(film)
     steady = steadiness(looked.small.grey)
-    rotation, sound = _streams(path)
+    shown, sound = _streams(path)
     seconds = film.seconds
     facts = (
-        ("size", f"{film.info.width}x{film.info.height}" + (f" (turned by {rotation} degrees)" if rotation else "")),
+        ("size", f"{film.info.width}x{film.info.height}" + shown),
         ("frames", f"{len(seconds)} in {seconds[-1] + 1 / film.rate:.2f} s, {_rate(film)}"),
         ("sound", sound),
         ("sharpness", _sharpness(looked.sharpness)),
@@ -106,13 +106,24 @@ def _look(film: Film) -> _Looked:
     return _Looked(SmallImages(np.stack(small), film.seconds[: len(small)]), np.array(sharpness))
 
 
-def _streams(path: Path) -> tuple[int, str]:
-    """Return by how many degrees images are turned on reading, and what sound there is."""
+_ORIENTATIONS = (
+    "",
+    "mirrored",
+    "rotated by 180 degrees",
+    "mirrored upside down",
+    "mirrored and rotated by 270 degrees",
+)
+_ORIENTATIONS += ("rotated by 90 degrees", "mirrored and rotated by 90 degrees", "rotated by 270 degrees")
+"""What is done to frames on reading, by their orientation."""
+
+
+def _streams(path: Path) -> tuple[str, str]:
+    """Return what is done to frames on reading, in brackets, and what sound there is."""
     with reading(path, "it must be a video; copy or convert it again"), opened_video(path) as container:
         first = next(container.decode(container.streams.video[0]))
-        rotation = round(getattr(first, "rotation", 0) / 90) % 4 * 90
+        done = _ORIENTATIONS[orientation_of(first) - 1]
         audio = container.streams.audio
-        return rotation, f"{audio[0].codec_context.name}, {audio[0].rate} Hz" if audio else "none"
+        return f" ({done})" if done else "", f"{audio[0].codec_context.name}, {audio[0].rate} Hz" if audio else "none"
 
 
 def _rate(film: Film) -> str:

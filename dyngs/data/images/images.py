@@ -25,7 +25,8 @@ _TAIL_BYTES = 4096
 _STRIP_PIXELS = 2**18
 """Pixels of an image that are shrunk at a time."""
 _PNG_END = b"IEND"
-_END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+"""What complete files end in, by suffix."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def read_header(path: Path) -> ImageHeader:
         source = _open(path)
         spec = source.spec()
         source.close()
-        return ImageHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags_of(spec))
+        return _header(spec)
 
 
 def header_if_readable(path: Path) -> ImageHeader | None:
@@ -124,7 +125,7 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
 
     source = _open(path)
     spec = source.spec()
-    tags = tags_of(spec)
+    header = _header(spec)
     check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
     is_linear = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
     pixels = source.read_image(oiio.FLOAT if is_linear else oiio.UINT8)
@@ -135,11 +136,11 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
         reason = message or "the data ends early"
         raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
-    header = ImageHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags)
     if upright or (size is not None and header.size_for(size) != header.size):
-        pixels = turned_upright(pixels, tags.orientation)
-    alpha = pixels[..., spec.alpha_channel] if spec.alpha_channel >= 0 else None
-    colour_channels = [i for i in range(spec.nchannels) if i != spec.alpha_channel]
+        pixels = turned_upright(pixels, header.tags.orientation)
+    alpha_channel = _alpha_channel(spec)
+    alpha = None if alpha_channel is None else pixels[..., alpha_channel]
+    colour_channels = [i for i in range(spec.nchannels) if i != alpha_channel]
     if not colour_channels:
         raise DyngsError(f"{path}: the image has no colour channel; use an RGB or RGBA image")
     colour_channels = colour_channels[:3] if len(colour_channels) >= 3 else colour_channels[:1] * 3
@@ -187,7 +188,7 @@ def check_image(path: Path) -> ImageHeader:
     """
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
-    marker = _END_MARKERS.get(path.suffix.lower())
+    marker = END_MARKERS.get(path.suffix.lower())
     if marker:
         with _reading(path), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
@@ -262,6 +263,16 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
         reason = image_error(oiio) or "unknown format"
         raise DyngsError(f"{path}: cannot be read as an image ({reason}); copy or convert it again")
     return source
+
+
+def _header(spec: OpenImageIO.ImageSpec) -> ImageHeader:
+    has_alpha = _alpha_channel(spec) is not None
+    return ImageHeader(spec.width, spec.height, spec.nchannels, has_alpha, tags_of(spec))
+
+
+def _alpha_channel(spec: OpenImageIO.ImageSpec) -> int | None:
+    """Return the index of alpha; OpenImageIO counts it from 1 for GIF."""
+    return min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel >= 0 else None
 
 
 def _encode_linear(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
