@@ -13,9 +13,9 @@ import torch
 from dyngs.capture.background import Background, Separation, background_of, person_mask, separation
 from dyngs.capture.multi_video.steadiness import steadiness
 from dyngs.data.capture import Capture, Silhouette, View, all_views
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
-from dyngs.data.frame_selection import evenly_spaced, parse_frames
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import SUFFIXES, read_header
-from dyngs.data.name_order import natural_order
 from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.times import evenly_spaced, natural_order, parse_frames
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, images_up_to, inside, staying_within
 from dyngs.files.wrong_place import VIDEO_SUFFIXES

@@ -9,10 +9,10 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.geometry.poses import camera_center
 from dyngs.data.geometry.projection import projected, times_seen
 from dyngs.data.loader import ImageLoader
+from dyngs.data.times import evenly_spaced
 
 SAMPLE = 2000
 """Points that are looked at."""

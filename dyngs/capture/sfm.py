@@ -25,10 +25,10 @@ from dyngs.capture.sfm_parallax import Parallax, matched_pairs, parallax_of
 from dyngs.capture.sfm_report import SfmResult, advice, write_report
 from dyngs.capture.sfm_work import working
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.frame_seconds import write_seconds
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import frame_seconds, read_frames, read_numbered_frames
 from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.times import write_seconds
 from dyngs.errors import DyngsError
 from dyngs.files.containment import MAX_MEGAPIXELS, images_up_to, inside, staying_within
 from dyngs.files.json_files import read_json_object

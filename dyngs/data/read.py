@@ -11,12 +11,10 @@ import numpy as np
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View, all_views
 from dyngs.data.fitted_body import with_fitted_body
-from dyngs.data.frame_selection import hold_out_frames, select_frames, split_by_camera
 from dyngs.data.geometry.recenter import recenter
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
-from dyngs.data.name_order import times_by_name
 from dyngs.data.prior_files import present_priors
 from dyngs.data.readers import (
     blender,
@@ -33,9 +31,13 @@ from dyngs.data.readers import (
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.times import (
     clip_seconds,
+    hold_out_frames,
+    select_frames,
     sequence_warnings,
     span_in_files,
+    split_by_camera,
     still_if_constant,
+    times_by_name,
     times_of_frames,
     unit_times,
 )

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.images.images import read_image, read_mask
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 
 LOOKED_AT = 4

@@ -13,8 +13,8 @@ from dyngs.capture.multi_video.films import Film, SmallImages, open_film, shrunk
 from dyngs.capture.multi_video.given import NAME, read_given
 from dyngs.capture.multi_video.planes import motion_of
 from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.images.video import opened_video, orientation_of, read_frames
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import reading
 from dyngs.files.containment import inside
 

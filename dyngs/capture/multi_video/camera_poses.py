@@ -13,8 +13,8 @@ import numpy as np
 
 from dyngs.capture.multi_video.films import Film
 from dyngs.conventions import ReportProgress
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.images.video import read_numbered_frames
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 

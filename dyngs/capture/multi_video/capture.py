@@ -12,11 +12,10 @@ import numpy as np
 from dyngs.capture.multi_video.camera_poses import camera_name
 from dyngs.capture.multi_video.films import Film
 from dyngs.capture.multi_video.given import NAME
-from dyngs.capture.multi_video.moments import Taken
 from dyngs.conventions import ReportProgress
-from dyngs.data.frame_seconds import write_seconds
 from dyngs.data.images.video import read_numbered_frames
 from dyngs.data.readers.colmap import TEST_LIST
+from dyngs.data.times import Taken, write_seconds
 from dyngs.files.write import write_image, write_text
 
 if TYPE_CHECKING:

@@ -21,12 +21,12 @@ from dyngs.capture.multi_video.camera_poses import (
 from dyngs.capture.multi_video.capture import write_facts, write_images, write_model
 from dyngs.capture.multi_video.films import Film, SmallImages, open_films, small_images
 from dyngs.capture.multi_video.given import checked_starts, read_given
-from dyngs.capture.multi_video.moments import taken_frames
 from dyngs.capture.multi_video.planes import Watcher, motion_of
 from dyngs.capture.multi_video.starts import found_starts, given_starts
 from dyngs.capture.multi_video.steadiness import STANDS, steadiness
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.readers.shared.camera_sequences import MIN_CAMERAS_TO_HOLD_OUT
+from dyngs.data.times import taken_frames
 from dyngs.errors import DyngsError
 from dyngs.files.containment import MAX_MEGAPIXELS, images_up_to, staying_within
 from dyngs.files.fields import first_few
@@ -41,7 +41,7 @@ class VideosOptions:
     """Options for several videos.
 
     Attributes:
-        num_moments: moments to take at most, evenly spaced; None: as many as fit ``moments.MOST_MOMENTS``.
+        num_steps: time steps to take at most, evenly spaced; None: ``times.MOST_STEPS``, fewer for many cameras.
         starts: camera to the second at which its video begins; None: as in ``videos.json``, else found.
         seed: of everything random.
         num_threads: 0 = all cores.
@@ -49,7 +49,7 @@ class VideosOptions:
         max_megapixels: larger videos are refused.
     """
 
-    num_moments: int | None = None
+    num_steps: int | None = None
     starts: dict[str, float] | None = None
     seed: int = 0
     num_threads: int = 0
@@ -84,7 +84,7 @@ def poses_of_videos(
     Args:
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
-        options: moments, offsets, effort.
+        options: time steps, offsets, effort.
         report: is told how far the work has come.
 
     Raises:
@@ -125,7 +125,8 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
     watchers = [_watcher(film, images, found.model) for film, images in zip(films, small, strict=True)]
     begun = found_starts(films, watchers) if starts is None else given_starts(films, starts)
     lines.append(begun.line)
-    taken, line = taken_frames(films, begun.seconds, options.num_moments)
+    clocks = [film.seconds + start for film, start in zip(films, begun.seconds, strict=True)]
+    taken, line = taken_frames(source, clocks, [film.rate for film in films], options.num_steps)
     lines.append(line)
     names = write_images(work, films, taken, report)
     write_model(work, films, names, found.model)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.times import evenly_spaced
 
 STANDS = 0.002
 """A camera stands if its image is never displaced by more than this fraction of its longer side."""

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from dyngs.data.capture import View
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.geometry.focus import focus_point, fraction_in_front
 from dyngs.data.geometry.poses import camera_center, inverse_rigid
 from dyngs.data.geometry.projection import times_seen
+from dyngs.data.times import evenly_spaced
 
 NEAR_PER_FOCUS = 0.25
 """Nearest depth, in distances from the cameras to what they look at."""

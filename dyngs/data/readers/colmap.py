@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View
-from dyngs.data.frame_seconds import read_seconds
 from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
 from dyngs.data.geometry.poses import checked_pose, repair_warning
 from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.colmap_check import check_model_file
 from dyngs.data.readers.shared.transforms import view_name
+from dyngs.data.times import read_seconds
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 

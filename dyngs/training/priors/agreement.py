@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image
+from dyngs.data.times import evenly_spaced
 from dyngs.training.priors.depth_maps import Kind, values_of
 
 PAIRS = 12
