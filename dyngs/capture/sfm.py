@@ -16,14 +16,20 @@ import numpy as np
 
 from dyngs.capture.frame_choice import STILL, FrameChoice, chosen_frames, measured
 from dyngs.capture.photos import Photo, copied, digest_of, gather_photos, lay_out
-from dyngs.capture.sfm_check import angles_deg, turning_fraction
-from dyngs.capture.sfm_features import FeatureTask, find_features, match_pairs, matched_images
+from dyngs.capture.sfm_features import (
+    ALIKE,
+    ALIKE_PHOTOS,
+    FeatureTask,
+    alike_pairs,
+    all_pairs,
+    find_features,
+    match_pairs,
+    matched_images,
+    neighbour_pairs,
+)
 from dyngs.capture.sfm_mapping import Mapper, MappingTask, Model, better, mapped, needs_more
-from dyngs.capture.sfm_movers import without_movers
-from dyngs.capture.sfm_pairs import ALIKE, ALIKE_PHOTOS, alike_pairs, all_pairs, neighbour_pairs
-from dyngs.capture.sfm_parallax import Parallax, matched_pairs, parallax_of
-from dyngs.capture.sfm_report import SfmResult, advice, write_report
-from dyngs.capture.sfm_work import working
+from dyngs.capture.sfm_matches import Parallax, angles_deg, matched_pairs, parallax_of, turning_fraction, without_movers
+from dyngs.capture.sfm_work import SfmResult, advice, working, write_report
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import frame_seconds, read_frames, read_numbered_frames

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dyngs.capture.sfm_check import agreement
+from dyngs.capture.sfm_matches import agreement
 from dyngs.conventions import ReportProgress
 
 if TYPE_CHECKING:

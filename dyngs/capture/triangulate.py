@@ -17,9 +17,9 @@ import torch
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
-from dyngs.data.geometry.frusta import points_in_frusta
-from dyngs.data.geometry.projection import projected
+from dyngs.data.geometry import projected
 from dyngs.data.loader import Image, ImageLoader
+from dyngs.data.scene_space import points_in_frusta
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dyngs.capture.multi_video.estimate import VideosOptions, poses_of_videos
-from dyngs.capture.multi_video.films import videos_in
-from dyngs.capture.multi_video.given import NAME as VIDEOS_FILE
+from dyngs.capture.multi_video.films import VIDEOS_FILE, videos_in
 from dyngs.capture.photos import digest_of, photos_below
 from dyngs.capture.sfm import SfmOptions, estimate_poses
 from dyngs.config import DataConfig

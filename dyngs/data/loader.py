@@ -13,12 +13,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
-from dyngs.data.ahead import Ahead
 from dyngs.data.capture import View
-from dyngs.data.decoded import Decoded
-from dyngs.data.geometry.intrinsics import scaled_intrinsics
-from dyngs.data.images.depth import read_depth, read_labels
-from dyngs.data.images.flow import read_flow
+from dyngs.data.decoding import Ahead, Decoded
+from dyngs.data.geometry import scaled_intrinsics
 from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,
@@ -30,8 +27,16 @@ from dyngs.data.images.images import (
     target_size,
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
-from dyngs.data.images.resampling import flow_at, nearest_positions, resized, taken_at
-from dyngs.data.images.silhouettes import cut_out
+from dyngs.data.images.maps import (
+    cut_out,
+    flow_at,
+    nearest_positions,
+    read_depth,
+    read_flow,
+    read_labels,
+    resized,
+    taken_at,
+)
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
 from dyngs.ops.device import CPU, gpu_memory

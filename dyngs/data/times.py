@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Splits, View, all_views
-from dyngs.data.geometry.poses import inverse_rigid
+from dyngs.data.capture import Split, Splits, View, all_views
+from dyngs.data.geometry import inverse_rigid
 from dyngs.errors import DyngsError, printable
 from dyngs.files.fields import is_number
 from dyngs.files.json_files import read_json_object
@@ -133,8 +133,11 @@ def times_of_frames(splits: Splits) -> Splits:
     The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its own.
     """
     timed: Splits = dict(splits)
-    for clip in ({"pose"}, splits.keys() - {"pose"}):
-        views = [view for name in clip & splits.keys() for view in splits[name]]
+    clips: list[list[Split]] = [[], []]
+    for name in splits:
+        clips[name == "pose"].append(name)
+    for clip in clips:
+        views = [view for name in clip for view in splits[name]]
         frames = {view.frame for view in views if view.frame is not None and view.time is None}
         if len(frames) > 1 and all(view.frame is not None and view.time is None for view in views):
             first, span = min(frames), max(frames) - min(frames)

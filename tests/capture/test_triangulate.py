@@ -20,7 +20,7 @@ from dyngs.capture.triangulate import (
 )
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
-from dyngs.data.geometry.projection import projected
+from dyngs.data.geometry import projected
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture

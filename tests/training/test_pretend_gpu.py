@@ -156,7 +156,7 @@ def test_images_that_do_not_fit_there_are_streamed(still: Path, monkeypatch: pyt
     config = config_of("static", still, *STATIC)
     with pretend_gpu():
         kept = trained(config, monkeypatch, GPU).checkpoint().tensors
-        monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: (0, 0))
+        monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: (0, 0))
         streamed = trained(config, monkeypatch, GPU).checkpoint().tensors
     assert [key for key, x in kept.items() if not torch.equal(streamed[key], x)] == []
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.capture import Capture, View
-from dyngs.data.geometry.poses import inverse_rigid, pose_fault
+from dyngs.data.geometry import inverse_rigid, pose_fault
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 

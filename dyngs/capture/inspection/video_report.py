@@ -9,9 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.capture.multi_video.films import Film, SmallImages, open_film, shrunk_grey, videos_in
-from dyngs.capture.multi_video.given import NAME, read_given
-from dyngs.capture.multi_video.planes import motion_of
+from dyngs.capture.multi_video.films import (
+    VIDEOS_FILE,
+    Film,
+    SmallImages,
+    open_film,
+    read_given,
+    shrunk_grey,
+    videos_in,
+)
+from dyngs.capture.multi_video.lags import motion_of
 from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
 from dyngs.data.images.video import opened_video, orientation_of, read_frames
 from dyngs.data.times import evenly_spaced
@@ -177,7 +184,7 @@ def _next_of_folder(folder: Path, reports: Sequence[VideoFacts]) -> list[str]:
         return [f"next: take {', '.join(moving[:5])} out: of several videos, only cameras that stand still get poses"]
     names = [found.film.name for found in reports]
     rates = {round(found.film.rate, 2) for found in reports}
-    known = "found by sound or motion" if read_given(folder, names).starts is None else f"as {NAME} says"
+    known = "found by sound or motion" if read_given(folder, names).starts is None else f"as {VIDEOS_FILE} says"
     return [
         f"{len(names)} cameras that stand, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
         f"offsets between them: {known}",

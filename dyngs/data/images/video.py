@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -194,7 +194,8 @@ def orientation_of(frame: av.VideoFrame) -> int:
 
     By its display matrix, which maps (x, y) to (a x + c y, b x + d y), rounded to quarter turns.
     """
-    matrix = next((bytes(x) for x in frame.side_data if x.type.name == "DISPLAYMATRIX"), b"")
+    found: list[Any] = list(frame.side_data)
+    matrix = next((bytes(x) for x in found if x.type.name == "DISPLAYMATRIX"), b"")
     if len(matrix) < 36:
         return 1
     a, b, _, c, d = struct.unpack("9i", matrix[:36])[:5]

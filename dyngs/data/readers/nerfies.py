@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Capture, PointCloud, Splits
-from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
+from dyngs.data.capture import Capture, CaptureFormat, PointCloud, Splits
+from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, header_if_readable
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
+from dyngs.data.readers.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.fields import is_number
 from dyngs.files.json_files import read_json_object

@@ -10,10 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, Splits, View
-from dyngs.data.geometry.poses import checked_pose
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Split, Splits, View
+from dyngs.data.geometry import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
-from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, first_few, numbers_of

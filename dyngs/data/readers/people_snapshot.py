@@ -9,12 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import BodyFrames, Capture, Silhouette
-from dyngs.data.geometry.poses import opengl_from_cam
-from dyngs.data.images.silhouettes import MASKS
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette
+from dyngs.data.geometry import opengl_from_cam
+from dyngs.data.images.maps import MASKS
 from dyngs.data.images.video import VIDEO_SUFFIXES
-from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views, video_fps
-from dyngs.data.readers.shared.capture_format import CaptureFormat
+from dyngs.data.readers.camera_folders import open_camera, sequence_views, video_fps
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, numbers_of

@@ -10,11 +10,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
-from dyngs.data.capture import BodyFrames, Capture, Silhouette, Splits, View
-from dyngs.data.geometry.poses import checked_pose, opengl_from_cam
-from dyngs.data.readers.shared.camera_sequences import MIN_CAMERAS_TO_HOLD_OUT
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
+from dyngs.data.geometry import checked_pose, opengl_from_cam
+from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
+from dyngs.data.readers.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, first_few, numbers_of

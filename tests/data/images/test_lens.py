@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dyngs.data.capture import Lens
-from dyngs.data.geometry.intrinsics import pinhole_matrix
+from dyngs.data.geometry import pinhole_matrix
 from dyngs.data.images.lens import (
     WIDEST_DEG,
     distort,

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 
 from dyngs.config import DataConfig
-from dyngs.data.images.silhouettes import cut_out
+from dyngs.data.images.maps import cut_out
 from dyngs.data.read import read_capture
 from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
 from dyngs.errors import DyngsError
