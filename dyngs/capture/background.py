@@ -214,7 +214,6 @@ def with_background_masks(
         folder: is made.
         empty: an image without the person, or a folder of one for each camera, whose name ends in the camera's number
             (or is that of any image of it); None: the median over time.
-        say: is told in a line how well the person stands out.
 
     Raises:
         DyngsError: a camera that moves, too few images, or nobody who stands out; says what to add.
@@ -247,11 +246,7 @@ def with_background_masks(
 
 
 def _fixed_cameras(capture: Capture) -> list[_Camera]:
-    """Return the cameras of a capture, all of which stand.
-
-    Raises:
-        DyngsError: a camera that moves, or of which there are few images.
-    """
+    """Return the cameras of a capture, all of which stand."""
     groups: dict[int, list[View]] = {}
     for view in all_views(capture.splits):
         groups.setdefault(view.camera_id, []).append(view)
@@ -276,11 +271,7 @@ def _fixed_cameras(capture: Capture) -> list[_Camera]:
 
 
 def _plates(empty: Path, cameras: Sequence[_Camera]) -> Mapping[int, Path]:
-    """Return the images without the person, by index of the camera.
-
-    Raises:
-        DyngsError: no such file, or none for a camera.
-    """
+    """Return the images without the person, by index of the camera."""
     if empty.is_file():
         if len(cameras) > 1:
             raise DyngsError(f"{empty}: is one image for {len(cameras)} cameras; give a folder with one each")
@@ -300,11 +291,7 @@ def _plates(empty: Path, cameras: Sequence[_Camera]) -> Mapping[int, Path]:
 
 
 def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Background:
-    """Return what the camera sees without the person.
-
-    Raises:
-        DyngsError: the camera moves, or the image of the background has another shape.
-    """
+    """Return what the camera sees without the person."""
     if plate is not None:
         first = camera.views[0]
         pixels = read_image(plate, (first.width, first.height))[..., :3]
@@ -329,11 +316,7 @@ def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Bac
 
 
 def _require_clear(camera: _Camera, found: Separation, *, with_plate: bool) -> None:
-    """Refuse masks that cannot be trusted.
-
-    Raises:
-        DyngsError: says why, and what to add.
-    """
+    """Refuse masks that cannot be trusted."""
     if found.is_clear if not with_plate else found.area > 0 and found.on_edges > 0.5:
         return
     if found.area < 1e-3:

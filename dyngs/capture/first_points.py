@@ -23,9 +23,6 @@ def checked_points(capture: Capture, options: DataConfig) -> tuple[Capture, str 
     """Return the capture, without its points if they are noise, and a line on that; None where they were not checked.
 
     Only points of a file that is not known to belong to the cameras are checked, see ``Capture.points_file``.
-
-    Raises:
-        DyngsError: images that cannot be read.
     """
     if capture.points is None or capture.points_file is None:
         return capture, None
@@ -50,9 +47,6 @@ def with_first_points(
         options: of the capture.
         triangulate: images of one moment at most; 0: nothing is triangulated.
         half_extent: half the side of the cube.
-
-    Raises:
-        DyngsError: images that cannot be read.
     """
     capture, line = checked_points(capture, options)
     lines = [] if line is None else [line]
@@ -108,9 +102,6 @@ def points_fault(points: PointCloud, views: Sequence[View], options: DataConfig)
         points: one or more, finite.
         views: of training.
         options: of the capture; its image sizes do not matter here.
-
-    Raises:
-        DyngsError: images that cannot be read.
     """
     rng = np.random.default_rng(0)
     chosen = np.sort(rng.permutation(len(points.xyz))[:SAMPLE])

@@ -104,7 +104,6 @@ def estimate_poses(
         source: a folder of photos (subfolders included) or a video file.
         out: a folder that does not exist, or is empty.
         options: lens model, matching, effort.
-        report: is told of frames read from a video, of images with features, of pairs matched, of poses found.
 
     Raises:
         DyngsError: too few images, an ``out`` in use, a camera that stands still or only turns, or nothing could be
@@ -235,11 +234,7 @@ def _is_single(images: _Images, options: SfmOptions) -> bool:
 def _matched(
     task: FeatureTask, is_video: bool, options: SfmOptions, told: tuple[_Clock, ReportProgress]
 ) -> tuple[str, ...]:
-    """Find features and match pairs; those of a stopped run are kept. Return lines about them.
-
-    Raises:
-        DyngsError: the camera only turned.
-    """
+    """Find features and match pairs; those of a stopped run are kept. Return lines about them."""
     clock, report = told
     with clock.stage("features"):
         stronger = find_features(task, report)
@@ -270,9 +265,6 @@ def _mapped(
 
     Where it is not good, features that disagree with most of their images are left out, and the better one is kept.
     ``first`` is the mapping that is tried first.
-
-    Raises:
-        DyngsError: none could be found.
     """
     count = len(features.names)
     task = MappingTask(
@@ -310,11 +302,7 @@ _TURNING = (
 
 
 def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
-    """Return a line where the camera hardly moved, or where matches may be of something that moves; else none.
-
-    Raises:
-        DyngsError: it only turned. Mapping would not notice: it finds a lens and points that fit.
-    """
+    """Return a line where the camera hardly moved, or where matches may be of something that moves; else none."""
     found = parallax_of(matched_pairs(task.database), task.side)
     if found.kind is Parallax.NONE:
         raise DyngsError(_TURNING)
@@ -333,11 +321,7 @@ def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
 
 
 def _require_depth(model: Model, database: Path, is_video: bool) -> None:
-    """Check that points are seen from directions that differ, by a lens that there can be.
-
-    Raises:
-        DyngsError: the camera turned without moving, or moved too little; or no lens fits.
-    """
+    """Check that points are seen from directions that differ, by a lens that there can be."""
     if not model.has_real_lens:
         raise DyngsError(
             "no lens that there can be fits the matches: most of them are probably on something that moves, as a "
@@ -375,9 +359,6 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
     """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
 
     Two passes, so that only one image is held in memory: the first one measures. Frames of a stopped run are kept.
-
-    Raises:
-        DyngsError: nothing moves.
     """
     images, done = capture / "images", capture.parent / "frames.json"
     if not done.is_file():

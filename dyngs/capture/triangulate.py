@@ -73,9 +73,6 @@ def triangulated_points(views: Sequence[View], options: DataConfig) -> PointClou
     Args:
         views: of one moment, with poses.
         options: of the capture; its image sizes do not matter here.
-
-    Raises:
-        DyngsError: images that cannot be read.
     """
     return _points_of(views, options, None)
 
@@ -89,9 +86,6 @@ def points_over_clip(views: Sequence[View], options: DataConfig) -> PointCloud |
     Args:
         views: with times and poses.
         options: of the capture; its image sizes do not matter here.
-
-    Raises:
-        DyngsError: images that cannot be read.
     """
     in_order = sorted(views, key=lambda view: (view.time or 0.0, view.name))
     chosen = [in_order[i] for i in evenly_spaced(len(in_order), CLIP_IMAGES)]

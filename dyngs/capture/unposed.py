@@ -35,8 +35,6 @@ def with_poses(
     Args:
         data: its ``root`` is a capture of any format, a folder of photos, or a video.
         needs_times: something is to move, so photos must have an order.
-        say: is told in a line what will be done, and what came out.
-        report: is told how far structure from motion has come.
 
     Raises:
         DyngsError: photos without times where they are needed, several videos where nothing is to move, or poses that

@@ -32,7 +32,6 @@ def body_frames(
     """Return checked body parameters, sorted by frame; arrays may have any shape with one row per frame.
 
     Args:
-        where: the file, for messages.
         frames: F distinct numbers.
         poses: F rows of 72, 156 or 165 numbers.
         trans: F rows of 3.
@@ -98,9 +97,6 @@ def moved(body: BodyFrames, offset: np.ndarray) -> BodyFrames:
 
 def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     """(V,) index of the row of ``body`` for each view, by frame number.
-
-    Args:
-        where: the file of the body parameters, for messages.
 
     Raises:
         DyngsError: a view without a frame number, or whose frame has no parameters.
@@ -175,11 +171,7 @@ def read_body_file(path: Path) -> BodyFrames:
 
 
 def with_fitted_body(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and ``body_pose.npz`` if there.
-
-    Raises:
-        DyngsError: a file is missing or broken.
-    """
+    """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and ``body_pose.npz`` if there."""
     if not (folder / "body_train.npz").is_file():
         raise DyngsError(
             f"{folder / 'body_train.npz'}: no such file (data.body); a fit that `dyngs train human` made comes back by "

@@ -21,7 +21,6 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
 
     Args:
         matrix: (4, 4) or (3, 4), either direction and any axis convention.
-        where: file and frame, for messages.
 
     Returns:
         The pose, its rotation re-orthonormalised, and the largest entry of ``|R^T R - I|`` before that.
@@ -134,7 +133,6 @@ def match_size(
     Args:
         intrinsics: (3, 3) for an image of ``described`` (width, height).
         stored: (width, height) of the file, None where it could not be opened.
-        where: the image, for messages.
 
     Raises:
         DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal point.

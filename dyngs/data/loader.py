@@ -157,9 +157,6 @@ class ImageLoader:
             options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count; None: the defaults.
             with_maps: read depth maps and flow, too, where views have them.
             decoding_threads: decode what is to be expected in so many threads; 0, or ``cache_mb`` 0: in none.
-
-        Raises:
-            DyngsError: missing images (count and first), damaged ones, or a size that is not the view's.
         """
         self._views = tuple(views)
         self._options = options = options or DataConfig(root=Path())
@@ -207,11 +204,7 @@ class ImageLoader:
         return self._views
 
     def __getitem__(self, index: int) -> Image:
-        """Return the image of view ``index``.
-
-        Raises:
-            DyngsError: the file turns out to be truncated, or its mask has another size.
-        """
+        """Return the image of view ``index``."""
         return self._with_camera(index, self._as_stored(index))
 
     def _with_camera(self, index: int, image: Image) -> Image:
@@ -451,11 +444,7 @@ def _camera_of(view: View, width: int, height: int) -> Cameras:
 
 
 def check_files(views: Sequence[View]) -> None:
-    """Check that all images and masks of ``views`` exist, look complete and have the size of their view.
-
-    Raises:
-        DyngsError: a file is missing (says how many, and the first), damaged or of another size.
-    """
+    """Check that all images and masks of ``views`` exist, look complete and have the size of their view."""
     silhouettes = [view.silhouette.path for view in views if view.silhouette]
     paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + silhouettes
     missing = [path for path in paths if not path.is_file()]

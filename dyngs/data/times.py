@@ -58,11 +58,7 @@ def write_seconds(root: Path, seconds: Mapping[str, float]) -> None:
 
 
 def read_seconds(root: Path) -> dict[str, float]:
-    """Read the second of each image, by its path below ``root/images``; empty without the file.
-
-    Raises:
-        DyngsError: the file is damaged, or something in it is no number.
-    """
+    """Read the second of each image, by its path below ``root/images``; empty without the file."""
     path = root / SECONDS_FILE
     if not path.is_file():
         return {}
@@ -83,7 +79,6 @@ def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -
     numbers. Each folder is a camera; the same numbers, or positions, in another one are the same times.
 
     Args:
-        root: the capture, for messages.
         splits: views; times that they have are replaced.
         per_second: numbers, or positions, in a second: times become seconds; None leaves them as they are.
 
@@ -155,7 +150,6 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     Times that are all equal are left as they are, see ``still_if_constant``.
 
     Args:
-        root: the capture, for messages.
         splits: views with times as in the files, or all without.
         stretch: scale times that lie within [0, 1], too; otherwise only those that do not.
 
@@ -263,7 +257,6 @@ def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
     The first selected time becomes 0 and the last one 1; a single one becomes 0.
 
     Args:
-        root: the capture, for messages.
         splits: views with times in [0, 1], or all without.
         frames: see ``parse_frames``.
 
@@ -454,7 +447,6 @@ def taken_frames(
     time if that differs.
 
     Args:
-        where: folder of the videos, for messages.
         clocks: of each video the seconds (F,) of its frames, in one clock.
         rates: frames per second.
         most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many cameras.

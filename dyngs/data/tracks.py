@@ -43,9 +43,6 @@ def read_tracks(path: Path) -> Tracks:
     """Read tracks from a ``.npz`` with ``xy`` (F, P, 2), ``visible`` (F, P) and ``names`` (F,), text.
 
     Positions that are not finite are taken as not visible.
-
-    Raises:
-        DyngsError: the file is missing or damaged, or its arrays do not fit together.
     """
     if not path.is_file():
         raise DyngsError(f"{path}: no such tracks; restore them or remove tracks_file_path")
@@ -106,9 +103,6 @@ def read_true_tracks(root: Path, world_offset: np.ndarray) -> TrueTracks | None:
     Args:
         root: the folder.
         world_offset: (3,) of the capture, see ``Capture``.
-
-    Raises:
-        DyngsError: the file is damaged, or its arrays do not fit together.
     """
     path = root / TRACKS_FILE
     if not inside(path).is_file():

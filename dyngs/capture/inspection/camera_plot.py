@@ -21,9 +21,6 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
 
     Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours.
     Up is the mean of the cameras' up axes. Points far beyond the cameras, and views without a rigid pose, are left out.
-
-    Raises:
-        DyngsError: no view has a usable pose, or the file cannot be written.
     """
     views = [(split, view) for split, views in capture.splits.items() for view in views]
     usable = [(split, view) for split, view in views if pose_fault(view) is None]

@@ -79,11 +79,7 @@ def video_report(path: Path) -> str:
 
 
 def video_facts(path: Path) -> VideoFacts:
-    """Return what there is to know about a video; its frames are decoded once.
-
-    Raises:
-        DyngsError: the video cannot be read.
-    """
+    """Return what there is to know about a video; its frames are decoded once."""
     film = open_film(inside(path))
     looked = _look(film)
     steady = steadiness(looked.small.grey)

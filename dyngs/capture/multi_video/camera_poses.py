@@ -82,9 +82,6 @@ def standing_image(film: Film, num_frames: int) -> np.ndarray:
     Args:
         film: of a camera that stands.
         num_frames: frames that count, from the first one on.
-
-    Raises:
-        DyngsError: damage in the video.
     """
     most = max(MEDIAN_BYTES // max(film.info.width * film.info.height * 3, 1), 3)
     wanted = evenly_spaced(num_frames, min(MOMENTS, most))
@@ -106,14 +103,9 @@ def standing_model(
     that fits badly.
 
     Args:
-        films: the videos.
         images: (H, W, 3) uint8 of each.
         work: a folder for COLMAP's files.
         options: lens model, seed, threads.
-        report: is told of each attempt.
-
-    Raises:
-        DyngsError: COLMAP fails.
     """
 
     folder = work / "fixed"
@@ -256,11 +248,7 @@ def _mapping(options: StandingOptions, seed: int) -> pycolmap.IncrementalPipelin
 
 @contextmanager
 def _quiet(seed: int) -> Iterator[None]:
-    """Keep COLMAP's log out of the terminal, and make it start from a seed.
-
-    Raises:
-        DyngsError: COLMAP fails in the block.
-    """
+    """Keep COLMAP's log out of the terminal, and make it start from a seed."""
     import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value

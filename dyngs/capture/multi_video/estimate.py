@@ -47,11 +47,7 @@ if TYPE_CHECKING:
 
 
 def write_images(root: Path, films: Sequence[Film], taken: Sequence[Taken], report: ReportProgress) -> list[list[str]]:
-    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below ``images`` by camera.
-
-    Raises:
-        DyngsError: damage in a video, or the folder cannot be written.
-    """
+    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below ``images`` by camera."""
     total, done = sum(len(frames.numbers) for frames in taken), 0
     names: list[list[str]] = []
     for film, frames in zip(films, taken, strict=True):
@@ -73,8 +69,6 @@ def write_model(
     The first image of each camera has the observations of the points.
 
     Args:
-        root: the capture.
-        films: the videos.
         names: images of each.
         standing: poses, one image for each camera.
     """
@@ -115,7 +109,6 @@ def write_facts(root: Path, seconds: Mapping[str, float], starts: Mapping[str, f
     """Write the seconds of the images, which of them are for testing, and when each video begins.
 
     Args:
-        root: the capture.
         seconds: image below ``images`` to the second at which it was taken, in the clock of all videos.
         starts: camera to the second at which its video begins.
         test: cameras that are held out.
@@ -177,7 +170,6 @@ def poses_of_videos(
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
         options: time steps, offsets, effort.
-        report: is told how far the work has come.
 
     Raises:
         DyngsError: a camera that moves, poses or offsets that cannot be found, with what to do; an ``out`` in use.
@@ -235,11 +227,7 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
 
 
 def _require_standing(source: Path, films: Sequence[Film], small: Sequence[SmallImages]) -> str:
-    """Return a line that says that all cameras stand.
-
-    Raises:
-        DyngsError: one of them moves, or is too short to tell.
-    """
+    """Return a line that says that all cameras stand."""
     found = [steadiness(images.grey) for images in small]
     moving = [
         f"{film.name} ({'far' if np.isinf(steady.displaced) else f'up to {steady.displaced:.1%} of its width'})"
@@ -260,11 +248,7 @@ def _require_standing(source: Path, films: Sequence[Film], small: Sequence[Small
 def _posed(
     work: Path, films: list[Film], small: list[SmallImages], options: VideosOptions, report: ReportProgress
 ) -> tuple[list[Film], list[SmallImages], StandingModel, str]:
-    """Return the cameras that have a pose, with their small images, the poses, and a line on them.
-
-    Raises:
-        DyngsError: fewer than two poses.
-    """
+    """Return the cameras that have a pose, with their small images, the poses, and a line on them."""
     images = []
     for film, shown in zip(films, small, strict=True):
         images.append(standing_image(film, len(shown.grey)))

@@ -78,34 +78,18 @@ def videos_in(folder: Path) -> list[Path]:
 
 
 def open_films(folder: Path) -> list[Film]:
-    """Return the videos of a folder, by name.
-
-    Raises:
-        DyngsError: one of them cannot be read.
-    """
+    """Return the videos of a folder, by name."""
     return [open_film(inside(path)) for path in videos_in(folder)]
 
 
 def open_film(path: Path) -> Film:
-    """Return a video.
-
-    Raises:
-        DyngsError: it cannot be read.
-    """
+    """Return a video."""
     info = probe_video(path)
     return Film(path.stem, path, info, np.array(frame_seconds(path, info.num_frames)))
 
 
 def small_images(films: Sequence[Film], report: ReportProgress = report_nothing) -> list[SmallImages]:
-    """Return small grey images of all videos, of the first frames where all would take too much memory.
-
-    Args:
-        films: the videos.
-        report: is told of each video.
-
-    Raises:
-        DyngsError: damage in a video.
-    """
+    """Return small grey images of all videos, of the first frames where all would take too much memory."""
     limit = SMALL_BYTES // max(len(films) * SMALL_SIDE * SMALL_SIDE, 1)
     images = []
     for number, film in enumerate(films):
@@ -188,7 +172,6 @@ def checked_starts(starts: Mapping[str, object], names: Sequence[str], where: st
     Args:
         starts: camera to seconds, as given.
         names: of all cameras.
-        where: they are from, for messages.
 
     Raises:
         DyngsError: a camera that is not there or missing, or something that is no number of at most a day.

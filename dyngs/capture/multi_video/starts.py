@@ -28,9 +28,6 @@ def onsets(path: Path) -> np.ndarray | None:
     """Return (T, B) rises of loudness in B bands, ``RATE`` per second from the first image on; None without sound.
 
     Silence counts as no sound.
-
-    Raises:
-        DyngsError: the file cannot be read.
     """
     samples = _samples(path)
     hop = int(_SAMPLES_PER_SECOND / RATE)
@@ -116,7 +113,6 @@ def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
     """Return the starts by the sound if all videos have some that tells, else by the motion that they show.
 
     Args:
-        films: the videos.
         watchers: one for each, with poses.
 
     Raises:

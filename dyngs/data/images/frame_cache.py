@@ -60,11 +60,7 @@ class VideoFrames:
 
 
 def planned_frames(video: Path) -> VideoFrames:
-    """Return the frames of ``video`` and where they are cached; nothing is written.
-
-    Raises:
-        DyngsError: the video cannot be opened.
-    """
+    """Return the frames of ``video`` and where they are cached; nothing is written."""
     inside(video)
     try:
         status = video.stat()
@@ -86,7 +82,6 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
     The least recently used frames of other captures are removed to make room, unless a running process uses them.
 
     Args:
-        root: the capture, for messages.
         frames: image file, as ``planned_frames`` named it, to the frame of a video that it holds.
         limit_mb: 1e6 bytes on disk that all cached frames together may take.
 

@@ -70,11 +70,7 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Read size and channels of an image without decoding it.
-
-    Raises:
-        DyngsError: the file is missing or is no image.
-    """
+    """Read size and channels of an image without decoding it."""
     with _reading(path):
         source = _open(path)
         spec = source.spec()
@@ -108,9 +104,6 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
         size: (width, height) of its camera; an image that has this shape only when it is turned as its EXIF tag says
             is turned. None: as stored.
         upright: turn it as its EXIF tag says in any case.
-
-    Raises:
-        DyngsError: the file is missing, truncated, no image, or larger than ``data.max_megapixels``.
     """
     with _reading(path):
         return _decoded(path, size, upright)
@@ -151,11 +144,7 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
 
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
-    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers.
-
-    Raises:
-        DyngsError: as ``read_image``.
-    """
+    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers."""
     import OpenImageIO as oiio
 
     with _reading(path):
@@ -172,20 +161,12 @@ def read_raw(path: Path) -> tuple[np.ndarray, bool]:
 
 
 def read_mask(path: Path) -> Tensor:
-    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half.
-
-    Raises:
-        DyngsError: as ``read_image``.
-    """
+    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half."""
     return read_image(path)[..., :3].float().mean(dim=-1) >= 127.5
 
 
 def check_image(path: Path) -> ImageHeader:
-    """Read the header and check that the file is very likely complete; a JPEG without end marker is decoded for that.
-
-    Raises:
-        DyngsError: the file is missing, truncated or no image.
-    """
+    """Read the header and check that the file is very likely complete; a JPEG without end marker is decoded for that."""
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
     marker = END_MARKERS.get(path.suffix.lower())

@@ -28,9 +28,6 @@ def read_depth(path: Path) -> Tensor:
 
     Images of whole numbers (PNG, TIFF of 16 bits) are in millimetres and become metres; floats (``.exr``, ``.npy``,
     ``.npz`` with one array or one named ``depth``) are taken as they are. The first channel counts.
-
-    Raises:
-        DyngsError: the file is missing, damaged, no map, or larger than ``data.max_megapixels``.
     """
     if path.suffix.lower() in (".npy", ".npz"):
         values, unit = read_map(path, "depth"), 1.0
@@ -47,11 +44,7 @@ def read_depth(path: Path) -> Tensor:
 
 
 def read_labels(path: Path) -> Tensor:
-    """Read a label image as (h, w) bool, true where the label is not 0.
-
-    Raises:
-        DyngsError: the file is missing, damaged, no image, or larger than ``data.max_megapixels``.
-    """
+    """Read a label image as (h, w) bool, true where the label is not 0."""
     return torch.as_tensor((read_raw(path)[0] != 0).any(-1), device="cpu")
 
 
@@ -64,9 +57,6 @@ def read_flow(path: Path) -> Tensor:
     """Read a flow field as (h, w, 2) float32, displacements (x, y) in pixels, NaN where unknown.
 
     ``.npy``, ``.npz`` with one array or one named ``flow``, or ``.flo`` (Baker et al. 2011, Middlebury).
-
-    Raises:
-        DyngsError: the file is missing, damaged, no flow, or larger than ``data.max_megapixels``.
     """
     values = _read_flo(path) if path.suffix.lower() == ".flo" else read_map(path, "flow")
     if values.ndim != 3 or values.shape[2] != 2 or not values.size:

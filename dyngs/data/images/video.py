@@ -58,9 +58,6 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
 
     One image is in memory at a time. Nothing behind the last wanted one is decoded; unwanted ones before it are (each
     image builds on others), but not converted.
-
-    Raises:
-        DyngsError: as ``read_frames``; a wanted image is damaged or missing: names its number.
     """
     wanted = set(numbers)
     left = len(wanted)
@@ -111,9 +108,6 @@ def frame_seconds(path: Path, num_frames: int) -> list[float]:
 
     Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or too few, the mean
     rate does, and 30 frames per second where the file names none either.
-
-    Raises:
-        DyngsError: as ``probe_video``.
     """
     from av.error import FFmpegError
 

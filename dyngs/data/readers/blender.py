@@ -28,9 +28,6 @@ def read_blender(root: Path) -> Capture:
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
     Points: see ``find_points``.
-
-    Raises:
-        DyngsError: see ``dyngs.data.readers.transforms.read_views``.
     """
     splits: Splits = {}
     warnings: list[str] = []
@@ -69,9 +66,6 @@ def read_nerfstudio(root: Path) -> Capture:
     The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val list without a test
     list is used for testing. Points and poses are read as they stand: ``applied_transform``
     has been applied to both.
-
-    Raises:
-        DyngsError: see ``dyngs.data.readers.transforms.read_views``; an unreadable ``.ply``.
     """
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
@@ -136,9 +130,6 @@ def read_body_json(root: Path) -> Capture:
     train. ``surface_model_type`` "anny" says that betas are of the free template's shape space.
     ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
     one world; unlike with AMASS files nothing is rotated to make it y up.
-
-    Raises:
-        DyngsError: missing or bad parameters, and see ``dyngs.data.readers.transforms.read_views``.
     """
     with reading(root):
         return _read(root)

@@ -91,9 +91,6 @@ def sequence_views(
         path: the calibration file in the capture's folder.
         cameras: in the order of their ``camera_id``.
         calibrations: by camera name, the fields of a frame in a transforms file: ``fl_x``, ``transform_matrix``, ...
-
-    Raises:
-        DyngsError: see ``dyngs.data.readers.transforms.read_views``.
     """
     numbers = sorted({number for camera in cameras for number in camera.images})
     span = max(numbers[-1] - numbers[0], 1)
@@ -183,9 +180,6 @@ def read_camera_folders(root: Path) -> Capture:
     The file holds ``{"cameras": {NAME: {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", .., "transform_matrix" (OpenGL
     camera-to-world) or "cam_from_world" (OpenCV)}}, "fps": .., "test": [NAME, ..]}``. Without ``test`` the first camera
     is held out where there are three or more. Times run from the first frame number to the last one.
-
-    Raises:
-        DyngsError: broken or incomplete calibration, no images, images without a number in their name, bad videos.
     """
     path = root / CALIBRATION
     file = _read_calibration(path)

@@ -62,10 +62,6 @@ def read_colmap(root: Path) -> Capture:
 
     Registered images become training views, but for those that ``test.txt`` in the model's folder lists; distorted
     camera models are kept as ``View.lens``.
-
-    Raises:
-        DyngsError: incomplete or inconsistent model files, no ``images`` folder, an unsupported camera model, images
-            whose aspect ratio is not their camera's.
     """
     folder = find_model(root)
     if folder is None:
@@ -113,9 +109,6 @@ def read_colmap(root: Path) -> Capture:
 
 def pinhole_and_lens(camera: pycolmap.Camera, where: str) -> tuple[np.ndarray, Lens]:
     """Return the (3, 3) matrix and the lens distortion of a COLMAP camera.
-
-    Args:
-        where: the image, for messages.
 
     Raises:
         DyngsError: the camera model is not one that OpenCV's formulas express, or a parameter is not usable.

@@ -49,9 +49,6 @@ def read_nerfies(root: Path) -> Capture:
     Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th image); the time is
     ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if present, are the sparse points, grey.
     Cameras (Park et al. 2021): ``orientation`` has the camera's OpenCV axes as rows, ``position`` is its centre.
-
-    Raises:
-        DyngsError: anything missing, broken or inconsistent; names the file.
     """
     dataset = read_json_object(root / "dataset.json")
     lists = {key: _ids(root, dataset, key) for key in ("ids", "train_ids", "val_ids")}

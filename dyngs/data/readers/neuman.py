@@ -37,9 +37,6 @@ def read_neuman(root: Path) -> Capture:
     (pose, betas of one person) with ``alignments.npy`` (image name to a (4, 3) matrix M, ``world = [v 1] M``). Masks
     in ``segmentations`` under the images' names are black where the person is. Splits are those of
     ``{train,val,test}_split.txt``, if there.
-
-    Raises:
-        DyngsError: anything missing, broken or inconsistent; names the file.
     """
     with reading(root):
         return _read(root)

@@ -101,11 +101,7 @@ class _Warnings:
 
 
 def read_frame_file(path: Path) -> FrameFile:
-    """Read the fields and frames of a transforms file.
-
-    Raises:
-        DyngsError: unreadable, broken JSON (with line and column), or no list ``frames`` of objects.
-    """
+    """Read the fields and frames of a transforms file."""
     wrong = "the list 'frames' is missing; is this a transforms file?"
     fields = read_json_object(path, wrong)
     listed = fields.get("frames")
@@ -374,11 +370,7 @@ def _only_ply(root: Path) -> Path | None:
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read the points of a ``.ply`` file (through trimesh), grey where it has no colours.
-
-    Raises:
-        DyngsError: missing or unreadable.
-    """
+    """Read the points of a ``.ply`` file (through trimesh), grey where it has no colours."""
     import trimesh
 
     if not path.is_file():

@@ -63,9 +63,6 @@ def read_zju_mocap(root: Path) -> Capture:
 
     Parameters: v = Rh LBS(x; poses) + Th, about the template's origin: kept as ``BodyFrames.turns``. OpenCV calibrated
     these cameras, with pixel centres at whole numbers: half a pixel is added to the principal point.
-
-    Raises:
-        DyngsError: anything missing, broken or inconsistent; names the file.
     """
     with reading(root):
         return _read(root)

@@ -80,9 +80,6 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
 
     Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA, straight alpha, sRGB) for
     every split with images. Each file is written atomically, the JSON last.
-
-    Raises:
-        DyngsError: the folder cannot be written.
     """
     scene = still_life()
     splits = {
