@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.photos import Photo
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress
 from dyngs.files.write import write_text
 
@@ -35,12 +36,9 @@ class FeatureTask:
         images: folder of upright images.
         names: of the images in it, in order.
         photos: the same ones, with their tags.
+        options: effort, seed, threads.
         masks: folder of masks ``NAME.png``, white = keep; None without.
-        camera_model: COLMAP's name of the lens.
         single_camera: all images share a lens.
-        max_features: per image.
-        longest_side: images are shrunk to this for finding features.
-        seed, num_threads: as in ``SfmOptions``.
         enough: features of an image, on average over three of them, above which weak ones are left out; 0 = never.
     """
 
@@ -48,13 +46,9 @@ class FeatureTask:
     images: Path
     names: Sequence[str]
     photos: Sequence[Photo]
-    masks: Path | None
-    camera_model: str
-    single_camera: bool
-    max_features: int
-    longest_side: int
-    seed: int
-    num_threads: int
+    options: SfmOptions
+    masks: Path | None = None
+    single_camera: bool = True
     enough: int = 0
 
     @property
@@ -95,7 +89,7 @@ def _reader(task: FeatureTask) -> tuple[pycolmap.ImageReaderOptions, pycolmap.Ca
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = task.camera_model
+    reader.camera_model = task.options.camera_model
     if task.masks is not None:
         reader.mask_path = task.masks
     return reader, pycolmap.CameraMode.SINGLE if task.single_camera else pycolmap.CameraMode.PER_IMAGE
@@ -107,11 +101,11 @@ def _extract(task: FeatureTask, database: Path, names: Sequence[str], stronger: 
 
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
-    extraction.num_threads = task.num_threads or -1
-    extraction.max_image_size = task.longest_side
-    extraction.sift.max_num_features = task.max_features
+    extraction.num_threads = task.options.num_threads or -1
+    extraction.max_image_size = task.options.longest_side
+    extraction.sift.max_num_features = task.options.max_features
     extraction.sift.peak_threshold = stronger * _PEAK
-    extraction.sift.first_octave = -1 if min(task.side, task.longest_side) <= _SMALL_PX else 0
+    extraction.sift.first_octave = -1 if min(task.side, task.options.longest_side) <= _SMALL_PX else 0
     reader, mode = _reader(task)
     pycolmap.extract_features(
         database, task.images, names, camera_mode=mode, reader_options=reader,
@@ -142,9 +136,9 @@ def match_pairs(task: FeatureTask, pairs: Sequence[tuple[int, int]], report: Rep
 
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    matching.num_threads = task.num_threads or -1
+    matching.num_threads = task.options.num_threads or -1
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = task.seed
+    verification.ransac.random_seed = task.options.seed
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = task.database.with_name("pairs.txt")
     ordered = sorted(set(pairs))  # of few images at a time: COLMAP prepares each one anew in every call

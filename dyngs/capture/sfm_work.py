@@ -1,4 +1,4 @@
-"""The folder in which structure from motion works, found again by the next try, and the report on its result."""
+"""Structure from motion: options, result, report, and the folder to work in, which the next try finds again."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 from dyngs.errors import DyngsError
+from dyngs.files.containment import MAX_MEGAPIXELS
 from dyngs.files.write import write_text
 
 try:
@@ -22,6 +23,45 @@ except ImportError:  # Windows
 
 REPORT_FILE = "sfm_report.json"
 _SHOWN = 5
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """Options of pose estimation.
+
+    Attributes:
+        camera_model: COLMAP's name of the lens model to fit.
+        single_camera: one camera took all images, so they share its lens; None = yes for a video, and for photos that
+            agree in size, camera model and focal length (EXIF); else every photo has a lens of its own.
+        matching: which pairs are compared; auto = all pairs up to 60 photos or 24 frames, beyond that neighbours by
+            name (some far ones, too) and those that look alike; sequential = the same without what looks alike.
+        overlap: neighbours on either side in sequential matching; None = near ones densely, far ones sparsely.
+        mapper: COLMAP's mapping; auto = global, and incremental where that finds less.
+        max_features: SIFT features per image.
+        longest_side: images are shrunk to this, in pixels, for finding features (poses refer to the full size).
+        num_frames: images to take from a video, by motion seen and sharpness.
+        masks: folder of masks of the photos, named as in captures; white = keep. None without.
+        seed: of everything random.
+        num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is always the same.
+        follow_links: photos may be links that lead out of their folder.
+        max_megapixels: larger images and videos are refused.
+    """
+
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
+        "SIMPLE_RADIAL"
+    )
+    single_camera: bool | None = None
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    overlap: int | None = None
+    mapper: Literal["auto", "global", "incremental"] = "auto"
+    max_features: int = 8192
+    longest_side: int = 1600
+    num_frames: int = 100
+    masks: Path | None = None
+    seed: int = 0
+    num_threads: int = 0
+    follow_links: bool = False
+    max_megapixels: float = MAX_MEGAPIXELS
 
 
 @dataclass(frozen=True)
@@ -116,6 +156,26 @@ def advice(
 
 
 _KEY, _LOCK = "task.txt", "lock"
+
+
+class ColmapError(DyngsError):
+    """COLMAP failed."""
+
+
+@contextmanager
+def quiet_colmap(seed: int) -> Iterator[None]:
+    """Keep COLMAP's log out of the terminal, and make it start from a seed; its errors in the block are ours."""
+    import pycolmap
+
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        lines = str(error).strip().splitlines()
+        raise ColmapError(f"structure from motion failed: {lines[-1] if lines else error}") from error
+    finally:
+        pycolmap.logging.minloglevel = level
 
 
 def work_folder_of(out: Path) -> Path:

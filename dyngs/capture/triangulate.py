@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from dyngs.capture.sfm_work import ColmapError, quiet_colmap
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
 from dyngs.data.geometry import projected
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.scene_space import points_in_frusta
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 
 if TYPE_CHECKING:
@@ -116,21 +116,13 @@ def _points_of(
 ) -> PointCloud | None:
     if len({view.cam_from_world.tobytes() for view in views}) < MIN_IMAGES:
         return None
-    import pycolmap
-
     full_size = options.model_copy(update={"downscale": 1.0, "longest_side": LONGEST_SIDE, "cache_mb": 0.0})
     images = ImageLoader(views, full_size)
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
-    pycolmap.set_random_seed(0)
     try:
-        with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder:
+        with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder, quiet_colmap(0):
             return _triangulated(Path(folder), [images[i] for i in range(len(images))], pairs)
-    except (RuntimeError, ValueError, OSError) as error:
-        if isinstance(error, DyngsError):
-            raise
+    except (ColmapError, OSError):
         return None
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 def _triangulated(folder: Path, images: Sequence[Image], pairs: Sequence[tuple[int, int]] | None) -> PointCloud | None:

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.multi_video.camera_poses import (
-    StandingModel,
-    StandingOptions,
+    FixedModel,
     camera_name,
-    standing_image,
-    standing_model,
+    fixed_model,
+    image_without_movers,
 )
 from dyngs.capture.multi_video.films import (
     VIDEOS_FILE,
@@ -31,6 +30,7 @@ from dyngs.capture.multi_video.films import (
 from dyngs.capture.multi_video.lags import Watcher, motion_of
 from dyngs.capture.multi_video.starts import found_starts, given_starts
 from dyngs.capture.multi_video.steadiness import STANDS, steadiness
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import read_numbered_frames
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
@@ -203,7 +203,7 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
     if options.starts is not None:
         starts = checked_starts(options.starts, [film.name for film in films], "--start")
     small = small_images(films, report)
-    lines = [_require_standing(source, films, small)]
+    lines = [_require_fixed(source, films, small)]
     films, small, found, line = _posed(work, films, small, options, report)
     lines.append(line)
     watchers = [_watcher(film, images, found.model) for film, images in zip(films, small, strict=True)]
@@ -226,7 +226,7 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
     return lines
 
 
-def _require_standing(source: Path, films: Sequence[Film], small: Sequence[SmallImages]) -> str:
+def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[SmallImages]) -> str:
     """Return a line that says that all cameras stand."""
     found = [steadiness(images.grey) for images in small]
     moving = [
@@ -247,16 +247,14 @@ def _require_standing(source: Path, films: Sequence[Film], small: Sequence[Small
 
 def _posed(
     work: Path, films: list[Film], small: list[SmallImages], options: VideosOptions, report: ReportProgress
-) -> tuple[list[Film], list[SmallImages], StandingModel, str]:
+) -> tuple[list[Film], list[SmallImages], FixedModel, str]:
     """Return the cameras that have a pose, with their small images, the poses, and a line on them."""
     images = []
     for film, shown in zip(films, small, strict=True):
-        images.append(standing_image(film, len(shown.grey)))
+        images.append(image_without_movers(film, len(shown.grey)))
         report("what stands, cameras", len(images), len(films))
     folder = work / "colmap"
-    found = standing_model(
-        films, images, folder, StandingOptions(seed=options.seed, num_threads=options.num_threads), report
-    )
+    found = fixed_model(films, images, folder, SfmOptions(seed=options.seed, num_threads=options.num_threads), report)
     shutil.rmtree(folder)
     names = set() if found is None else {camera_name(image) for image in found.model.images.values() if image.has_pose}
     if found is None or len(names) < 2:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from dyngs.capture.multi_video.films import SmallImages
 
@@ -256,12 +257,7 @@ def motion_of(images: SmallImages) -> np.ndarray:
 def even_rate(values: np.ndarray, seconds: np.ndarray, rate: float) -> np.ndarray:
     """Return (T, B) values at even times from 0 on, linear between those of (F,) ``seconds``."""
     times = np.arange(int(np.floor(seconds[-1] * rate + 1e-6)) + 1) / rate
-    after = np.clip(np.searchsorted(seconds, times), 1, max(len(seconds) - 1, 1))
-    before = after - 1
-    if len(seconds) < 2:
-        return values[:1].astype(np.float64)
-    fraction = np.clip((times - seconds[before]) / np.maximum(seconds[after] - seconds[before], 1e-9), 0, 1)[:, None]
-    return values[before] * (1 - fraction) + values[after] * fraction
+    return np.stack([np.interp(times, seconds, own) for own in values.T], axis=1)
 
 
 def correlated_motion(a: Watcher, b: Watcher, rate: float, blur: float) -> Correlation | None:
@@ -277,9 +273,11 @@ def correlated_motion(a: Watcher, b: Watcher, rate: float, blur: float) -> Corre
     if bins is None:
         return None
     signals = [
-        _blurred(even_rate(_binned(watcher.motion, own), watcher.seconds, rate), blur)
+        even_rate(_binned(watcher.motion, own), watcher.seconds, rate)
         for watcher, own in zip((a, b), bins, strict=True)
     ]
+    if blur > 0:
+        signals = [gaussian_filter1d(signal, blur, axis=0, mode="nearest", truncate=3.0) for signal in signals]
     return correlate(signals[0], signals[1])
 
 
@@ -325,17 +323,6 @@ def _bins_of(a: Watcher, b: Watcher) -> tuple[np.ndarray, np.ndarray] | None:
     placed = [np.floor((angle - low) / (high - low) * BINS).astype(int) for angle in angles]
     first, second = (np.where((place >= 0) & (place < BINS), place, -1) for place in placed)
     return first, second
-
-
-def _blurred(values: np.ndarray, blur: float) -> np.ndarray:
-    """Return (T, B) values blurred in time by a Gaussian, ``blur`` samples wide."""
-    if blur == 0:
-        return values
-    reach = int(np.ceil(3 * blur))
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / blur) ** 2)
-    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
-    windows = (padded[i : i + len(values)] * weight for i, weight in enumerate(kernel / kernel.sum()))
-    return sum(windows, np.zeros(values.shape))
 
 
 def _binned(motion: np.ndarray, bins: np.ndarray) -> np.ndarray:

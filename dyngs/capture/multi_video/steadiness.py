@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from dyngs.data.times import evenly_spaced
 
@@ -118,10 +119,4 @@ def _sampled(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarra
     """Return the image at places in px, bilinear, and which of them lie inside."""
     height, width = image.shape
     is_inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
-    left, top = np.minimum(x.astype(int), max(width - 2, 0)), np.minimum(y.astype(int), max(height - 2, 0))
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    fx, fy = x - left, y - top
-    upper = image[top, left] * (1 - fx) + image[top, right] * fx
-    lower = image[below, left] * (1 - fx) + image[below, right] * fx
-    return upper * (1 - fy) + lower * fy, is_inside
+    return map_coordinates(image, [y, x], order=1, mode="nearest"), is_inside

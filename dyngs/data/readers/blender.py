@@ -15,12 +15,7 @@ from dyngs.data.readers.transforms import (
     read_views,
     tracks_path_of,
 )
-from dyngs.errors import DyngsError, reading
-
-
-def is_blender(root: Path) -> bool:
-    """Whether the folder holds ``transforms_train.json``."""
-    return (root / "transforms_train.json").is_file()
+from dyngs.errors import DyngsError
 
 
 def read_blender(root: Path) -> Capture:
@@ -52,12 +47,9 @@ def read_blender(root: Path) -> Capture:
     )
 
 
-FORMAT = CaptureFormat("blender", "transforms_train.json", is_blender, read_blender)
-
-
-def is_nerfstudio(root: Path) -> bool:
-    """Whether the folder holds ``transforms.json``."""
-    return (root / "transforms.json").is_file()
+FORMAT = CaptureFormat(
+    "blender", "transforms_train.json", lambda root: (root / "transforms_train.json").is_file(), read_blender
+)
 
 
 def read_nerfstudio(root: Path) -> Capture:
@@ -110,16 +102,13 @@ def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits,
     return splits, notes
 
 
-NERFSTUDIO_FORMAT = CaptureFormat("nerfstudio", "transforms.json", is_nerfstudio, read_nerfstudio)
+NERFSTUDIO_FORMAT = CaptureFormat(
+    "nerfstudio", "transforms.json", lambda root: (root / "transforms.json").is_file(), read_nerfstudio
+)
 
 
 _TRAIN = "body_train.npz"
 _NEW_POSES = cast(Split, "pose")
-
-
-def is_body_json(root: Path) -> bool:
-    """Whether the folder holds ``transforms_train.json`` and some ``body_*.npz``."""
-    return (root / "transforms_train.json").is_file() and any(root.glob("body_*.npz"))
 
 
 def read_body_json(root: Path) -> Capture:
@@ -131,11 +120,6 @@ def read_body_json(root: Path) -> Capture:
     ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
     one world; unlike with AMASS files nothing is rotated to make it y up.
     """
-    with reading(root):
-        return _read(root)
-
-
-def _read(root: Path) -> Capture:
     capture = read_blender(root)  # whose points are of no use: people begin on a template
     splits, warnings = dict(capture.splits), capture.warnings
     path = root / "transforms_pose.json"
@@ -167,5 +151,9 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
 
 
 BODY_FORMAT = CaptureFormat(
-    "body_json", "transforms_train.json and body_train.npz", is_body_json, read_body_json, extends="blender"
+    "body_json",
+    "transforms_train.json and body_train.npz",
+    lambda root: (root / "transforms_train.json").is_file() and any(root.glob("body_*.npz")),
+    read_body_json,
+    extends="blender",
 )

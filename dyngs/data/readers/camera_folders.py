@@ -160,20 +160,6 @@ def _images(folder: Path) -> list[Path]:
 CALIBRATION = "cameras.json"
 
 
-@dataclass(frozen=True)
-class _CalibrationFile:
-    """The fields of ``cameras.json``: camera name to calibration, frames per second, and ``test`` as written."""
-
-    cameras: dict[str, object]
-    fps: float | None
-    test: object
-
-
-def is_camera_folders(root: Path) -> bool:
-    """Whether the folder holds ``cameras.json``."""
-    return (root / CALIBRATION).is_file()
-
-
 def read_camera_folders(root: Path) -> Capture:
     """Read ``cameras.json`` and the folders or videos named like its cameras.
 
@@ -182,8 +168,7 @@ def read_camera_folders(root: Path) -> Capture:
     is held out where there are three or more. Times run from the first frame number to the last one.
     """
     path = root / CALIBRATION
-    file = _read_calibration(path)
-    calibrated = file.cameras
+    calibrated, fps, test = _read_calibration(path)
     found = find_cameras(root)
     names = [name for name in sorted(calibrated) if name in found]
     if not names:
@@ -198,12 +183,12 @@ def read_camera_folders(root: Path) -> Capture:
     cameras = [open_camera(name, found[name]) for name in names]
     own = {name: _calibration(calibrated[name], f"{path}, camera {name}") for name in names}
     views, notes = sequence_views(path, cameras, own)
-    splits, more = _splits(path, file.test, views)
-    fps = file.fps or video_fps(cameras)
-    return Capture(root, "camera_folders", splits, fps=fps, warnings=(*warnings, *notes, *more))
+    splits, more = _splits(path, test, views)
+    return Capture(root, "camera_folders", splits, fps=fps or video_fps(cameras), warnings=(*warnings, *notes, *more))
 
 
-def _read_calibration(path: Path) -> _CalibrationFile:
+def _read_calibration(path: Path) -> tuple[dict[str, object], float | None, object]:
+    """Return camera name to calibration, frames per second, and ``test`` as written."""
     wrong = "must be an object whose 'cameras' maps camera names to calibrations"
     fields = read_json_object(path, wrong)
     cameras = fields.get("cameras")
@@ -212,7 +197,7 @@ def _read_calibration(path: Path) -> _CalibrationFile:
     fps = fields.get("fps")
     if fps is not None and not (is_number(fps) and 0 < fps < MAX_FPS):
         raise DyngsError(f"{path}: 'fps' must be a positive number, got {fps!r:.40}")
-    return _CalibrationFile(cameras, None if fps is None else float(fps), fields.get("test"))
+    return cameras, None if fps is None else float(fps), fields.get("test")
 
 
 def _calibration(value: object, where: str) -> dict[str, object]:
@@ -251,15 +236,10 @@ def _splits(path: Path, test: object, views: dict[str, tuple[View, ...]]) -> tup
     }, notes
 
 
-FORMAT = CaptureFormat("camera_folders", CALIBRATION, is_camera_folders, read_camera_folders)
+FORMAT = CaptureFormat("camera_folders", CALIBRATION, lambda root: (root / CALIBRATION).is_file(), read_camera_folders)
 
 
 POSES = "poses_bounds.npy"
-
-
-def is_llff(root: Path) -> bool:
-    """Whether the folder holds ``poses_bounds.npy``."""
-    return (root / POSES).is_file()
 
 
 def read_llff(root: Path) -> Capture:
@@ -279,10 +259,11 @@ def read_llff(root: Path) -> Capture:
     found = {name: at for name, at in found.items() if re.fullmatch(r"cam[-_]?\d+", name, re.IGNORECASE)} or found
     names = list(found)
     if len(names) != len(rows):
+        ends = f" ({names[0]} to {names[-1]})" if names else ""
         few = "restore the missing ones" if len(names) < len(rows) else "remove those without a pose"
         raise DyngsError(
             f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there"
-            f"{_ends(names)}{_gaps(names)}; {few}, or remove the rows of cameras that are not there"
+            f"{ends}{_gaps(names)}; {few}, or remove the rows of cameras that are not there"
         )
     cameras = [open_camera(name, found[name]) for name in names]
     calibrations = {name: _llff_calibration(row) for name, row in zip(names, rows, strict=True)}
@@ -327,10 +308,6 @@ def _llff_splits(views: dict[str, tuple[View, ...]], names: list[str]) -> Splits
     }
 
 
-def _ends(names: list[str]) -> str:
-    return f" ({names[0]} to {names[-1]})" if names else ""
-
-
 def _gaps(names: list[str]) -> str:
     """Say which numbers are missing between the first and the last name."""
     numbers = {int(digits) for name in names for digits in re.findall(r"\d+$", name)}
@@ -338,4 +315,4 @@ def _gaps(names: list[str]) -> str:
     return f", without number {', '.join(map(str, missing[:5]))}" if 0 < len(missing) < len(numbers) else ""
 
 
-LLFF_FORMAT = CaptureFormat("llff", POSES, is_llff, read_llff)
+LLFF_FORMAT = CaptureFormat("llff", POSES, lambda root: (root / POSES).is_file(), read_llff)

@@ -38,11 +38,6 @@ class _Images:
     files: dict[str, Path]
 
 
-def is_nerfies(root: Path) -> bool:
-    """Whether the folder holds ``dataset.json`` and the folder ``camera``."""
-    return (root / "dataset.json").is_file() and (root / "camera").is_dir()
-
-
 def read_nerfies(root: Path) -> Capture:
     """Read the capture, in the world scaled as ``scene.json`` says, with the largest images that exist.
 
@@ -214,4 +209,9 @@ def _points(path: Path, scene: _Scene) -> PointCloud | None:
     return PointCloud(scene.apply(xyz), np.full(xyz.shape, 128, np.uint8)) if len(xyz) else None
 
 
-FORMAT = CaptureFormat("nerfies", "dataset.json and camera/", is_nerfies, read_nerfies)
+FORMAT = CaptureFormat(
+    "nerfies",
+    "dataset.json and camera/",
+    lambda root: (root / "dataset.json").is_file() and (root / "camera").is_dir(),
+    read_nerfies,
+)

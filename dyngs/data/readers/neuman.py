@@ -24,11 +24,6 @@ ALIGNMENTS = "alignments.npy"
 FITS = ("smpl_output_optimized.pkl", "smpl_output_romp.pkl")
 
 
-def is_neuman(root: Path) -> bool:
-    """Whether the folder holds a COLMAP model and one of the files of body parameters."""
-    return is_colmap(root) and any((root / name).is_file() for name in (ALIGNED, ALIGNMENTS, *FITS))
-
-
 def read_neuman(root: Path) -> Capture:
     """Read the capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's world and unit.
 
@@ -38,11 +33,6 @@ def read_neuman(root: Path) -> Capture:
     in ``segmentations`` under the images' names are black where the person is. Splits are those of
     ``{train,val,test}_split.txt``, if there.
     """
-    with reading(root):
-        return _read(root)
-
-
-def _read(root: Path) -> Capture:
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
     names = [view.image_path.name for view in posed]
@@ -140,5 +130,9 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
 
 
 FORMAT = CaptureFormat(
-    "neuman", "a COLMAP model and alignments.npy or 4d_humans", is_neuman, read_neuman, extends="colmap"
+    "neuman",
+    "a COLMAP model and alignments.npy or 4d_humans",
+    lambda root: is_colmap(root) and any((root / name).is_file() for name in (ALIGNED, ALIGNMENTS, *FITS)),
+    read_neuman,
+    extends="colmap",
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -89,17 +89,6 @@ class FrameFile:
         return float(fps)
 
 
-@dataclass
-class _Warnings:
-    """Warnings collected while views are made."""
-
-    repaired: dict[str, float] = field(default_factory=dict)
-    rescaled: list[str] = field(default_factory=list)
-
-    def lines(self) -> list[str]:
-        return repair_warning(self.repaired) + rescale_warning(self.rescaled)
-
-
 def read_frame_file(path: Path) -> FrameFile:
     """Read the fields and frames of a transforms file."""
     wrong = "the list 'frames' is missing; is this a transforms file?"
@@ -134,14 +123,16 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
         for frame, path in zip(file.frames, paths, strict=True)
     ]
     common = _common_size(file, paths, headers)
-    notes = _Warnings()
+    repaired: dict[str, float] = {}
+    rescaled: list[str] = []
     views = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
         described = _described_size(frame)
         stored = header.size_for(described) if header else None
-        view = _view(frame, root, path, stored, common, notes)
+        view, repaired[frame.where], is_rescaled = _view(frame, root, path, stored, common)
+        rescaled += [frame.where] if is_rescaled else []
         views[str(frame.own["file_path"])] = replace(view, exposure=header.tags.exposure if header else None)
-    return _with_flow_targets(views), notes.lines()
+    return _with_flow_targets(views), repair_warning(repaired) + rescale_warning(rescaled)
 
 
 def tracks_path_of(file: FrameFile) -> Path | None:
@@ -159,25 +150,17 @@ def view_name(path: Path, root: Path) -> str:
 
 
 def _view(
-    frame: Frame,
-    root: Path,
-    path: Path,
-    stored: tuple[int, int] | None,
-    common: tuple[int, int] | None,
-    notes: _Warnings,
-) -> View:
+    frame: Frame, root: Path, path: Path, stored: tuple[int, int] | None, common: tuple[int, int] | None
+) -> tuple[View, float, bool]:
+    """Return a view, by how much its rotation was repaired, and whether its intrinsics were rescaled."""
     described = _described_size(frame) or stored or common
     if described is None:
-        header = read_header(path)  # raises the error
-        described = header.upright_size
+        described = read_header(path).upright_size  # raises the error
     intrinsics, size, rescaled = match_size(_intrinsics(frame, *described), described, stored, frame.where)
-    if rescaled:
-        notes.rescaled.append(frame.where)
     pose, error = checked_pose(_matrix(frame), frame.where)
-    notes.repaired[frame.where] = error
     masks = [_named_file(root, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
     camera = frame.integer("camera")
-    return View(
+    view = View(
         name=view_name(path, root),
         image_path=path,
         cam_from_world=cam_from_opengl(pose),
@@ -195,6 +178,7 @@ def _view(
         motion_mask_labels=masks[0] is None and masks[1] is not None,
         flow_path=_named_file(root, frame, "flow_file_path"),
     )
+    return view, error, rescaled
 
 
 def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:

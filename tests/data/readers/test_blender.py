@@ -15,7 +15,7 @@ from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Lens, View
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
-from dyngs.data.readers.blender import is_blender, is_body_json, read_blender, read_body_json, read_nerfstudio
+from dyngs.data.readers.blender import BODY_FORMAT, FORMAT, read_blender, read_body_json, read_nerfstudio
 from dyngs.data.readers.transforms import view_name
 from dyngs.errors import DyngsError
 
@@ -58,7 +58,7 @@ def test_explicit_intrinsics_win_and_frame_beats_file(blender_root: Path) -> Non
 
 
 def test_val_and_test_may_be_absent(blender_root: Path) -> None:
-    assert is_blender(blender_root)
+    assert FORMAT.recognise(blender_root)
     (blender_root / "transforms_test.json").unlink()
     assert set(read_blender(blender_root).splits) == {"train"}
 
@@ -317,7 +317,7 @@ def bodies(capture: Capture) -> dict[str, BodyFrames]:
 
 
 def test_every_split_has_its_frames(root: Path) -> None:
-    assert is_body_json(root)
+    assert BODY_FORMAT.recognise(root)
     capture = read_body_json(root)
     assert (capture.format, capture.warnings) == ("body_json", ())
     found = {
@@ -357,11 +357,11 @@ def test_missing_files(root: Path) -> None:
         read_body_json(root)
     write_body(root / "body_pose.npz", 2)
     (root / "body_train.npz").unlink()
-    assert is_body_json(root)
+    assert BODY_FORMAT.recognise(root)
     with pytest.raises(DyngsError, match=r"body_train\.npz: no such file; it should hold the body parameters poses"):
         read_body_json(root)
     (root / "body_pose.npz").unlink()
-    assert not is_body_json(root)
+    assert not BODY_FORMAT.recognise(root)
 
 
 @pytest.mark.parametrize(
