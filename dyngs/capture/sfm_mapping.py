@@ -34,13 +34,11 @@ class Model:
     Attributes:
         reconstruction: poses, cameras, points.
         mapper: what found it.
-        num_models: models it found: more than one if images fall into groups without connection.
         agreeing: fraction of the matched pairs whose matches fit the poses.
     """
 
     reconstruction: pycolmap.Reconstruction
     mapper: Mapper
-    num_models: int
     agreeing: float
 
     @property
@@ -142,7 +140,7 @@ def _found(task: MappingTask, mapper: Mapper) -> Model | None:
     if best is None or best.num_reg_images() < 2:
         return None
     task.report("poses, images", best.num_reg_images(), task.count)
-    return Model(best, mapper, len(models), agreement(best, task.database, task.longest_side))
+    return Model(best, mapper, agreement(best, task.database, task.longest_side))
 
 
 def _global(task: MappingTask, folder: Path) -> dict[int, pycolmap.Reconstruction]:

@@ -13,8 +13,6 @@ STANDS = 0.002
 """A camera stands if its image is never displaced by more than this fraction of its longer side."""
 SAMPLES = 16
 """Images that are compared with the typical one."""
-SWEEPING = 0.02
-"""Fraction of the longer side by which each image is displaced against the last one where the camera moves fast."""
 _ITERATIONS = 16
 _TOLD, _FLAT = 0.4, 1.0
 """Pixels that are looked at: this fraction of them, where the image changes most, by so many grey levels per pixel."""
