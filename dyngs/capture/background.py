@@ -37,7 +37,7 @@ LEAST_FRACTION = 0.1
 SHADE = (0.5, 0.97)
 """Range of brightness, as a fraction of the background's, that a shadow has."""
 SHADE_SPREAD = 0.08
-"""Largest spread of that share, of its mean, in a window where it is a shadow."""
+"""Largest spread of that fraction, of its mean, in a window where it is a shadow."""
 _WINDOW = 5
 _SMOOTH = 0.7
 EDGE, HALF = 2, 0.45
@@ -210,7 +210,7 @@ def with_background_masks(
     """Return the capture with masks of the person, written to ``folder``.
 
     Args:
-        capture: of cameras that stand.
+        capture: of fixed cameras.
         folder: is made.
         empty: an image without the person, or a folder of one for each camera, whose name ends in the camera's number
             (or is that of any image of it); None: the median over time.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dyngs.capture.triangulate import MIN_IMAGES, points_over_clip, triangulated_points, views_of_a_moment
+from dyngs.capture.triangulate import MIN_IMAGES, points_over_clip, triangulated_points, views_of_a_time_step
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import camera_center, projected, times_seen
@@ -38,14 +38,14 @@ def with_first_points(
 ) -> tuple[Capture, list[str]]:
     """Return the capture with the points that a scene begins with, None for random ones, and lines on the choice.
 
-    Points are triangulated where there are none: from the images of a moment that several cameras show, else from
-    those of a moving camera over the whole clip. Not where it is published custom to begin with random points: in the
-    cube around the origin of Blender scenes that are still or show each moment from one side, if they lie there.
+    Points are triangulated where there are none: from the images of a time step that several cameras show, else from
+    those of a moving camera over the full clip. Not where it is published custom to begin with random points: in the
+    cube around the origin of Blender scenes that are still or show each time step from one side, if they lie there.
 
     Args:
         capture: of a scene.
         options: of the capture.
-        triangulate: images of one moment at most; 0: nothing is triangulated.
+        triangulate: images of one time step at most; 0: nothing is triangulated.
         half_extent: half the side of the cube.
     """
     capture, line = checked_points(capture, options)
@@ -61,14 +61,14 @@ def with_first_points(
             lines.append(f"the scene does not lie around the origin, where Blender scenes do by custom: {why}")
     if triangulate == 0 or (is_in_cube and views[0].time is None):
         return capture, lines
-    moment = views_of_a_moment(views, triangulate)
+    moment = views_of_a_time_step(views, triangulate)
     points: PointCloud | None = None
     if views[0].time is None or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES:
         points = triangulated_points(moment, options)
     elif not is_in_cube:
         points = points_over_clip(views, options)
         if points is not None:
-            lines.append(f"{len(points.xyz):,} points were triangulated over the whole clip")
+            lines.append(f"{len(points.xyz):,} points were triangulated over the full clip")
     return capture.replace(points=points), lines
 
 
@@ -77,9 +77,9 @@ SAMPLE = 2000
 LONGEST_SIDE = 240
 """Of the images that they are looked at in, px."""
 GROUPS, GROUP = 3, 5
-"""Groups of images from about the same moment, and images of each."""
+"""Groups of images from about the same time step, and images of each."""
 MIN_SEEN = 0.1
-"""Points of which a smaller share lies in any image do not belong to the cameras."""
+"""Points of which a smaller fraction lies in any image do not belong to the cameras."""
 COLOURS_FIT, PLACES_FIT = 0.85, 0.9
 """Points fit if their error is smaller than that of chance by this factor."""
 _INNER = (2.0, 98.0)
@@ -89,13 +89,13 @@ _INNER = (2.0, 98.0)
 def points_fault(points: PointCloud, views: Sequence[View], options: DataConfig) -> str | None:
     """Return why the points are noise, in a few words, or None where they fit the images.
 
-    They fit where one of two tests is passed, over images from about the same moments:
+    They fit where one of two tests is passed, over images from about the same time steps:
 
     - Their colours are nearer to the images' at their places than to those at the places of other points: the mean
       of the median difference over images is below ``COLOURS_FIT`` times that with colours and points shuffled.
     - Their places agree between images: the spread of the images' colours (and alpha) at a point, over the spread
       with the points shuffled in each image, is below ``PLACES_FIT`` times the same ratio of points drawn at random
-      in the box of the points, among images of a moment or among all of them (neighbours may be too near each other
+      in the box of the points, among images of a time step or among all of them (neighbours may be too near each other
       to tell). Shuffling keeps the colours of each image, so a plain background does not count.
 
     Args:
@@ -123,9 +123,9 @@ def points_fault(points: PointCloud, views: Sequence[View], options: DataConfig)
 
 
 def groups_of(views: Sequence[View]) -> list[list[int]]:
-    """Return indices of ``GROUPS`` groups of up to ``GROUP`` views: from about the same moment each.
+    """Return indices of ``GROUPS`` groups of up to ``GROUP`` views: from about the same time step each.
 
-    Views without times are of one moment; then the groups are of cameras near each other.
+    Views without times are of one time step; then the groups are of cameras near each other.
     """
     size = min(GROUP, len(views))
     if any(view.time is None for view in views):

@@ -1,4 +1,4 @@
-"""A video, or a folder of its frames, of a person before one camera that stands, as a capture with a guessed camera."""
+"""A video, or a folder of its frames, of a person before one fixed camera, as a capture with a guessed camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photos for structure from motion: found below a folder, made readable, turned upright, masks beside them."""
+"""Photos for structure from motion: found below a folder, made readable, rotated upright, masks beside them."""
 
 from __future__ import annotations
 

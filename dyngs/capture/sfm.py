@@ -67,7 +67,7 @@ def estimate_poses(
         options: lens model, matching, effort.
 
     Raises:
-        DyngsError: too few images, an ``out`` in use, a camera that stands still or only turns, or nothing could be
+        DyngsError: too few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
             registered, with advice.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -229,13 +229,13 @@ def _mapped(work: Path, features: FeatureTask, first: Mapper, report: ReportProg
             raise DyngsError(_TURNING)
         raise DyngsError(
             f"no poses could be found for {count} images: take sharper ones that overlap by two thirds, move "
-            "the camera sideways rather than only turning it, avoid bare or moving surfaces, or try matching=exhaustive"
+            "the camera sideways, do not only rotate it, avoid bare or moving surfaces, or try matching=exhaustive"
         )
     return model, notes
 
 
 _TURNING = (
-    "the images differ only as if the camera turned on the spot (or all show one flat surface), which gives no "
+    "the images differ only as if the camera rotated on the spot (or all show one flat surface), which gives no "
     "depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
 )
 

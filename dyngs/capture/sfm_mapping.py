@@ -90,7 +90,7 @@ class MappingTask:
 def mapped(task: MappingTask, wanted: Literal["auto", "global", "incremental"]) -> Model | None:
     """Return the model with most images; None where none could be found.
 
-    "auto" is ``task.first``, and the other mapping beside it only where the first leaves images out, its poses do
+    "auto" is ``task.first``, and the other mapping next to it only where the first leaves images out, its poses do
     not fit the matches of all pairs, or its mean reprojection error is large: see ``better``.
     """
     if wanted != "auto":

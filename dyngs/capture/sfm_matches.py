@@ -65,7 +65,7 @@ def angles_deg(model: pycolmap.Reconstruction, most: int = 2000) -> np.ndarray:
 
 
 def turning_fraction(database: Path) -> float:
-    """Return the fraction of matched pairs that a homography explains: turning on the spot, or one flat surface."""
+    """Return the fraction of matched pairs that a homography explains: rotating on the spot, or one flat surface."""
     import pycolmap
 
     kinds = pycolmap.TwoViewGeometryConfiguration
@@ -102,7 +102,7 @@ _COVERED, _CELLS = 0.5, 8
 class Parallax(Enum):
     """Whether the camera moved."""
 
-    NONE = "it turned on the spot"
+    NONE = "it rotated on the spot"
     SMALL = "it hardly moved"
     ENOUGH = "it moved"
 
@@ -112,7 +112,7 @@ class SeenParallax:
     """Parallax of a set of images.
 
     Attributes:
-        share: of the longest side of an image.
+        fraction: of the longest side of an image.
         kind: what that says about the camera.
         covered: median over pairs of the fraction of an image, as far as it has features, in which some match.
     """
@@ -149,7 +149,7 @@ def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
 
     The parallax of a pair is the distance that three quarters of its matches stay below after the turn of the camera
     that explains them best, with the focal length, common to all, that leaves least. It is that of noise where the
-    camera only turned, however far, and about the focal length times the shift over the depth where it moved.
+    camera only rotated, however far, and about the focal length times the shift over the depth where it moved.
     Without pairs nothing is known, and it is 1. Nor is it where matches cover less than half of the images: what
     else is in them may be elsewhere in the other ones, and the matches those of a thing that moves.
 

@@ -147,7 +147,7 @@ def advice(
     if lost and len(apart) < len(lost):
         lines.append(
             f"{len(lost) - len(apart)} images without a pose match others, but fit no common scene: things that "
-            "move fill them, or the camera only turned there"
+            "move fill them, or the camera only rotated there"
         )
     if blurred:
         more = "more light or a slower hand" if is_video else "take them again"

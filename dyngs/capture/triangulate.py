@@ -1,6 +1,6 @@
 """Sparse points for a capture that has poses but no points, by pycolmap's triangulation on the CPU.
 
-From the images of one moment, or of one moving camera over the whole clip: there, what moves violates the poses.
+From the images of one time step, or of one moving camera over the full clip: there, what moves violates the poses.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ _PROBES = 4000
 """Random points by which the overlap of images is judged."""
 
 
-def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
-    """Return at most ``limit`` views of one moment, evenly spaced; of the moments with most views, the middle one.
+def views_of_a_time_step(views: Sequence[View], limit: int) -> list[View]:
+    """Return at most ``limit`` views of one time step, evenly spaced; of those with most views, the middle.
 
-    Without times all views show the same moment.
+    Without times all views show the same time step.
     """
     shown = Counter(view.time for view in views)
     most = max(shown.values(), default=0)
-    moments = [time for time in shown if shown[time] == most]
-    of_moment = [view for view in views if moments and view.time == moments[len(moments) // 2]]
-    return [of_moment[i] for i in evenly_spaced(len(of_moment), limit)]
+    steps = [time for time in shown if shown[time] == most]
+    of_step = [view for view in views if steps and view.time == steps[len(steps) // 2]]
+    return [of_step[i] for i in evenly_spaced(len(of_step), limit)]
 
 
 def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:
@@ -71,7 +71,7 @@ def triangulated_points(views: Sequence[View], options: DataConfig) -> PointClou
     poses. One thread, so that the same images give the same points.
 
     Args:
-        views: of one moment, with poses.
+        views: of one time step, with poses.
         options: of the capture; its image sizes do not matter here.
     """
     return _points_of(views, options, None)

@@ -30,7 +30,7 @@ def with_poses(
     """Return the options with a capture that has poses as their folder: the given one, unless it has none.
 
     Photos and videos without poses go through structure from motion once; the same ones are found in the user's cache
-    from then on. Of a folder that holds ``images``, those are the photos: masks and maps beside them are not.
+    from then on. Of a folder that holds ``images``, those are the photos: masks and maps next to them are not.
 
     Args:
         data: its ``root`` is a capture of any format, a folder of photos, or a video.

@@ -144,10 +144,10 @@ def match_size(
     # Each side of a shrunk image was rounded to whole pixels: half a pixel either way is the same aspect.
     slack = max(0.5 / stored[0], 0.5 / stored[1]) + 1e-9
     if abs(scale_x / scale_y - 1) > 2 * slack:
-        turned = " (turned by its EXIF tag?)" if stored == described[::-1] else ""
+        rotated = " (rotated by its EXIF tag?)" if stored == described[::-1] else ""
         raise DyngsError(
             f"{where}: the image is {stored[0]}x{stored[1]} but its intrinsics are for {described[0]}x{described[1]}"
-            f"{turned}; correct the size and focal length or restore the original image"
+            f"{rotated}; correct the size and focal length or restore the original image"
         )
     return scaled_intrinsics(intrinsics, scale_x, scale_y), stored, True
 
@@ -205,7 +205,7 @@ def times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
 def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
     """Return the (3,) point nearest to all optical axes (least squares), None where the axes are nearly parallel.
 
-    It may lie behind the cameras; see ``share_in_front``.
+    It may lie behind the cameras; see ``fraction_in_front``.
 
     Args:
         world_from_cam: (V, 4, 4) rigid OpenCV poses.
@@ -221,6 +221,6 @@ def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
 
 
 def fraction_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
-    """Return the share in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of them."""
+    """Return the fraction in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of them."""
     depth = np.einsum("vi,vi->v", point - world_from_cam[:, :3, 3], world_from_cam[:, :3, 2])
     return float((depth > 0).mean())

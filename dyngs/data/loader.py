@@ -102,7 +102,7 @@ class Image:
         return self.rgb_premultiplied.nbytes + sum(x.nbytes for x in self._maps().values() if x is not None)
 
     def _maps(self) -> dict[str, Tensor | None]:
-        """Return everything per pixel beside the colours, by name."""
+        """Return everything per pixel next to the colours, by name."""
         return {name: getattr(self, name) for name in ("alpha", "mask", "moves", "depth", "flow")}
 
     def shrunk(self, factor: int) -> Image:
@@ -132,7 +132,7 @@ class Image:
 class ImageLoader:
     """A sequence of images, decoded on demand or ahead of it; the first ones are cached up to ``options.cache_mb``.
 
-    Once the cache is full, what is in it stays: where every image is asked for once per epoch, in a new order each
+    Once the cache is full, what is in it stays: where every image is requested once per epoch, in a new order each
     time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
     ahead or not. Safe to use from several threads. Images are decoded on the CPU. Those given out on a GPU are kept
     there as far as a quarter of its free memory goes; the others are copied beside its work.
@@ -258,7 +258,7 @@ class ImageLoader:
         return self._with_camera(index, image)
 
     def expect(self, indices: Sequence[int]) -> None:
-        """Begin to decode the images that are asked for next, in this order, as far as they are not cached."""
+        """Begin to decode the images that are requested next, in this order, as far as they are not cached."""
         with self._lock:
             wanted = [i for i in indices if i not in self._kept and not (self._small_by > 1 and i in self._small)]
         self._ahead.expect(wanted)
@@ -368,7 +368,7 @@ class ImageLoader:
     def _has_room(self, size: int) -> bool:
         """Return whether an image of ``size`` bytes is to be kept where it is given out.
 
-        While images are shrunk, only where small and large ones fit together: the small ones are what is asked for.
+        While images are shrunk, only where small and large ones fit together: the small ones are what is requested.
         """
         left = len(self._views) - len(self._kept) - 1
         if self._small_by > 1 and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > self._room:

@@ -26,7 +26,7 @@ MARGIN = 0.1
 WIDE_BASELINE = 10.0
 """Degrees between neighbouring views, seen from the scene, from which they are far apart."""
 CLOSE_IN_TIME, FEW_VIEWS = 0.08, 3
-"""Motion over this fraction of a clip is small; with fewer views in it, each moment is seen from one side only."""
+"""Motion over this fraction of a clip is small; with fewer views in it, each time step is seen from one side only."""
 
 
 def before_training(capture: Capture) -> list[str]:
@@ -139,7 +139,7 @@ def _is_still_monocular(capture: Capture) -> bool:
 def _ill_posed(capture: Capture) -> list[str]:
     """Few images of one time each from places far apart: what moves has moved on before another side of it is seen.
 
-    Many such images are no problem (D-NeRF's are all like that): neighbours in time then show nearly the same moment.
+    Many such images are no problem (D-NeRF's are all like that): neighbours in time then show nearly the same.
     """
     views = sorted((v for v in capture.splits.get("train", ()) if v.time is not None), key=lambda v: v.time or 0.0)
     times = set(distinct_times(views).values())

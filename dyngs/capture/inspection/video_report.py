@@ -167,7 +167,7 @@ def _lines(found: VideoFacts) -> list[str]:
 def _next(path: Path, found: VideoFacts) -> list[str]:
     where = shlex.quote(str(path))
     if found.stands:
-        return ["next: one camera that stands shows no depth; put videos of two or more that ran at once into a folder"]
+        return ["next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"]
     return [
         f"next: dyngs train static data.root={where}     # nothing but the camera moves",
         f"      dyngs train dynamic data.root={where}    # something else moves, too",
@@ -177,12 +177,12 @@ def _next(path: Path, found: VideoFacts) -> list[str]:
 def _next_of_folder(folder: Path, reports: Sequence[VideoFacts]) -> list[str]:
     moving = [found.film.name for found in reports if not found.stands]
     if moving:
-        return [f"next: take {', '.join(moving[:5])} out: of several videos, only cameras that stand still get poses"]
+        return [f"next: take {', '.join(moving[:5])} out: of several videos, only fixed cameras get poses"]
     names = [found.film.name for found in reports]
     rates = {round(found.film.rate, 2) for found in reports}
     known = "found by sound or motion" if read_given(folder, names).starts is None else f"as {VIDEOS_FILE} says"
     return [
-        f"{len(names)} cameras that stand, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
+        f"{len(names)} fixed cameras, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
         f"offsets between them: {known}",
         f"next: dyngs train dynamic data.root={shlex.quote(str(folder))}",
     ]

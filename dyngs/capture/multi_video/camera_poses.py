@@ -1,4 +1,4 @@
-"""Poses of cameras that stand, one each, from one image per camera: what stands in it, of many moments together."""
+"""Poses of fixed cameras, one each, from one image per camera: what stands in it, of many time steps together."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def image_without_movers(film: Film, num_frames: int) -> np.ndarray:
     """Return the (H, W, 3) uint8 median of frames over the clip: what moves is not in it, and noise is weaker.
 
     Args:
-        film: of a camera that stands.
+        film: of a fixed camera.
         num_frames: frames that count, from the first one on.
     """
     most = max(MEDIAN_BYTES // max(film.info.width * film.info.height * 3, 1), 3)
@@ -79,7 +79,7 @@ def image_without_movers(film: Film, num_frames: int) -> np.ndarray:
 def fixed_model(
     films: Sequence[Film], images: Sequence[np.ndarray], work: Path, options: SfmOptions, report: ReportProgress
 ) -> FixedModel | None:
-    """Return the poses of cameras that stand, None where no two cameras match.
+    """Return the poses of fixed cameras, None where no two cameras match.
 
     SIFT features, all pairs matched, incremental mapping from several random seeds; of the models, that with most
     cameras, then with most observations. Where a camera or observations are missing, features are also found with

@@ -162,7 +162,7 @@ class VideosResult:
 def poses_of_videos(
     source: Path, out: Path, options: VideosOptions = VideosOptions(), report: ReportProgress = report_nothing
 ) -> VideosResult:
-    """Make a capture of a folder of videos that ran at once, of cameras that stand.
+    """Make a capture of a folder of videos that ran at once, of fixed cameras.
 
     All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is whole or absent.
 

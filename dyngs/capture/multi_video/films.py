@@ -1,4 +1,4 @@
-"""Videos of a folder, small grey images of them, and what ``videos.json`` beside them says."""
+"""Videos of a folder, small grey images of them, and what ``videos.json`` next to them says."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class Given:
 def read_given(folder: Path, names: Sequence[str]) -> Given:
     """Read ``videos.json``: ``{"starts": {"cam00": 0, "cam01": 1.25}, "test": ["cam00"]}``; all keys are optional.
 
-    ``"starts": 0`` says that all videos begin at the same moment.
+    ``"starts": 0`` says that all videos begin at once.
 
     Args:
         folder: the videos' folder.

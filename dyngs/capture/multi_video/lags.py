@@ -226,7 +226,7 @@ _MIN_BASELINE = 1e-6
 
 @dataclass(frozen=True)
 class Watcher:
-    """A camera that stands, with the motion that it sees.
+    """A fixed camera, with the motion that it sees.
 
     Attributes:
         center: (3,) in the world.
@@ -264,7 +264,7 @@ def correlated_motion(a: Watcher, b: Watcher, rate: float, blur: float) -> Corre
     """Return how alike the motion of two cameras is at every shift; None where they share no planes.
 
     Args:
-        a, b: cameras that stand.
+        a, b: fixed cameras.
         rate: samples per second of the shifts.
         blur: standard deviation in samples by which motion is blurred in time: what moves by more than its size from
             frame to frame is not alike otherwise.
@@ -287,7 +287,7 @@ def correlations(
     """Return the correlation of each camera with at most ``most`` others, those that look at it most alike.
 
     Args:
-        watchers: cameras that stand.
+        watchers: fixed cameras.
         rate: samples per second of the shifts.
         most: others per camera.
         blur: in time, see ``correlated_motion``.

@@ -84,7 +84,7 @@ COARSE, FINE = 1.2, 0.0
 WHOLE = 0.2
 """Offsets so near to whole frames, in frames, are taken as whole: they are not known better."""
 TOGETHER = 0.97
-"""Videos begin together if that explains them as well as the offsets found, to this share."""
+"""Videos begin together if that explains them as well as the offsets found, to this fraction."""
 MAX_RATE = 60.0
 _SHOWN = 12
 

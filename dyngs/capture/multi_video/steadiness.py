@@ -42,7 +42,7 @@ def steadiness(grey: np.ndarray) -> Steadiness:
     """Return how far the images of a video are displaced against their median.
 
     An affine displacement and a change of brightness are fitted to what most pixels show (iterated least squares with
-    Cauchy weights), so that what moves before a camera that stands does not count. A camera that jumps far leaves
+    Cauchy weights), so that what moves before a fixed camera does not count. A camera that jumps far leaves
     no sharp median, and does not fit.
 
     Args:

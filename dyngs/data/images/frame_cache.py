@@ -1,6 +1,6 @@
 """Cache of video frames as image files: decoded once, within a disk limit, found again by the video's content.
 
-The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` beside them holds
+The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to them holds
 the video's size and frame rate and marks the folder as ours. Nothing is ever written to a capture. Only files named
 like ours in folders with that mark are removed, never through a link.
 """

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.data.images.exif import PhotoTags, is_lying, tags_of, turned_upright
+from dyngs.data.images.exif import PhotoTags, is_lying, rotated_upright, tags_of
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside, max_decoded_mb
 from dyngs.files.image_errors import image_error
@@ -101,8 +101,8 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
 
     Args:
         path: a file.
-        size: (width, height) of its camera; an image that has this shape only when it is turned as its EXIF tag says
-            is turned. None: as stored.
+        size: (width, height) of its camera; an image that has this shape only when it is rotated as its EXIF tag says
+            is rotated. None: as stored.
         upright: turn it as its EXIF tag says in any case.
     """
     with _reading(path):
@@ -130,7 +130,7 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
         raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     if upright or (size is not None and header.size_for(size) != header.size):
-        pixels = turned_upright(pixels, header.tags.orientation)
+        pixels = rotated_upright(pixels, header.tags.orientation)
     alpha_channel = _alpha_channel(spec)
     alpha = None if alpha_channel is None else pixels[..., alpha_channel]
     colour_channels = [i for i in range(spec.nchannels) if i != alpha_channel]
@@ -192,7 +192,7 @@ def target_size(width: int, height: int, downscale: float = 1.0, longest_side: i
 def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
     """Return a (height, width, D) image; each pixel is the exact mean of the area of ``pixels`` (H, W, D) it covers.
 
-    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered share.
+    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered fraction.
     """
     return _shrink_axis(_shrink_axis(pixels, 0, _all_of(pixels.shape[0], height)), 1, _all_of(pixels.shape[1], width))
 
@@ -289,7 +289,7 @@ def _shrink_axis(pixels: Tensor, axis: int, span: _Span) -> Tensor:
         return pixels
     if size > old:
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
-    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the shares exact.
+    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the fractions exact.
     starts = torch.arange(span.begin, span.end + 1, device=pixels.device) * old
     first = starts[:-1] // size
     shape = [1] * pixels.ndim

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dyngs.data.images.exif import turned_upright
+from dyngs.data.images.exif import rotated_upright
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import check_size
 from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
@@ -32,7 +32,7 @@ class VideoInfo:
     """Size, length and frame rate of a video.
 
     Attributes:
-        width, height: pixels of an image, turned as the rotation tag says.
+        width, height: pixels of an image, rotated as the rotation tag says.
         num_frames: images that there should be; those of a truncated file may not all be readable.
         fps: mean images per second, 0 if the file does not say.
     """
@@ -203,4 +203,4 @@ def _sign(x: int) -> int:
 
 
 def _rotated_rgb(frame: av.VideoFrame) -> np.ndarray:
-    return turned_upright(frame.to_ndarray(format="rgb24"), orientation_of(frame))
+    return rotated_upright(frame.to_ndarray(format="rgb24"), orientation_of(frame))

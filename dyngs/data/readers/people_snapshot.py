@@ -1,4 +1,4 @@
-"""Reader for PeopleSnapshot folders: a video of a turning person, ``camera.pkl``, masks and poses in HDF5 files."""
+"""Reader for PeopleSnapshot folders: a video of a rotating person, ``camera.pkl``, masks and poses in HDF5 files."""
 
 from __future__ import annotations
 

@@ -316,7 +316,7 @@ KEY = "ply_file_path"
 
 @dataclass(frozen=True)
 class FoundPoints:
-    """Points beside a transforms file: the file that they are from, and warnings; None where there are none."""
+    """Points next to a transforms file: the file that they are from, and warnings; None where there are none."""
 
     points: PointCloud | None = None
     path: Path | None = None

@@ -218,7 +218,7 @@ def _times_between(num_times: int, count: int) -> list[float]:
 def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
     """(count, 4, 4) OpenGL camera-to-world poses spread evenly over the upper hemisphere, looking at the origin.
 
-    A Fibonacci spiral from 6 to 80 degrees of elevation, turned by a random azimuth.
+    A Fibonacci spiral from 6 to 80 degrees of elevation, rotated by a random azimuth.
     """
     turn = np.random.default_rng(seed).uniform(0.0, 2 * np.pi)
     fraction = (np.arange(count) + 0.5) / max(count, 1)

@@ -254,7 +254,7 @@ def test_resized_images_rescale_the_intrinsics(nerfstudio_root: Path, width: int
 
 def test_another_shape_is_an_error(nerfstudio_root: Path) -> None:
     edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(w=8, h=12))
-    with pytest.raises(DyngsError, match=r"12x8 but its intrinsics are for 8x12 \(turned"):
+    with pytest.raises(DyngsError, match=r"12x8 but its intrinsics are for 8x12 \(rotated"):
         read_nerfstudio(nerfstudio_root)
 
 
