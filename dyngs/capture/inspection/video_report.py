@@ -53,14 +53,6 @@ class VideoFacts:
     stands: bool
 
 
-@dataclass(frozen=True)
-class _Looked:
-    """What was seen in the frames: small images, and the sharpness of each."""
-
-    small: SmallImages
-    sharpness: np.ndarray
-
-
 def video_report(path: Path) -> str:
     """Return a report on a video file, or on the videos of a folder, as lines of text.
 
@@ -81,21 +73,22 @@ def video_report(path: Path) -> str:
 def video_facts(path: Path) -> VideoFacts:
     """Return what there is to know about a video; its frames are decoded once."""
     film = open_film(inside(path))
-    looked = _look(film)
-    steady = steadiness(looked.small.grey)
+    small, sharpness = _look(film)
+    steady = steadiness(small.grey)
     shown, sound = _streams(path)
     seconds = film.seconds
     facts = (
         ("size", f"{film.info.width}x{film.info.height}" + shown),
         ("frames", f"{len(seconds)} in {seconds[-1] + 1 / film.rate:.2f} s, {_rate(film)}"),
         ("sound", sound),
-        ("sharpness", _sharpness(looked.sharpness)),
-        ("camera", _camera(looked.small, steady)),
+        ("sharpness", _sharpness(sharpness)),
+        ("camera", _camera(small, steady)),
     )
     return VideoFacts(film, facts, steady.stands)
 
 
-def _look(film: Film) -> _Looked:
+def _look(film: Film) -> tuple[SmallImages, np.ndarray]:
+    """Return small images of the frames, and the sharpness of each."""
     small, sharpness = [], []
     for number, rgb in enumerate(read_frames(film.path)):
         if number >= min(MAX_FRAMES, len(film.seconds)):
@@ -106,7 +99,7 @@ def _look(film: Film) -> _Looked:
         sharpness.append(
             float(np.diff(grey, axis=0).std() + np.diff(grey, axis=1).std()) if min(grey.shape) > 1 else 0.0
         )
-    return _Looked(SmallImages(np.stack(small), film.seconds[: len(small)]), np.array(sharpness))
+    return SmallImages(np.stack(small), film.seconds[: len(small)]), np.array(sharpness)
 
 
 _ORIENTATIONS = (

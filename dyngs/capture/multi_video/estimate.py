@@ -207,9 +207,9 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
     films, small, found, line = _posed(work, films, small, options, report)
     lines.append(line)
     watchers = [_watcher(film, images, found.model) for film, images in zip(films, small, strict=True)]
-    begun = found_starts(films, watchers) if starts is None else given_starts(films, starts)
-    lines.append(begun.line)
-    clocks = [film.seconds + start for film, start in zip(films, begun.seconds, strict=True)]
+    begun, line = found_starts(films, watchers) if starts is None else given_starts(films, starts)
+    lines.append(line)
+    clocks = [film.seconds + start for film, start in zip(films, begun, strict=True)]
     taken, line = taken_frames(source, clocks, [film.rate for film in films], options.num_steps)
     lines.append(line)
     names = write_images(work, films, taken, report)
@@ -220,7 +220,7 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
         for own, frames in zip(names, taken, strict=True)
         for name, second in zip(own, frames.seconds, strict=True)
     }
-    write_facts(work, seconds, {film.name: float(x) for film, x in zip(films, begun.seconds, strict=True)}, test)
+    write_facts(work, seconds, {film.name: float(x) for film, x in zip(films, begun, strict=True)}, test)
     if test:
         lines.append(f"held out for testing: {first_few(test)}")
     return lines

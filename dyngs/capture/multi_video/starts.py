@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -89,24 +89,15 @@ MAX_RATE = 60.0
 _SHOWN = 12
 
 
-@dataclass(frozen=True)
-class Starts:
-    """When the videos begin.
-
-    Attributes:
-        seconds: (C,) in one clock, the earliest one at 0.
-        line: how they were found, and what they are.
-    """
-
-    seconds: np.ndarray
-    line: str
+Starts = tuple[np.ndarray, str]
+"""Seconds (C,) at which the videos begin in one clock, the earliest at 0, and a line on how they were found."""
 
 
 def given_starts(films: Sequence[Film], starts: dict[str, float]) -> Starts:
     """Return the starts that a person gave, for those of the videos that are left."""
     seconds = np.array([starts[film.name] for film in films])
     seconds = seconds - seconds.min()
-    return Starts(seconds, f"offsets between the cameras as given: {_listed(films, seconds)}")
+    return seconds, f"offsets between the cameras as given: {_listed(films, seconds)}"
 
 
 def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
@@ -136,12 +127,12 @@ def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
     sure = f"{found.agreeing} of {found.pairs} pairs agree, correlation {found.correlation:.2f}"
     frames = found.shifts / hertz * rate
     if found.together >= TOGETHER * found.correlation or np.abs(frames).max() <= WHOLE:
-        return Starts(np.zeros(len(films)), f"the videos begin together, by {what} ({sure})")
+        return np.zeros(len(films)), f"the videos begin together, by {what} ({sure})"
     if _same_rate(films) and np.abs(frames - np.round(frames)).max() <= WHOLE:
         frames = np.round(frames)
         sure += ", whole frames"
     seconds = (frames - frames.min()) / rate
-    return Starts(seconds, f"offsets between the cameras by {what} ({sure}): {_listed(films, seconds)}")
+    return seconds, f"offsets between the cameras by {what} ({sure}): {_listed(films, seconds)}"
 
 
 def _by_sound(films: Sequence[Film]) -> tuple[Alignment | None, str]:

@@ -245,14 +245,8 @@ def check_model_file(path: Path) -> None:
         _check_text(path)
         return
     source = _Bytes(path)
-    walk = {
-        "cameras": _walk_cameras,
-        "images": _walk_images,
-        "points3D": _walk_points,
-        "rigs": _walk_rigs,
-        "frames": _walk_frames,
-    }[path.stem]
-    walk(source)
+    for _ in range(source.take(_COUNT)[0]):
+        {"cameras": _skip_camera, "rigs": _skip_rig}.get(path.stem, _skip_record)(source)
     if source.at != len(source.data):
         extra = len(source.data) - source.at
         raise DyngsError(f"{path}: {extra} bytes follow the end of the COLMAP file; copy or export it again")
@@ -264,42 +258,35 @@ _RIG = struct.Struct("<II")
 _SENSOR = struct.Struct("<iIB")
 _SENSORS = struct.Struct("<I")
 _POSE_BYTES = 7 * 8
+_RECORDS = {
+    "images": (4 + _POSE_BYTES + 4, _COUNT, 24),
+    "points3D": (8 + 3 * 8 + 3 + 8, _COUNT, 8),
+    "frames": (8 + _POSE_BYTES, _SENSORS, 16),
+}
+"""Bytes of a record, then of images a name, then a count and the bytes of each item that it counts."""
 
 
-def _walk_cameras(source: _Bytes) -> None:
-    for _ in range(source.take(_COUNT)[0]):
-        camera, model, _, _ = source.take(_CAMERA)
-        if not 0 <= model < len(_NUM_PARAMS):
-            raise DyngsError(f"{source.path}: camera {camera} has the unknown model id {model}; undistort with COLMAP")
-        source.skip(8 * _NUM_PARAMS[model])
+def _skip_camera(source: _Bytes) -> None:
+    camera, model, _, _ = source.take(_CAMERA)
+    if not 0 <= model < len(_NUM_PARAMS):
+        raise DyngsError(f"{source.path}: camera {camera} has the unknown model id {model}; undistort with COLMAP")
+    source.skip(8 * _NUM_PARAMS[model])
 
 
-def _walk_images(source: _Bytes) -> None:
-    for _ in range(source.take(_COUNT)[0]):
-        source.skip(4 + _POSE_BYTES + 4)
+def _skip_rig(source: _Bytes) -> None:
+    _, sensors = source.take(_RIG)
+    source.skip(8 if sensors else 0)
+    for _ in range(sensors - 1):
+        has_pose = source.take(_SENSOR)[2]
+        source.skip(_POSE_BYTES if has_pose else 0)
+
+
+def _skip_record(source: _Bytes) -> None:
+    size, count, item_size = _RECORDS[source.path.stem]
+    source.skip(size)
+    if source.path.stem == "images":
         source.skip_string()
-        source.skip(24 * source.take(_COUNT)[0])
-
-
-def _walk_points(source: _Bytes) -> None:
-    for _ in range(source.take(_COUNT)[0]):
-        source.skip(8 + 3 * 8 + 3 + 8)
-        source.skip(8 * source.take(_COUNT)[0])
-
-
-def _walk_rigs(source: _Bytes) -> None:
-    for _ in range(source.take(_COUNT)[0]):
-        _, sensors = source.take(_RIG)
-        source.skip(8 if sensors else 0)
-        for _ in range(sensors - 1):
-            has_pose = source.take(_SENSOR)[2]
-            source.skip(_POSE_BYTES if has_pose else 0)
-
-
-def _walk_frames(source: _Bytes) -> None:
-    for _ in range(source.take(_COUNT)[0]):
-        source.skip(8 + _POSE_BYTES)
-        source.skip(16 * source.take(_SENSORS)[0])
+    source.skip(item_size * source.take(count)[0])
 
 
 def _check_text(path: Path) -> None:
