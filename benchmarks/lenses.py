@@ -23,7 +23,7 @@ import torch
 from dyngs.api.train import train
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Lens
-from dyngs.data.geometry.intrinsics import pinhole_matrix
+from dyngs.data.geometry import pinhole_matrix
 from dyngs.data.images.lens import undistorted_points
 from dyngs.data.synthetic import raytrace
 from dyngs.data.synthetic.scenes import scene_at

@@ -29,15 +29,14 @@ from dyngs.build import assemble
 from dyngs.config import Config, PointsInit, RandomInit, StaticModel, TrajectoryField
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+from dyngs.data.synthetic.captures import DynamicOptions, is_in_image, write_dynamic_capture
 from dyngs.data.synthetic.raytrace import Primitive, Sheet, is_seen
 from dyngs.data.synthetic.raytrace import Scene as TrueScene
 from dyngs.data.synthetic.scenes import SceneName, scene_at
-from dyngs.data.synthetic.tracks import is_in_image
-from dyngs.data.true_tracks import read_true_tracks
+from dyngs.data.times import evenly_spaced
+from dyngs.data.tracks import read_true_tracks
 from dyngs.deform.field import FieldSetup, Offsets, chosen
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene

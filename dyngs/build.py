@@ -15,7 +15,7 @@ import torch
 from typing_extensions import assert_never
 
 from dyngs.capture.first_points import with_first_points
-from dyngs.capture.inspection.scene_problems import before_training
+from dyngs.capture.inspection.problems import before_training
 from dyngs.config import (
     AutoColour,
     Config,
@@ -34,12 +34,12 @@ from dyngs.config import (
     StaticModel,
 )
 from dyngs.config.kinds import field_of, stored_sh_degree, uses_absgrad
-from dyngs.data.ahead import usual_threads
 from dyngs.data.capture import Capture
-from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.geometry.frusta import outside_of_cube
+from dyngs.data.decoding import usual_threads
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.data.scene_space import outside_of_cube
+from dyngs.data.times import evenly_spaced
 from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
 from dyngs.deform.given_masks import moving_fraction_of

@@ -110,7 +110,7 @@ def read_a_image(root: Path) -> object:
 
 def read_a_depth_map(root: Path) -> object:
     """Read a depth map, and the same file as labels where it is an image."""
-    from dyngs.data.images.depth import read_depth, read_labels
+    from dyngs.data.images.maps import read_depth, read_labels
 
     path = only(root)
     return read_depth(path), read_labels(path) if path.suffix == ".png" else None
@@ -118,7 +118,7 @@ def read_a_depth_map(root: Path) -> object:
 
 def read_a_flow_field(root: Path) -> object:
     """Read optical flow; NaN in it is no failure: it means unknown."""
-    from dyngs.data.images.flow import read_flow
+    from dyngs.data.images.maps import read_flow
 
     return read_flow(only(root)).nan_to_num(0.0)
 
@@ -136,7 +136,7 @@ def read_known_tracks(root: Path) -> object:
     from moving_scene import camera, still_scene
 
     from dyngs.data.capture import View
-    from dyngs.data.true_tracks import read_true_tracks
+    from dyngs.data.tracks import read_true_tracks
     from dyngs.evaluate.tracks import track_scores
 
     views = [View(name, Path(name), np.eye(4), np.eye(3), 8, 8, time=t) for name, t in (("a", 0.0), ("b", 1.0))]
@@ -279,7 +279,7 @@ def read_a_point(root: Path) -> object:
 
 def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
-    from dyngs.data.frame_selection import parse_frames
+    from dyngs.data.times import parse_frames
     from dyngs.output.camera_paths import parse_times
     from dyngs.tradeoff.requirements import parse_requirements
     from dyngs.tradeoff.variants import parse_variations

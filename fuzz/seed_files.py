@@ -18,7 +18,7 @@ from dyngs.build import restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
-from dyngs.data.true_tracks import TrueTracks, write_true_tracks
+from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.export.avatar import _KIND as AVATAR_KIND
 from dyngs.files.tensor_file import write_tensors

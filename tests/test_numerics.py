@@ -19,7 +19,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.geometry.recenter import recenter
+from dyngs.data.scene_space import recenter
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import Rendering, RenderOptions, render

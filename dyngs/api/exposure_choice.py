@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dyngs.api.candidate import Candidate, Choice, Comparison, Evidence
 from dyngs.config import Config, DynamicModel, StaticModel
-from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.metrics import psnr
 from dyngs.training.background import background_colour

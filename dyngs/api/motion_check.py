@@ -10,10 +10,9 @@ import torch
 from dyngs.build import assemble
 from dyngs.config import Config, DefaultStrategy, PointsInit, StaticModel
 from dyngs.data.capture import Capture, View
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.times import are_scattered
+from dyngs.data.times import are_scattered, evenly_spaced
 from dyngs.deform.evidence import MIN_DIFFERING, Evidence, Verdict, agreement_over_time, differing_fraction
 from dyngs.deform.still_error import cameras_in_place, signed_errors
 from dyngs.training.background import evaluation_background

@@ -15,9 +15,9 @@ from dyngs.build import assemble
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.config.kinds import network_of, person_of
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.ops.device import deterministic, device_for

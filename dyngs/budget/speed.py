@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dyngs.budget.run import LimitedRun, stage
 from dyngs.config import Config
-from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.evaluate.temporal import Drawing
 from dyngs.gaussians.scene import Scene, render_options

@@ -1,4 +1,4 @@
-"""A video, or a folder of its frames, of a person before one camera that stands, as a capture with a guessed camera."""
+"""A video, or a folder of its frames, of a person before one fixed camera, as a capture with a guessed camera."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
-from dyngs.data.frame_selection import evenly_spaced, parse_frames
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
-from dyngs.data.images.images import read_header
-from dyngs.data.name_order import natural_order
+from dyngs.data.images.images import SUFFIXES, read_header
 from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.times import evenly_spaced, natural_order, parse_frames
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, images_up_to, inside, staying_within
-from dyngs.files.wrong_place import PHOTO_SUFFIXES, VIDEO_SUFFIXES
+from dyngs.files.wrong_place import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
 """``Capture.format`` of what is read here."""
@@ -137,7 +136,7 @@ def _images_of(folder: Path) -> list[Path]:
             found = [
                 path
                 for path in place.iterdir()
-                if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file() and not path.name.startswith(".")
+                if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
             ]
             if found:
                 return sorted(found, key=lambda path: natural_order(path.name))

@@ -1,24 +1,29 @@
-"""Photos for structure from motion: found below a folder, turned upright, masks beside them."""
+"""Photos for structure from motion: found below a folder, made readable, rotated upright, masks beside them."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dyngs.data.images.exif import is_lying
-from dyngs.data.images.images import ImageHeader, read_header, read_image, read_mask
+from dyngs.data.images.images import END_MARKERS, ImageHeader, check_image, read_header, read_image, read_mask
 from dyngs.data.images.video import VIDEO_SUFFIXES
-from dyngs.errors import reading
+from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside
-from dyngs.files.write import write_image
+from dyngs.files.write import atomic_file, write_image
 from dyngs.files.wrong_place import PHOTO_SUFFIXES
 
+HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
+"""What phones write; read by pillow-heif."""
+_FOR_COLMAP = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _SAMPLE_BYTES = 2**20
 
 
@@ -29,19 +34,17 @@ class Photo:
     Attributes:
         name: path below ``images/``.
         header: size and tags as stored there.
+        source: path of the photo below the given folder.
     """
 
     name: str
     header: ImageHeader
+    source: str = ""
 
 
 def photos_below(folder: Path) -> list[Path]:
     """Return all photos below the folder, sorted; hidden files and folders are left out."""
-    return sorted(
-        path for path in folder.rglob("*")
-        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )  # fmt: skip
+    return [path for path in _files_below(folder) if path.suffix.lower() in PHOTO_SUFFIXES]
 
 
 def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
@@ -63,47 +66,54 @@ def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
     return digest.hexdigest()[:16]
 
 
-def gather_photos(source: Path, images: Path, out: Path) -> list[Photo]:
-    """Copy (hard-link where possible) all photos below ``source`` to ``images``, sorted by name.
+def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], tuple[str, ...]]:
+    """Copy all photos below ``source`` to ``images``; return them, sorted by source, and lines on what is left out.
 
-    Photos that lie on their side by their EXIF tag are linked as they are: the model's sizes say that they are to be
-    turned, and readers of ours do. Those that are upside down, mirrored or square cannot be told by their size: they
-    are written upright, as PNG.
+    Photos that lie on their side by their EXIF tag are copied as they are: the model's sizes say that they are to be
+    rotated, and readers of ours do. Those that are upside down, mirrored or square cannot be told by their size: they
+    are written upright, as PNG, and so are HEIC photos and the first frame of GIF files.
 
     Args:
         source: a folder; hidden files, and those of ``out``, are left out.
-        images: a folder, made if there are photos.
+        images: a folder, made if there are photos; images that are there already are left.
         out: the capture that will be made.
 
     Raises:
-        DyngsError: a file is no image, too large, or lies outside the folder.
+        DyngsError: a file is no image, truncated, too large, or lies outside the folder; pillow-heif is missing.
     """
     result = out.resolve()
-    taken = [photo for photo in photos_below(source) if result not in photo.resolve().parents]
-    names = {photo.relative_to(source) for photo in taken}
+    files = [file for file in _files_below(source) if result not in file.resolve().parents]
+    taken = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
+    _require_heif([file for file in taken if file.suffix.lower() in HEIF_SUFFIXES], source)
+    headers = {photo: _checked(photo) for photo in taken}
+    names = _stored_names({photo.relative_to(source): _is_converted(photo, headers[photo]) for photo in taken})
     photos = []
-    for photo in taken:
-        header = read_header(inside(photo))
-        check_size(photo, header.width, header.height, header.channels)
-        name = photo.relative_to(source)
-        target = images / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if header.tags.orientation != 1 and header.upright_size == header.size:
-            png = name.with_suffix(".png")
-            name = name.with_name(name.name + ".png") if png in names else png
-            write_image(images / name, read_image(photo, upright=True).numpy())
-        elif not target.exists():
-            link_or_copy(photo.resolve(), target)
-        photos.append(Photo(name.as_posix(), header))
-    return photos
+    for photo, header in headers.items():
+        relative = photo.relative_to(source)
+        target = images / names[relative]
+        if not target.exists():
+            _store(photo, target, header)
+        stored = header if header is not None and target.suffix == photo.suffix else read_header(target)
+        photos.append(Photo(names[relative].as_posix(), stored, relative.as_posix()))
+    left_out = Counter(file.suffix.lower() or "without a suffix" for file in files if file not in headers)
+    notes = [_left_out_line(left_out)] if left_out else []
+    animated = sum(photo.suffix.lower() == ".gif" for photo in taken)
+    notes += [f"{animated} .gif: the first frame of each is taken"] if animated else []
+    return photos, tuple(notes)
 
 
-def link_or_copy(source: Path, target: Path) -> None:
-    """Make ``target`` a hard link of a file, or a copy where links are not possible."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
+def copied(source: Path, target: Path) -> None:
+    """Make ``target`` a copy of a file, atomically; file systems that share blocks until one is written do so."""
+    with atomic_file(target) as temporary:
+        try:
+            with source.open("rb") as given, temporary.open("wb") as new:
+                while os.copy_file_range(given.fileno(), new.fileno(), 2**30):
+                    pass
+            is_whole = temporary.stat().st_size == source.stat().st_size
+        except (AttributeError, OSError):  # another system, or two file systems
+            is_whole = False
+        if not is_whole:
+            shutil.copyfile(source, temporary)
 
 
 def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str, Path]) -> list[str]:
@@ -114,7 +124,8 @@ def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str,
     Args:
         photos: in order.
         stored_in: folder of theirs.
-        images: a folder; images that are there already are left.
+        images: a folder that does not outlive the work, as files in it may be links to the photos; images that are
+            there already are left.
         masks: of photos, by name; white = keep.
     """
     names = []
@@ -122,15 +133,99 @@ def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str,
     for index, photo in enumerate(photos):
         stored = stored_in / photo.name
         lies = is_lying(photo.header.tags.orientation) and photo.header.upright_size != photo.header.size
-        name = f"{index:06d}" + (".png" if lies else stored.suffix.lower())
+        is_written = lies or stored.suffix.lower() not in _FOR_COLMAP
+        name = f"{index:06d}" + (".png" if is_written else stored.suffix.lower())
         names.append(name)
         if not (images / name).exists():
-            if lies:
+            if is_written:
                 write_image(images / name, read_image(stored, upright=True).numpy())
             else:
-                link_or_copy(stored, images / name)
+                _link(stored, images / name)
         mask = masks.get(photo.name)
         if mask is not None:
             target = images.with_name("masks") / f"{name}.png"
             write_image(target, np.where(read_mask(inside(mask)).numpy(), 255, 0).astype(np.uint8)[..., None])
     return names
+
+
+def _files_below(folder: Path) -> list[Path]:
+    return sorted(
+        path for path in folder.rglob("*")
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )  # fmt: skip
+
+
+def _left_out_line(counts: Counter[str]) -> str:
+    what = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
+    return f"left out, no photos: {what} (photos are {', '.join(sorted(PHOTO_SUFFIXES))}; convert what else is one)"
+
+
+def _require_heif(photos: Sequence[Path], source: Path) -> None:
+    if photos:
+        try:
+            import pillow_heif  # noqa: F401
+        except ImportError:
+            raise DyngsError(
+                f"{source}: {len(photos)} photos are HEIC, first {photos[0].name}, which needs the package "
+                "pillow-heif: pip install 'dyngs[heic]', or convert them to JPEG"
+            ) from None
+
+
+def _checked(photo: Path) -> ImageHeader | None:
+    """Return the header of a photo that is complete; None for HEIC, which is checked when it is converted."""
+    if inside(photo).suffix.lower() in HEIF_SUFFIXES:
+        return None
+    header = check_image(photo)
+    if photo.suffix.lower() not in END_MARKERS:
+        read_image(photo)
+    return header
+
+
+def _is_converted(photo: Path, header: ImageHeader | None) -> bool:
+    """Whether a photo is written anew, as PNG."""
+    if header is None or photo.suffix.lower() == ".gif":
+        return True
+    return header.tags.orientation != 1 and header.upright_size == header.size
+
+
+def _stored_names(converted: dict[Path, bool]) -> dict[Path, Path]:
+    """Return where each photo is stored; no two differ in the suffix alone, because views are named without it."""
+    taken: set[Path] = set()
+    names = {}
+    for name, is_png in sorted(converted.items(), key=lambda item: (item[1], item[0])):
+        view, count = name.with_suffix(""), 1
+        while view in taken:
+            view, count = name.with_name(name.name if count == 1 else f"{name.name}_{count}"), count + 1
+        taken.add(view)
+        names[name] = view.with_name(view.name + (".png" if is_png else name.suffix))
+    return names
+
+
+def _store(photo: Path, target: Path, header: ImageHeader | None) -> None:
+    if header is None:
+        _convert_heif(photo, target)
+    elif not _is_converted(photo, header):
+        copied(photo.resolve(), target)
+    else:
+        pixels = read_image(photo, upright=True).numpy()
+        is_opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())
+        write_image(target, pixels[..., :3] if is_opaque else pixels)
+
+
+def _convert_heif(photo: Path, target: Path) -> None:
+    """Write a HEIC photo as PNG, upright and with its tags."""
+    import pillow_heif
+
+    heif: Any = pillow_heif
+    with reading(photo, "the image is damaged; copy or convert it again"), heif.HeifImageFile(str(photo)) as image:
+        check_size(photo, *image.size)
+        rgb, exif = image.convert("RGB"), image.info.get("exif")
+    with atomic_file(target) as temporary:
+        rgb.save(temporary, exif=exif or b"", compress_level=1)
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)

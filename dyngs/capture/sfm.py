@@ -10,27 +10,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from dyngs.capture.frame_choice import STILL, FrameChoice, chosen_frames, measured
-from dyngs.capture.photos import Photo, digest_of, gather_photos, lay_out, link_or_copy
-from dyngs.capture.sfm_check import angles_deg, turning_fraction
-from dyngs.capture.sfm_features import FeatureTask, find_features, match_pairs, matched_images
+from dyngs.capture.photos import Photo, copied, digest_of, gather_photos, lay_out
+from dyngs.capture.sfm_features import (
+    ALIKE,
+    ALIKE_PHOTOS,
+    FeatureTask,
+    alike_pairs,
+    all_pairs,
+    find_features,
+    match_pairs,
+    matched_images,
+    neighbour_pairs,
+)
 from dyngs.capture.sfm_mapping import Mapper, MappingTask, Model, better, mapped, needs_more
-from dyngs.capture.sfm_movers import without_movers
-from dyngs.capture.sfm_pairs import ALIKE, ALIKE_PHOTOS, alike_pairs, all_pairs, neighbour_pairs
-from dyngs.capture.sfm_parallax import Parallax, matched_pairs, parallax_of
-from dyngs.capture.sfm_report import SfmResult, advice, write_report
-from dyngs.capture.sfm_work import working
+from dyngs.capture.sfm_matches import Parallax, angles_deg, matched_pairs, parallax_of, turning_fraction, without_movers
+from dyngs.capture.sfm_work import SfmOptions, SfmResult, advice, quiet_colmap, working, write_report
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.frame_seconds import write_seconds
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import frame_seconds, read_frames, read_numbered_frames
 from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.times import write_seconds
 from dyngs.errors import DyngsError
-from dyngs.files.containment import MAX_MEGAPIXELS, images_up_to, inside, staying_within
+from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.json_files import read_json_object
 from dyngs.files.write import write_image, write_text
 
@@ -46,45 +52,6 @@ _FEWEST_MATCHED = 3
 _MOVING_FRACTION = 0.02
 
 
-@dataclass(frozen=True)
-class SfmOptions:
-    """Options of pose estimation.
-
-    Attributes:
-        camera_model: COLMAP's name of the lens model to fit.
-        single_camera: one camera took all images, so they share its lens; None = yes for a video, and for photos that
-            agree in size, camera model and focal length (EXIF); else every photo has a lens of its own.
-        matching: which pairs are compared; auto = all pairs up to 60 photos or 24 frames, beyond that neighbours by
-            name (some far ones, too) and those that look alike; sequential = the same without what looks alike.
-        overlap: neighbours on either side in sequential matching; None = near ones densely, far ones sparsely.
-        mapper: COLMAP's mapping; auto = global, and incremental where that finds less.
-        max_features: SIFT features per image.
-        longest_side: images are shrunk to this, in pixels, for finding features (poses refer to the full size).
-        num_frames: images to take from a video, by motion seen and sharpness.
-        masks: folder of masks of the photos, named as in captures; white = keep. None without.
-        seed: of everything random.
-        num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is always the same.
-        follow_links: photos may be links that lead out of their folder.
-        max_megapixels: larger images and videos are refused.
-    """
-
-    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
-        "SIMPLE_RADIAL"
-    )
-    single_camera: bool | None = None
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    overlap: int | None = None
-    mapper: Literal["auto", "global", "incremental"] = "auto"
-    max_features: int = 8192
-    longest_side: int = 1600
-    num_frames: int = 100
-    masks: Path | None = None
-    seed: int = 0
-    num_threads: int = 0
-    follow_links: bool = False
-    max_megapixels: float = MAX_MEGAPIXELS
-
-
 def estimate_poses(
     source: Path, out: Path, options: SfmOptions = SfmOptions(), report: ReportProgress = report_nothing
 ) -> SfmResult:
@@ -98,10 +65,9 @@ def estimate_poses(
         source: a folder of photos (subfolders included) or a video file.
         out: a folder that does not exist, or is empty.
         options: lens model, matching, effort.
-        report: is told of frames read from a video, of images with features, of pairs matched, of poses found.
 
     Raises:
-        DyngsError: too few images, an ``out`` in use, a camera that stands still or only turns, or nothing could be
+        DyngsError: too few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
             registered, with advice.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -127,20 +93,12 @@ def estimate_poses(
         raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
 
 
-class _Clock:
-    """Seconds of each stage, by its name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Add the seconds of the block to a stage."""
-        begun = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+@contextmanager
+def _timed(stages: dict[str, float], name: str) -> Iterator[None]:
+    """Note the seconds of the block as those of a stage."""
+    begun = time.perf_counter()
+    yield
+    stages[name] = time.perf_counter() - begun
 
 
 @dataclass(frozen=True)
@@ -155,32 +113,25 @@ class _Images:
 
 def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress) -> SfmResult:
     """Write the capture for ``out`` in ``work/capture`` and return the result."""
-    clock = _Clock()
+    stages: dict[str, float] = {}
     capture = work / "capture"
-    with clock.stage("images"):
+    with _timed(stages, "images"):
         if source.is_file():
             images = _frames_of(source, capture, options, report)
         else:
-            images = _Images(gather_photos(source, capture / "images", out), is_video=False)
+            gathered, left_out = gather_photos(source, capture / "images", out)
+            images = _Images(gathered, is_video=False, notes=left_out)
     photos = images.photos
     if len(photos) < 3:
-        raise DyngsError(f"{source} has {len(photos)} images; structure from motion needs at least 3, better 30")
-    import pycolmap
-
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
-    pycolmap.set_random_seed(options.seed)
-    try:
+        found = "; ".join((f"{source} has {len(photos)} image{'s' * (len(photos) != 1)}", *images.notes))
+        raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
+    with quiet_colmap(options.seed):
         with nullcontext() if options.masks is None else staying_within(options.masks, options.follow_links):
             features = _feature_task(work, images, options)
-        seen = _matched(features, images.is_video, options, (clock, report))
-        with clock.stage("poses"):
+        seen = _matched(features, images.is_video, (stages, report))
+        with _timed(stages, "poses"):
             first = "global" if images.is_video else "incremental"
-            model, notes = _mapped(work, features, options, first, report)
-    except (RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()
-        raise DyngsError(f"structure from motion failed: {reason[-1] if reason else error}") from error
-    finally:
-        pycolmap.logging.minloglevel = level
+            model, notes = _mapped(work, features, first, report)
     _require_depth(model, features.database, images.is_video)
     names = dict(zip(features.names, (photo.name for photo in photos), strict=True))
     matched = {names[name]: count for name, count in matched_images(features.database).items()}
@@ -190,7 +141,7 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
     found = model.reconstruction
     result = SfmResult(
         out, len(photos), len(photos) - len(missing), missing, found.num_points3D(), model.error_px,
-        float(found.compute_mean_track_length()), model.mapper, clock.seconds, notes,
+        float(found.compute_mean_track_length()), model.mapper, stages, notes,
     )  # fmt: skip
     write_report(capture, result)
     capture.chmod(0o755)
@@ -201,19 +152,17 @@ def _feature_task(work: Path, images: _Images, options: SfmOptions) -> FeatureTa
     """Lay the images out for COLMAP."""
     folder, photos = work / "capture" / "images", images.photos
     found = {} if options.masks is None else find_masks(options.masks)
-    masks = {photo.name: mask for photo in photos if (mask := mask_of(photo.name, found)) is not None}
+    masks = {photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None}
     if options.masks is not None and not masks:
         raise DyngsError(f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)")
     names = lay_out(photos, folder, work / "images", masks)
     for name, mask in masks.items():
         target = folder.with_name("masks") / (name + mask.suffix)
-        target.parent.mkdir(parents=True, exist_ok=True)
         if not target.exists():
-            link_or_copy(inside(mask).resolve(), target)
+            copied(inside(mask).resolve(), target)
     return FeatureTask(
-        work / "database.db", work / "images", names, photos, work / "masks" if masks else None,
-        options.camera_model, _is_single(images, options), options.max_features, options.longest_side,
-        options.seed, options.num_threads, _ENOUGH_FEATURES if images.is_video else 0,
+        work / "database.db", work / "images", names, photos, options, work / "masks" if masks else None,
+        _is_single(images, options), _ENOUGH_FEATURES if images.is_video else 0,
     )  # fmt: skip
 
 
@@ -225,28 +174,22 @@ def _is_single(images: _Images, options: SfmOptions) -> bool:
     return images.is_video or len(kinds) == 1
 
 
-def _matched(
-    task: FeatureTask, is_video: bool, options: SfmOptions, told: tuple[_Clock, ReportProgress]
-) -> tuple[str, ...]:
-    """Find features and match pairs; those of a stopped run are kept. Return lines about them.
-
-    Raises:
-        DyngsError: the camera only turned.
-    """
-    clock, report = told
-    with clock.stage("features"):
+def _matched(task: FeatureTask, is_video: bool, told: tuple[dict[str, float], ReportProgress]) -> tuple[str, ...]:
+    """Find features and match pairs; those of a stopped run are kept. Return lines about them."""
+    stages, report = told
+    with _timed(stages, "features"):
         stronger = find_features(task, report)
-    with clock.stage("matching"):
-        match_pairs(task, _pairs(task, is_video, options), report)
+    with _timed(stages, "matching"):
+        match_pairs(task, _pairs(task, is_video), report)
         notes = _parallax_seen(task, is_video)
     if stronger > 1:
         notes = (f"features with {stronger:g} times the usual contrast were taken: frames have many", *notes)
     return notes
 
 
-def _pairs(task: FeatureTask, is_video: bool, options: SfmOptions) -> list[tuple[int, int]]:
+def _pairs(task: FeatureTask, is_video: bool) -> list[tuple[int, int]]:
     """Return the pairs to match, by places in the order of names."""
-    count = len(task.names)
+    options, count = task.options, len(task.names)
     limit = _EXHAUSTIVE_FRAMES if is_video else _EXHAUSTIVE_PHOTOS
     if options.matching == "exhaustive" or (options.matching == "auto" and count <= limit):
         return all_pairs(count)
@@ -256,18 +199,13 @@ def _pairs(task: FeatureTask, is_video: bool, options: SfmOptions) -> list[tuple
     return near + alike_pairs(task.database, task.names, ALIKE if is_video else ALIKE_PHOTOS)
 
 
-def _mapped(
-    work: Path, features: FeatureTask, options: SfmOptions, first: Mapper, report: ReportProgress
-) -> tuple[Model, tuple[str, ...]]:
+def _mapped(work: Path, features: FeatureTask, first: Mapper, report: ReportProgress) -> tuple[Model, tuple[str, ...]]:
     """Return the model, and lines about what was done for it.
 
     Where it is not good, features that disagree with most of their images are left out, and the better one is kept.
     ``first`` is the mapping that is tried first.
-
-    Raises:
-        DyngsError: none could be found.
     """
-    count = len(features.names)
+    options, count = features.options, len(features.names)
     task = MappingTask(
         features.database, features.images, work / "models", count, features.side, options.seed, report, first,
     )  # fmt: skip
@@ -291,23 +229,19 @@ def _mapped(
             raise DyngsError(_TURNING)
         raise DyngsError(
             f"no poses could be found for {count} images: take sharper ones that overlap by two thirds, move "
-            "the camera sideways rather than only turning it, avoid bare or moving surfaces, or try matching=exhaustive"
+            "the camera sideways, do not only rotate it, avoid bare or moving surfaces, or try matching=exhaustive"
         )
     return model, notes
 
 
 _TURNING = (
-    "the images differ only as if the camera turned on the spot (or all show one flat surface), which gives no "
+    "the images differ only as if the camera rotated on the spot (or all show one flat surface), which gives no "
     "depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
 )
 
 
 def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
-    """Return a line where the camera hardly moved, or where matches may be of something that moves; else none.
-
-    Raises:
-        DyngsError: it only turned. Mapping would not notice: it finds a lens and points that fit.
-    """
+    """Return a line where the camera hardly moved, or where matches may be of something that moves; else none."""
     found = parallax_of(matched_pairs(task.database), task.side)
     if found.kind is Parallax.NONE:
         raise DyngsError(_TURNING)
@@ -326,11 +260,7 @@ def _parallax_seen(task: FeatureTask, is_video: bool) -> tuple[str, ...]:
 
 
 def _require_depth(model: Model, database: Path, is_video: bool) -> None:
-    """Check that points are seen from directions that differ, by a lens that there can be.
-
-    Raises:
-        DyngsError: the camera turned without moving, or moved too little; or no lens fits.
-    """
+    """Check that points are seen from directions that differ, by a lens that there can be."""
     if not model.has_real_lens:
         raise DyngsError(
             "no lens that there can be fits the matches: most of them are probably on something that moves, as a "
@@ -368,9 +298,6 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
     """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
 
     Two passes, so that only one image is held in memory: the first one measures. Frames of a stopped run are kept.
-
-    Raises:
-        DyngsError: nothing moves.
     """
     images, done = capture / "images", capture.parent / "frames.json"
     if not done.is_file():
@@ -387,7 +314,7 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
             done, json.dumps({key: list(names) for key, names in fields.items()} | {"notes": [choice.summary()]})
         )
     stored = {key: tuple(map(str, cast("list[object]", value))) for key, value in read_json_object(done).items()}
-    photos = [Photo(name, read_header(images / name)) for name in stored["names"]]
+    photos = [Photo(name, read_header(images / name), name) for name in stored["names"]]
     return _Images(photos, True, stored["blurred"], stored["notes"])
 
 

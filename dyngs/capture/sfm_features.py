@@ -1,4 +1,4 @@
-"""Features and matches of images, in COLMAP's database; what a stopped run found is kept."""
+"""Features and matches of images in COLMAP's database, and which images are compared; a stopped run goes on."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.photos import Photo
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress
 from dyngs.files.write import write_text
 
 if TYPE_CHECKING:
     import pycolmap
+
 
 _AT_ONCE, _MATCHING_CALLS = 8, 16
 _SMALL_PX = 1000
@@ -34,12 +36,9 @@ class FeatureTask:
         images: folder of upright images.
         names: of the images in it, in order.
         photos: the same ones, with their tags.
+        options: effort, seed, threads.
         masks: folder of masks ``NAME.png``, white = keep; None without.
-        camera_model: COLMAP's name of the lens.
         single_camera: all images share a lens.
-        max_features: per image.
-        longest_side: images are shrunk to this for finding features.
-        seed, num_threads: as in ``SfmOptions``.
         enough: features of an image, on average over three of them, above which weak ones are left out; 0 = never.
     """
 
@@ -47,13 +46,9 @@ class FeatureTask:
     images: Path
     names: Sequence[str]
     photos: Sequence[Photo]
-    masks: Path | None
-    camera_model: str
-    single_camera: bool
-    max_features: int
-    longest_side: int
-    seed: int
-    num_threads: int
+    options: SfmOptions
+    masks: Path | None = None
+    single_camera: bool = True
     enough: int = 0
 
     @property
@@ -94,7 +89,7 @@ def _reader(task: FeatureTask) -> tuple[pycolmap.ImageReaderOptions, pycolmap.Ca
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = task.camera_model
+    reader.camera_model = task.options.camera_model
     if task.masks is not None:
         reader.mask_path = task.masks
     return reader, pycolmap.CameraMode.SINGLE if task.single_camera else pycolmap.CameraMode.PER_IMAGE
@@ -106,11 +101,11 @@ def _extract(task: FeatureTask, database: Path, names: Sequence[str], stronger: 
 
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.use_gpu = False
-    extraction.num_threads = task.num_threads or -1
-    extraction.max_image_size = task.longest_side
-    extraction.sift.max_num_features = task.max_features
+    extraction.num_threads = task.options.num_threads or -1
+    extraction.max_image_size = task.options.longest_side
+    extraction.sift.max_num_features = task.options.max_features
     extraction.sift.peak_threshold = stronger * _PEAK
-    extraction.sift.first_octave = -1 if min(task.side, task.longest_side) <= _SMALL_PX else 0
+    extraction.sift.first_octave = -1 if min(task.side, task.options.longest_side) <= _SMALL_PX else 0
     reader, mode = _reader(task)
     pycolmap.extract_features(
         database, task.images, names, camera_mode=mode, reader_options=reader,
@@ -141,9 +136,9 @@ def match_pairs(task: FeatureTask, pairs: Sequence[tuple[int, int]], report: Rep
 
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
-    matching.num_threads = task.num_threads or -1
+    matching.num_threads = task.options.num_threads or -1
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = task.seed
+    verification.ransac.random_seed = task.options.seed
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = task.database.with_name("pairs.txt")
     ordered = sorted(set(pairs))  # of few images at a time: COLMAP prepares each one anew in every call
@@ -195,3 +190,82 @@ def _enter_focal_lengths(task: FeatureTask) -> None:
                 params[list(camera.focal_length_idxs())] = focal
                 camera.params = params
             opened.update_camera(camera)
+
+
+STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+"""Distances in the order of names at which images are compared: dense near, sparse far (loops of a few seconds)."""
+ALIKE = 6
+"""Images that look most alike, compared with each one beside its neighbours; of photos ``ALIKE_PHOTOS``."""
+ALIKE_PHOTOS = 24
+_WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
+
+
+def all_pairs(count: int) -> list[tuple[int, int]]:
+    """Return all pairs of ``count`` images, the first one smaller."""
+    return [(i, j) for i in range(count) for j in range(i + 1, count)]
+
+
+def neighbour_pairs(count: int, overlap: int | None = None) -> list[tuple[int, int]]:
+    """Return pairs at the distances ``STEPS``, or at all distances up to ``overlap``."""
+    steps = STEPS if overlap is None else range(1, overlap + 1)
+    return [(i, i + step) for step in steps for i in range(count - step)]
+
+
+def alike_pairs(database: Path, names: Sequence[str], each: int) -> list[tuple[int, int]]:
+    """Return pairs of each image with the ``each`` others that look most alike by their features.
+
+    An image is described by its SIFT descriptors, counted by which of 64 typical ones is nearest (found by k-means
+    among these images), as sums of differences from it (VLAD: Jegou et al. 2010, "Aggregating local descriptors into
+    a compact image representation"). Nothing random is left to chance: the same features give the same pairs.
+
+    Args:
+        database: COLMAP's, with features of all images.
+        names: of the images, as in the database.
+        each: pairs for every image.
+    """
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        found = [np.asarray(opened.read_descriptors(ids[name]).data) for name in names]
+    described = _described([descriptors.astype(np.float32) for descriptors in found])
+    alike = described @ described.T
+    np.fill_diagonal(alike, -np.inf)
+    pairs = set()
+    for i, row in enumerate(alike):
+        for j in np.argsort(-row, kind="stable")[:each].tolist():
+            if np.isfinite(row[j]):
+                pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
+
+
+def _described(descriptors: list[np.ndarray]) -> np.ndarray:
+    """Return (N, D) unit vectors, zero for images without features."""
+    full = np.concatenate([*descriptors, np.zeros((0, 128), np.float32)])
+    if len(full) == 0:
+        return np.zeros((len(descriptors), 1), np.float32)
+    words = _typical(full[:: max(len(full) // _SAMPLE, 1)])
+    vectors = np.zeros((len(descriptors), *words.shape), np.float32)
+    for place, own in enumerate(descriptors):
+        if len(own):
+            nearest = _nearest(own, words)
+            np.add.at(vectors[place], nearest, own - words[nearest])
+    vectors /= np.linalg.norm(vectors, axis=2, keepdims=True) + 1e-6
+    flat = vectors.reshape(len(vectors), -1)
+    return flat / (np.linalg.norm(flat, axis=1, keepdims=True) + 1e-6)
+
+
+def _typical(sample: np.ndarray) -> np.ndarray:
+    """Return centres of clusters by k-means from evenly spaced ones."""
+    words = sample[np.linspace(0, len(sample) - 1, min(_WORDS, len(sample))).astype(int)]
+    for _ in range(_ROUNDS):
+        nearest = _nearest(sample, words)
+        sums = np.zeros_like(words)
+        np.add.at(sums, nearest, sample)
+        counts = np.bincount(nearest, minlength=len(words))[:, None]
+        words = np.where(counts > 0, sums / np.maximum(counts, 1), words).astype(np.float32)
+    return words
+
+
+def _nearest(rows: np.ndarray, words: np.ndarray) -> np.ndarray:
+    return ((words**2).sum(1) - 2 * rows @ words.T).argmin(1)

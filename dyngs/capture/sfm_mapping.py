@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dyngs.capture.sfm_check import agreement
+from dyngs.capture.sfm_matches import agreement
 from dyngs.conventions import ReportProgress
 
 if TYPE_CHECKING:
@@ -34,13 +34,11 @@ class Model:
     Attributes:
         reconstruction: poses, cameras, points.
         mapper: what found it.
-        num_models: models it found: more than one if images fall into groups without connection.
         agreeing: fraction of the matched pairs whose matches fit the poses.
     """
 
     reconstruction: pycolmap.Reconstruction
     mapper: Mapper
-    num_models: int
     agreeing: float
 
     @property
@@ -92,7 +90,7 @@ class MappingTask:
 def mapped(task: MappingTask, wanted: Literal["auto", "global", "incremental"]) -> Model | None:
     """Return the model with most images; None where none could be found.
 
-    "auto" is ``task.first``, and the other mapping beside it only where the first leaves images out, its poses do
+    "auto" is ``task.first``, and the other mapping next to it only where the first leaves images out, its poses do
     not fit the matches of all pairs, or its mean reprojection error is large: see ``better``.
     """
     if wanted != "auto":
@@ -142,7 +140,7 @@ def _found(task: MappingTask, mapper: Mapper) -> Model | None:
     if best is None or best.num_reg_images() < 2:
         return None
     task.report("poses, images", best.num_reg_images(), task.count)
-    return Model(best, mapper, len(models), agreement(best, task.database, task.longest_side))
+    return Model(best, mapper, agreement(best, task.database, task.longest_side))
 
 
 def _global(task: MappingTask, folder: Path) -> dict[int, pycolmap.Reconstruction]:

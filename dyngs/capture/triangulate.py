@@ -1,6 +1,6 @@
 """Sparse points for a capture that has poses but no points, by pycolmap's triangulation on the CPU.
 
-From the images of one moment, or of one moving camera over the whole clip: there, what moves violates the poses.
+From the images of one time step, or of one moving camera over the full clip: there, what moves violates the poses.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from dyngs.capture.sfm_work import ColmapError, quiet_colmap
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
-from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.geometry.frusta import points_in_frusta
-from dyngs.data.geometry.projection import projected
+from dyngs.data.geometry import projected
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.errors import DyngsError
+from dyngs.data.scene_space import points_in_frusta
+from dyngs.data.times import evenly_spaced
 from dyngs.files.write import write_image
 
 if TYPE_CHECKING:
@@ -52,16 +52,16 @@ _PROBES = 4000
 """Random points by which the overlap of images is judged."""
 
 
-def views_of_a_moment(views: Sequence[View], limit: int) -> list[View]:
-    """Return at most ``limit`` views of one moment, evenly spaced; of the moments with most views, the middle one.
+def views_of_a_time_step(views: Sequence[View], limit: int) -> list[View]:
+    """Return at most ``limit`` views of one time step, evenly spaced; of those with most views, the middle.
 
-    Without times all views show the same moment.
+    Without times all views show the same time step.
     """
     shown = Counter(view.time for view in views)
     most = max(shown.values(), default=0)
-    moments = [time for time in shown if shown[time] == most]
-    of_moment = [view for view in views if moments and view.time == moments[len(moments) // 2]]
-    return [of_moment[i] for i in evenly_spaced(len(of_moment), limit)]
+    steps = [time for time in shown if shown[time] == most]
+    of_step = [view for view in views if steps and view.time == steps[len(steps) // 2]]
+    return [of_step[i] for i in evenly_spaced(len(of_step), limit)]
 
 
 def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:
@@ -71,11 +71,8 @@ def triangulated_points(views: Sequence[View], options: DataConfig) -> PointClou
     poses. One thread, so that the same images give the same points.
 
     Args:
-        views: of one moment, with poses.
+        views: of one time step, with poses.
         options: of the capture; its image sizes do not matter here.
-
-    Raises:
-        DyngsError: images that cannot be read.
     """
     return _points_of(views, options, None)
 
@@ -89,9 +86,6 @@ def points_over_clip(views: Sequence[View], options: DataConfig) -> PointCloud |
     Args:
         views: with times and poses.
         options: of the capture; its image sizes do not matter here.
-
-    Raises:
-        DyngsError: images that cannot be read.
     """
     in_order = sorted(views, key=lambda view: (view.time or 0.0, view.name))
     chosen = [in_order[i] for i in evenly_spaced(len(in_order), CLIP_IMAGES)]
@@ -122,21 +116,13 @@ def _points_of(
 ) -> PointCloud | None:
     if len({view.cam_from_world.tobytes() for view in views}) < MIN_IMAGES:
         return None
-    import pycolmap
-
     full_size = options.model_copy(update={"downscale": 1.0, "longest_side": LONGEST_SIDE, "cache_mb": 0.0})
     images = ImageLoader(views, full_size)
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
-    pycolmap.set_random_seed(0)
     try:
-        with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder:
+        with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder, quiet_colmap(0):
             return _triangulated(Path(folder), [images[i] for i in range(len(images))], pairs)
-    except (RuntimeError, ValueError, OSError) as error:
-        if isinstance(error, DyngsError):
-            raise
+    except (ColmapError, OSError):
         return None
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 def _triangulated(folder: Path, images: Sequence[Image], pairs: Sequence[tuple[int, int]] | None) -> PointCloud | None:

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dyngs.capture.multi_video.estimate import VideosOptions, poses_of_videos
-from dyngs.capture.multi_video.films import videos_in
-from dyngs.capture.multi_video.given import NAME as VIDEOS_FILE
+from dyngs.capture.multi_video.films import VIDEOS_FILE, videos_in
 from dyngs.capture.photos import digest_of, photos_below
 from dyngs.capture.sfm import SfmOptions, estimate_poses
 from dyngs.config import DataConfig
@@ -31,13 +30,11 @@ def with_poses(
     """Return the options with a capture that has poses as their folder: the given one, unless it has none.
 
     Photos and videos without poses go through structure from motion once; the same ones are found in the user's cache
-    from then on. Of a folder that holds ``images``, those are the photos: masks and maps beside them are not.
+    from then on. Of a folder that holds ``images``, those are the photos: masks and maps next to them are not.
 
     Args:
         data: its ``root`` is a capture of any format, a folder of photos, or a video.
         needs_times: something is to move, so photos must have an order.
-        say: is told in a line what will be done, and what came out.
-        report: is told how far structure from motion has come.
 
     Raises:
         DyngsError: photos without times where they are needed, several videos where nothing is to move, or poses that

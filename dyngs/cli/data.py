@@ -209,7 +209,7 @@ def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int
     if arguments.frames is not None and arguments.frames < 2:
         raise DyngsError("--frames must be at least 2")
     options = VideosOptions(
-        num_moments=arguments.frames,
+        num_steps=arguments.frames,
         starts=_starts(arguments.start),
         num_threads=arguments.threads,
         follow_links=limits.follow_links,

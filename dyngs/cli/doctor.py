@@ -22,7 +22,6 @@ _REQUIRED = {
     "rich": "rich",
     "pycolmap": "pycolmap",
     "trimesh": "trimesh",
-    "kornia": "kornia",
     "OpenImageIO": "OpenImageIO",
     "scikit-image": "skimage",
     "scipy": "scipy",

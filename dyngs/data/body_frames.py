@@ -1,6 +1,6 @@
-"""Body parameters of captured people, one row per frame: checks, changes of reference frame, rows of views.
+"""Body parameters of captured people, one row per frame: checks, changes of frame, fitted files.
 
-Local letters: F frames, J joints, B shape coefficients. The bodies are those of SMPL (Loper et al. 2015) and its heirs.
+Local letters: F frames, J joints, B shape coefficients. Bodies are those of SMPL (Loper et al. 2015) and its heirs.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.data.capture import BODY_KINDS, BodyFrames, Split, View
-from dyngs.errors import DyngsError
+from dyngs.data.capture import BODY_KINDS, BodyFrames, Capture, Split, Splits, View, all_views
+from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import staying_within
 from dyngs.files.fields import LARGEST, first_few, float_array, numbers_of
+from dyngs.files.numpy_files import read_npz
 
 
 def body_frames(
@@ -30,7 +32,6 @@ def body_frames(
     """Return checked body parameters, sorted by frame; arrays may have any shape with one row per frame.
 
     Args:
-        where: the file, for messages.
         frames: F distinct numbers.
         poses: F rows of 72, 156 or 165 numbers.
         trans: F rows of 3.
@@ -97,9 +98,6 @@ def moved(body: BodyFrames, offset: np.ndarray) -> BodyFrames:
 def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     """(V,) index of the row of ``body`` for each view, by frame number.
 
-    Args:
-        where: the file of the body parameters, for messages.
-
     Raises:
         DyngsError: a view without a frame number, or whose frame has no parameters.
     """
@@ -151,3 +149,49 @@ def _mean_row(where: Path, name: str, value: object, frames: Sequence[int]) -> n
     if array is not None and array.ndim > 1 and len(array) == 1:
         return numbers_of(f"{where}: '{name}'", array, None)
     return _rows(where, name, value, frames).mean(axis=0)
+
+
+def read_body_file(path: Path) -> BodyFrames:
+    """Read body parameters: poses (F, 72, 156 or 165), trans (F, 3), betas and, if there, scale and ``frames`` (F,).
+
+    Without ``frames``, row n is for frame n. ``surface_model_type`` "anny" says that betas are of the free template's
+    shape space.
+
+    Raises:
+        DyngsError: names the file and what is wrong.
+    """
+    found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames"))
+    count = len(found["poses"]) if found["poses"].ndim else 0
+    numbers = found.get("frames", np.arange(count))
+    if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or len(numbers) != count:
+        raise DyngsError(f"{path}: 'frames' must hold one whole number for each row of 'poses'; export it again")
+    frames = [int(number) for number in numbers]
+    body = body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
+    return replace(body, shape_space="anny") if str(found.get("surface_model_type")) == "anny" else body
+
+
+def with_fitted_body(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and ``body_pose.npz`` if there."""
+    if not (folder / "body_train.npz").is_file():
+        raise DyngsError(
+            f"{folder / 'body_train.npz'}: no such file (data.body); a fit that `dyngs train human` made comes back by "
+            f"training with data.root={capture.root} into another run.dir"
+        )
+    with staying_within(folder, False), reading(folder, "give a folder that `dyngs data fit` wrote"):
+        train = read_body_file(folder / "body_train.npz")
+        body: dict[Split, BodyFrames] = {"train": train, "val": train, "test": train}
+        if (folder / "body_pose.npz").is_file():
+            body["pose"] = read_body_file(folder / "body_pose.npz")
+    splits = numbered(capture.splits)
+    if "pose" in splits and "pose" not in body:
+        splits = {name: views for name, views in splits.items() if name != "pose"}
+    return capture.replace(splits=splits, body=body)
+
+
+def numbered(splits: Splits) -> Splits:
+    """Return the views with frame numbers; if any has none, all get them by the order of their times."""
+    views = all_views(splits)
+    if all(view.frame is not None for view in views):
+        return splits
+    order = {time: i for i, time in enumerate(sorted({view.time or 0.0 for view in views}))}
+    return {name: tuple(replace(view, frame=order[view.time or 0.0]) for view in own) for name, own in splits.items()}

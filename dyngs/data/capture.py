@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -195,3 +195,22 @@ class Capture:
     def replace(self, **changes: object) -> Capture:
         """Return the capture with other attributes."""
         return replace(self, **changes)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class CaptureFormat:
+    """A capture format: how a folder of this format is recognised and read.
+
+    Attributes:
+        name: as in ``data.format`` and ``Capture.format``.
+        files: the files by which it is recognised, for messages.
+        recognise: whether a folder holds these files; opens none of them.
+        read: reads the folder; ``dyngs.data.read`` then finishes splits and times.
+        extends: name of the format of which this one is a special case: its folders are recognised as that one, too.
+    """
+
+    name: str
+    files: str
+    recognise: Callable[[Path], bool]
+    read: Callable[[Path], Capture]
+    extends: str | None = None

@@ -13,12 +13,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
-from dyngs.data.ahead import Ahead
 from dyngs.data.capture import View
-from dyngs.data.decoded import Decoded
-from dyngs.data.geometry.intrinsics import scaled_intrinsics
-from dyngs.data.images.depth import read_depth, read_labels
-from dyngs.data.images.flow import read_flow
+from dyngs.data.decoding import Ahead, Decoded
+from dyngs.data.geometry import scaled_intrinsics
 from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,
@@ -30,8 +27,16 @@ from dyngs.data.images.images import (
     target_size,
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
-from dyngs.data.images.resampling import flow_at, nearest_positions, resized, taken_at
-from dyngs.data.images.silhouettes import cut_out
+from dyngs.data.images.maps import (
+    cut_out,
+    flow_at,
+    nearest_positions,
+    read_depth,
+    read_flow,
+    read_labels,
+    resized,
+    taken_at,
+)
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
 from dyngs.ops.device import CPU, gpu_memory
@@ -97,7 +102,7 @@ class Image:
         return self.rgb_premultiplied.nbytes + sum(x.nbytes for x in self._maps().values() if x is not None)
 
     def _maps(self) -> dict[str, Tensor | None]:
-        """Return everything per pixel beside the colours, by name."""
+        """Return everything per pixel next to the colours, by name."""
         return {name: getattr(self, name) for name in ("alpha", "mask", "moves", "depth", "flow")}
 
     def shrunk(self, factor: int) -> Image:
@@ -127,7 +132,7 @@ class Image:
 class ImageLoader:
     """A sequence of images, decoded on demand or ahead of it; the first ones are cached up to ``options.cache_mb``.
 
-    Once the cache is full, what is in it stays: where every image is asked for once per epoch, in a new order each
+    Once the cache is full, what is in it stays: where every image is requested once per epoch, in a new order each
     time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
     ahead or not. Safe to use from several threads. Images are decoded on the CPU. Those given out on a GPU are kept
     there as far as a quarter of its free memory goes; the others are copied beside its work.
@@ -152,9 +157,6 @@ class ImageLoader:
             options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count; None: the defaults.
             with_maps: read depth maps and flow, too, where views have them.
             decoding_threads: decode what is to be expected in so many threads; 0, or ``cache_mb`` 0: in none.
-
-        Raises:
-            DyngsError: missing images (count and first), damaged ones, or a size that is not the view's.
         """
         self._views = tuple(views)
         self._options = options = options or DataConfig(root=Path())
@@ -202,11 +204,7 @@ class ImageLoader:
         return self._views
 
     def __getitem__(self, index: int) -> Image:
-        """Return the image of view ``index``.
-
-        Raises:
-            DyngsError: the file turns out to be truncated, or its mask has another size.
-        """
+        """Return the image of view ``index``."""
         return self._with_camera(index, self._as_stored(index))
 
     def _with_camera(self, index: int, image: Image) -> Image:
@@ -260,7 +258,7 @@ class ImageLoader:
         return self._with_camera(index, image)
 
     def expect(self, indices: Sequence[int]) -> None:
-        """Begin to decode the images that are asked for next, in this order, as far as they are not cached."""
+        """Begin to decode the images that are requested next, in this order, as far as they are not cached."""
         with self._lock:
             wanted = [i for i in indices if i not in self._kept and not (self._small_by > 1 and i in self._small)]
         self._ahead.expect(wanted)
@@ -370,7 +368,7 @@ class ImageLoader:
     def _has_room(self, size: int) -> bool:
         """Return whether an image of ``size`` bytes is to be kept where it is given out.
 
-        While images are shrunk, only where small and large ones fit together: the small ones are what is asked for.
+        While images are shrunk, only where small and large ones fit together: the small ones are what is requested.
         """
         left = len(self._views) - len(self._kept) - 1
         if self._small_by > 1 and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > self._room:
@@ -446,11 +444,7 @@ def _camera_of(view: View, width: int, height: int) -> Cameras:
 
 
 def check_files(views: Sequence[View]) -> None:
-    """Check that all images and masks of ``views`` exist, look complete and have the size of their view.
-
-    Raises:
-        DyngsError: a file is missing (says how many, and the first), damaged or of another size.
-    """
+    """Check that all images and masks of ``views`` exist, look complete and have the size of their view."""
     silhouettes = [view.silhouette.path for view in views if view.silhouette]
     paths = [path for view in views for path in (view.image_path, view.mask_path) if path is not None] + silhouettes
     missing = [path for path in paths if not path.is_file()]

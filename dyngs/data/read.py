@@ -9,33 +9,30 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.config import DataConfig
-from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View, all_views
-from dyngs.data.fitted_body import with_fitted_body
-from dyngs.data.frame_selection import hold_out_frames, select_frames, split_by_camera
-from dyngs.data.geometry.recenter import recenter
+from dyngs.data.body_frames import with_fitted_body
+from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View, all_views
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
-from dyngs.data.name_order import times_by_name
-from dyngs.data.prior_files import present_priors
 from dyngs.data.readers import (
     blender,
-    body_json,
     camera_folders,
     colmap,
-    llff,
     nerfies,
-    nerfstudio,
     neuman,
     people_snapshot,
     zju_mocap,
 )
-from dyngs.data.readers.shared.capture_format import CaptureFormat
+from dyngs.data.scene_space import recenter
 from dyngs.data.times import (
     clip_seconds,
+    hold_out_frames,
+    select_frames,
     sequence_warnings,
     span_in_files,
+    split_by_camera,
     still_if_constant,
+    times_by_name,
     times_of_frames,
     unit_times,
 )
@@ -46,17 +43,20 @@ from dyngs.files.wrong_place import command_for
 FARTHEST = 1e18
 """Points with larger coordinates are dropped as mistakes; their squares would not fit into float32."""
 
+_PRIORS = {"depth_path": "depth maps", "motion_mask_path": "motion masks", "flow_path": "flow fields"}
+"""Files of priors that a capture may name, none of them required: fields of views, and what they are called."""
+
 FORMATS: tuple[CaptureFormat, ...] = (
-    body_json.FORMAT,
+    blender.BODY_FORMAT,
     zju_mocap.FORMAT,
     people_snapshot.FORMAT,
     neuman.FORMAT,
     blender.FORMAT,
-    nerfstudio.FORMAT,
+    blender.NERFSTUDIO_FORMAT,
     colmap.FORMAT,
     nerfies.FORMAT,
     camera_folders.FORMAT,
-    llff.FORMAT,
+    camera_folders.LLFF_FORMAT,
 )
 """All formats, in the order in which a folder is tried: of several that are recognised the first one is read."""
 
@@ -175,7 +175,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         splits = {name: _wide(views) for name, views in splits.items()}
     for view in all_views(splits):
         _check_places(view)
-    splits, tracks, absent = present_priors(splits, capture.tracks_path)
+    splits, tracks, absent = _present_priors(splits, capture.tracks_path)
     if decode_videos:
         frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
@@ -279,3 +279,21 @@ def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[s
     notes = [f"{lost} points hold NaN, infinite or far too large numbers and are ignored"] if lost else []
     points = PointCloud(points.xyz[keep], points.rgb[keep])
     return (points if len(points.xyz) else None), notes
+
+
+def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path | None, list[str]]:
+    """Return the splits and the tracks without priors whose files are missing, and a line for each kind of those."""
+    notes: list[str] = []
+    for field, kind in _PRIORS.items():
+        paths = [path for view in all_views(splits) if (path := getattr(view, field)) is not None]
+        missing = {path for path in paths if not path.is_file()}
+        if not missing:
+            continue
+        notes.append(f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}")
+        splits = {
+            name: tuple(replace(v, **{field: None}) if getattr(v, field) in missing else v for v in views)
+            for name, views in splits.items()
+        }
+    if tracks is not None and not inside(tracks).is_file():
+        return splits, None, [*notes, f"the tracks {tracks} are missing and are not used"]
+    return splits, tracks, notes

@@ -1,31 +1,147 @@
-"""Times of views: checked, scaled to [0, 1], compared between cameras. Their order in the files does not matter."""
+"""Times of views: where they are from, their scale of [0, 1], which are selected, and who sees what when.
+
+Times are from the fields of a capture, ``times.json``, frame numbers, or names. Their order in files does not matter.
+"""
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Splits, View, all_views
-from dyngs.data.geometry.poses import inverse_rigid
-from dyngs.errors import DyngsError
+from dyngs.data.capture import Split, Splits, View, all_views
+from dyngs.data.geometry import inverse_rigid
+from dyngs.errors import DyngsError, printable
 from dyngs.files.fields import is_number
+from dyngs.files.json_files import read_json_object
+from dyngs.files.write import write_text
 
+SECONDS_FILE = "times.json"
+"""Seconds of the images of a capture, beside them: COLMAP's models have no times."""
 SAME_TIME = 1e-6
 """Times closer than this are the same time: files of one capture are often rounded differently."""
 MENTIONED_CHANGE = 0.05
 """Times that are scaled by less than this are not mentioned: the last of n times is often written as (n - 1) / n."""
-_MAX_NAMED = 5
-_EVEN = 1.1
-"""Longest over shortest gap of evenly spaced times, with allowance for rounding in the files."""
 SCATTERED = 0.5
 """Distance between cameras that follow each other in time, in medians of the distance of any two, from which time and
 viewpoint have nothing to do with each other."""
+MOST_STEPS, MOST_IMAGES, FEWEST_STEPS = 300, 4000, 2
+"""Time steps of several videos (those of the usual clips of ten seconds) and images of all together, at most, unless a
+number is given; and time steps at least."""
+SAME_STEP = 0.2
+"""Frames within this fraction of a frame's duration of a time step count as taken at it."""
+_MAX_NAMED = 5
+_EVEN = 1.1
+"""Longest over shortest gap of evenly spaced times, with allowance for rounding in the files."""
+_DIGITS = re.compile(r"(\d+)")
+
+
+def evenly_spaced(length: int, count: int) -> list[int]:
+    """Return at most ``count`` indices below ``length``, evenly spaced."""
+    count = min(count, length)
+    return [i * length // count for i in range(count)]
+
+
+# Where times are from
+
+
+def write_seconds(root: Path, seconds: Mapping[str, float]) -> None:
+    """Write the second of each image, by its path below ``root/images``."""
+    write_text(root / SECONDS_FILE, json.dumps({"seconds": dict(seconds)}, indent=1) + "\n")
+
+
+def read_seconds(root: Path) -> dict[str, float]:
+    """Read the second of each image, by its path below ``root/images``; empty without the file."""
+    path = root / SECONDS_FILE
+    if not path.is_file():
+        return {}
+    seconds = read_json_object(path).get("seconds")
+    if not isinstance(seconds, dict):
+        raise DyngsError(f"{path}: needs an object 'seconds' of image names and seconds; see docs/formats.md")
+    for name, second in seconds.items():
+        if not is_number(second):
+            raise DyngsError(f"{path}: the second of {name:.60} must be a number, got {second!r:.40}")
+    return {str(name): float(second) for name, second in seconds.items()}
+
+
+def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
+    """Return the views with times by their names, and a line that says how.
+
+    Where the name of every image ends in a number, and no two of a folder in the same, that number is the time: frames
+    that are missing leave gaps. Otherwise times are positions in the order of the names, numbers in them read as
+    numbers. Each folder is a camera; the same numbers, or positions, in another one are the same times.
+
+    Args:
+        splits: views; times that they have are replaced.
+        per_second: numbers, or positions, in a second: times become seconds; None leaves them as they are.
+
+    Raises:
+        DyngsError: fewer than two images, or folders with different numbers of images and names without numbers.
+    """
+    views = all_views(splits)
+    if len(views) < 2:
+        raise DyngsError(f"{root}: data.times=order needs two images or more, there is {len(views)}")
+    folders: dict[Path, list[View]] = defaultdict(list)
+    for view in views:
+        folders[view.image_path.parent].append(view)
+    numbers = {view.name: re.search(r"\d{1,15}$", view.image_path.stem) for view in views}
+    known = {name: float(found[0]) for name, found in numbers.items() if found}
+    if all(len({known.get(view.name) for view in seen} - {None}) == len(seen) for seen in folders.values()):
+        times = known
+        line = f"times are the numbers in the names of the images, from {min(times.values()):g} to "
+        line += f"{max(times.values()):g} (data.times=order"
+    else:
+        lengths = {len(seen) for seen in folders.values()}
+        if len(lengths) > 1:
+            counts = f"{min(lengths)} to {max(lengths)}"
+            raise DyngsError(
+                f"{root}: data.times=order: folders hold {counts} images; end the names in the numbers of the frames"
+            )
+        orders = [sorted(seen, key=lambda view: natural_order(view.image_path.name)) for seen in folders.values()]
+        times = {view.name: float(position) for order in orders for position, view in enumerate(order)}
+        line = f"times are the order of the names, {orders[0][0].name} first (data.times=order"
+    if per_second is not None:
+        length = (max(times.values()) - min(times.values())) / per_second
+        line += f" at {per_second:g} per second: {length:.4g} s"
+    timed: Splits = {
+        split: tuple(replace(view, time=times[view.name] / (per_second or 1.0)) for view in kept)
+        for split, kept in splits.items()
+    }
+    return timed, line + ")"
+
+
+def natural_order(name: str) -> list[tuple[int, int, str]]:
+    """Return a key by which 9 sorts before 10."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in _DIGITS.split(name) if part]
+
+
+def times_of_frames(splits: Splits) -> Splits:
+    """Return the splits with times by frame number where no view has a time and all have a frame, of several.
+
+    The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its own.
+    """
+    timed: Splits = dict(splits)
+    clips: list[list[Split]] = [[], []]
+    for name in splits:
+        clips[name == "pose"].append(name)
+    for clip in clips:
+        views = [view for name in clip for view in splits[name]]
+        frames = {view.frame for view in views if view.frame is not None and view.time is None}
+        if len(frames) > 1 and all(view.frame is not None and view.time is None for view in views):
+            first, span = min(frames), max(frames) - min(frames)
+            for name in clip:
+                timed[name] = tuple(replace(v, time=((v.frame or 0) - first) / span) for v in splits[name])
+    return timed
+
+
+# On the scale of [0, 1]
 
 
 def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
@@ -34,7 +150,6 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     Times that are all equal are left as they are, see ``still_if_constant``.
 
     Args:
-        root: the capture, for messages.
         splits: views with times as in the files, or all without.
         stretch: scale times that lie within [0, 1], too; otherwise only those that do not.
 
@@ -64,26 +179,17 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
 
 
-def times_of_frames(splits: Splits) -> Splits:
-    """Return the splits with times by frame number where no view has a time and all have a frame, of several.
-
-    The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its own.
-    """
-    clips = {name: "pose" if name == "pose" else "train" for name in splits}
-    whole: defaultdict[str, list[View]] = defaultdict(list)
-    for name, views in splits.items():
-        whole[clips[name]] += views
-    spans: dict[str, tuple[int, int]] = {}
-    for clip, views in whole.items():
-        frames = {view.frame for view in views if view.frame is not None and view.time is None}
-        if len(frames) > 1 and all(view.frame is not None and view.time is None for view in views):
-            spans[clip] = (min(frames), max(frames) - min(frames))
-    timed: Splits = dict(splits)
-    for name, views in splits.items():
-        if clips[name] in spans:
-            first, span = spans[clips[name]]
-            timed[name] = tuple(replace(view, time=((view.frame or 0) - first) / span) for view in views)
-    return timed
+def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
+    """Return the splits without times, and a warning, if all of several images have the same time."""
+    views = all_views(splits)
+    times = {view.time for view in views}
+    if len(times) != 1 or times == {None}:
+        return splits, []
+    only, lines = times.pop() or 0.0, []
+    time = only if 0 <= only <= 1 else 0.0
+    if len(views) > 1:
+        time, lines = None, [f"all images have time {only:g}: treated as a static scene"]
+    return {name: tuple(replace(view, time=time) for view in kept) for name, kept in splits.items()}, lines
 
 
 def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
@@ -115,23 +221,6 @@ def clip_seconds(splits: Splits, fps: float | None) -> float | None:
     return steps / fps if steps else None
 
 
-def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the splits without times, and a warning, if all of several images have the same time."""
-    times = {view.time for view in all_views(splits)}
-    if len(times) != 1 or times == {None}:
-        return splits, []
-    time = times.pop() or 0.0
-    if len(all_views(splits)) == 1:
-        return _with_time(splits, time if 0 <= time <= 1 else 0.0), []
-    return _with_time(splits, None), [f"all images have time {time:g}: treated as a static scene"]
-
-
-def sequence_warnings(splits: Splits) -> list[str]:
-    """Warn of images with the same camera, pose and time, and of cameras with different numbers of frames."""
-    views = [view for view in all_views(splits) if view.time is not None]
-    return [*_repeated(views), *_frame_counts(views)]
-
-
 def distinct_times(views: Iterable[View]) -> dict[float, float]:
     """Map every time of the views to the first of those that count as the same time."""
     distinct: dict[float, float] = {}
@@ -142,6 +231,116 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
         distinct[time] = first
         before = time
     return distinct
+
+
+# Selection: data.frames, data.pose_frames, data.train_cameras
+
+
+def parse_frames(text: str, key: str = "data.frames") -> slice:
+    """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at ``key``.
+
+    Raises:
+        DyngsError: anything else, or a step of 0.
+    """
+    shown = printable(repr(text), 60)
+    if not re.fullmatch(r"\s*([-+]?\d+)?\s*:\s*([-+]?\d+)?\s*(:\s*([-+]?\d+)?\s*)?", text, re.ASCII):
+        raise DyngsError(f"{key}={shown}: write start:stop or start:stop:step in whole numbers, such as 0:100:2")
+    numbers = [int(part) if part.strip() else None for part in text.split(":")]
+    if len(numbers) == 3 and numbers[2] == 0:
+        raise DyngsError(f"{key}={shown}: the step must not be 0")
+    return slice(*numbers)
+
+
+def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
+    """Return the views at the times that the slice ``frames`` selects from the sorted distinct times of all splits.
+
+    The first selected time becomes 0 and the last one 1; a single one becomes 0.
+
+    Args:
+        splits: views with times in [0, 1], or all without.
+        frames: see ``parse_frames``.
+
+    Raises:
+        DyngsError: a bad slice, one that selects no time or no training view, or views without times.
+    """
+    distinct, picked = _picked_times(root, splits, frames, "data.frames")
+    selected = _at_times(splits, distinct, picked)
+    if splits.get("train") and not selected["train"]:
+        raise DyngsError(
+            f"{root}: data.frames={frames} picks {len(picked)} of {len(set(distinct.values()))} times, none of them "
+            "with training views"
+        )
+    return selected
+
+
+def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tuple[View, ...]]:
+    """Return the splits without the times that the slice ``frames`` selects, and the views at these times.
+
+    Where some cameras only have test views, the second are those of these cameras; otherwise those of all splits. Times
+    of both parts are scaled to [0, 1], as two clips. Arguments as ``select_frames``.
+
+    Raises:
+        DyngsError: a bad slice, one that selects no time or all times with training views, or views without times.
+    """
+    distinct, picked = _picked_times(root, splits, frames, "data.pose_frames")
+    kept = _at_times(splits, distinct, sorted(set(distinct.values()) - set(picked)))
+    if not kept["train"]:
+        raise DyngsError(f"{root}: data.pose_frames={frames} leaves no training views; hold out fewer frames")
+    trained = {view.camera_id for view in splits["train"]}
+    others = {view.camera_id for view in splits.get("test", ())} - trained
+    held = all_views(_at_times(splits, distinct, picked))
+    return kept, tuple(view for view in held if not others or view.camera_id in others)
+
+
+def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Splits:
+    """Return the views of the splits anew: those of ``cameras`` for training, those of all others for testing.
+
+    Raises:
+        DyngsError: a camera that has no images, or no other camera.
+    """
+    views = all_views(splits)
+    known = sorted({view.camera_id for view in views})
+    unknown = sorted(set(cameras) - set(known))
+    shown = ", ".join(map(str, cameras))
+    if unknown:
+        raise DyngsError(
+            f"{root}: data.train_cameras=[{shown}]: no camera {unknown[0]}; there are {len(known)}, from {known[0]} to "
+            f"{known[-1]}"
+        )
+    if set(known) == set(cameras):
+        raise DyngsError(f"{root}: data.train_cameras=[{shown}] are all cameras of the capture; leave one for testing")
+    return {
+        "train": tuple(view for view in views if view.camera_id in cameras),
+        "test": tuple(view for view in views if view.camera_id not in cameras),
+    }
+
+
+def _picked_times(root: Path, splits: Splits, frames: str, key: str) -> tuple[dict[float, float], list[float]]:
+    """Return the distinct time of each time of the views, and those of them that the slice ``frames`` selects."""
+    part = parse_frames(frames, key)
+    views = all_views(splits)
+    if any(view.time is None for view in views):
+        raise DyngsError(f"{root}: {key}={frames} picks times, but the capture has none; remove {key}")
+    distinct = distinct_times(views)
+    times = sorted(set(distinct.values()))
+    picked = sorted(times[part])
+    if not picked:
+        raise DyngsError(f"{root}: {key}={frames} picks none of the capture's {len(times)} times")
+    return distinct, picked
+
+
+def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[float]) -> Splits:
+    """Return the views at the ``picked`` times, ascending, of which the first becomes 0 and the last one 1."""
+    span = picked[-1] - picked[0] if picked else 0.0
+    new = {time: (time - picked[0]) / span if span else 0.0 for time in picked}
+    unit = {written: new[time] for written, time in distinct.items() if time in new}
+    return {
+        name: tuple(replace(view, time=unit[view.time]) for view in kept if view.time in unit)
+        for name, kept in splits.items()
+    }
+
+
+# Cameras over time
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
@@ -166,17 +365,23 @@ def are_scattered(views: Sequence[View]) -> bool:
 
 
 def videos(views: Sequence[View]) -> list[list[int]]:
-    """Return indices of views, in order of time, for each video: of a camera that stands, or of the one that moves.
+    """Return indices of views, in order of time, for each video: of a fixed camera, or of the one that moves.
 
     None where views without a common camera jump about in time.
     """
-    standing = static_cameras(views)
-    if standing:
-        return standing
+    fixed = static_cameras(views)
+    if fixed:
+        return fixed
     times = [view.time for view in views if view.time is not None]
     order = sorted(range(len(views)), key=lambda i: views[i].time or 0.0)
     is_one = len(views) > 2 and len(set(times)) == len(views) and not are_scattered([views[i] for i in order])
     return [order] if is_one else []
+
+
+def sequence_warnings(splits: Splits) -> list[str]:
+    """Warn of images with the same camera, pose and time, and of cameras with different numbers of frames."""
+    views = [view for view in all_views(splits) if view.time is not None]
+    return [*_repeated(views), *_frame_counts(views)]
 
 
 def _repeated(views: list[View]) -> list[str]:
@@ -222,5 +427,56 @@ def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
     }
 
 
-def _with_time(splits: Splits, time: float | None) -> Splits:
-    return {name: tuple(replace(view, time=time) for view in kept) for name, kept in splits.items()}
+# Time steps of several videos
+
+
+@dataclass(frozen=True)
+class Taken:
+    """Frames taken of one video: their ``numbers`` (K,), ascending, and ``seconds`` (K,) in the clock of all videos."""
+
+    numbers: np.ndarray
+    seconds: np.ndarray
+
+
+def taken_frames(
+    where: Path, clocks: Sequence[np.ndarray], rates: Sequence[float], most: int | None = None
+) -> tuple[list[Taken], str]:
+    """Return the frames of each video at the time steps that all of them show, and a line on how many.
+
+    Time steps are frames of the video with the fewest per second. Of the others the nearest frame is taken, at its own
+    time if that differs.
+
+    Args:
+        clocks: of each video the seconds (F,) of its frames, in one clock.
+        rates: frames per second.
+        most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many cameras.
+
+    Raises:
+        DyngsError: no two time steps that all videos show.
+    """
+    first, last = max(clock[0] for clock in clocks), min(clock[-1] for clock in clocks)
+    slowest = min(range(len(clocks)), key=lambda i: (rates[i], i))
+    slack = 0.5 / rates[slowest]
+    steps = clocks[slowest][(clocks[slowest] >= first - slack) & (clocks[slowest] <= last + slack)]
+    if len(steps) < FEWEST_STEPS:
+        raise DyngsError(
+            f"{where}: the videos share no two time steps: the last one begins at {first:.2f} s of one clock, the "
+            f"first one ends at {last:.2f} s; are all of them of one event?"
+        )
+    limit = max(min(MOST_STEPS, MOST_IMAGES // len(clocks)), FEWEST_STEPS) if most is None else most
+    chosen = steps[evenly_spaced(len(steps), limit)]
+    taken = [_nearest(clock, chosen, SAME_STEP / rate) for clock, rate in zip(clocks, rates, strict=True)]
+    line = f"{len(chosen)} time steps of {chosen[-1] - chosen[0]:.2f} s that all {len(clocks)} cameras show"
+    if len(chosen) < len(steps):
+        line += f", of {len(steps)} (--frames of `dyngs data sfm` chooses)"
+    return taken, line
+
+
+def _nearest(clock: np.ndarray, steps: np.ndarray, same: float) -> Taken:
+    """Return the frames that are nearest to the time steps, each at most once."""
+    after = np.clip(np.searchsorted(clock, steps), 1, max(len(clock) - 1, 1))
+    numbers = np.where(steps - clock[after - 1] <= clock[after] - steps, after - 1, after)
+    seconds = clock[numbers]
+    seconds = np.where(np.abs(seconds - steps) <= same, steps, seconds)
+    numbers, kept = np.unique(numbers, return_index=True)
+    return Taken(numbers, seconds[kept])

@@ -9,8 +9,8 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image, ImageLoader
+from dyngs.data.times import evenly_spaced
 from dyngs.deform.node_shifts import SeenShift, matching_factor, seen_shift
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render

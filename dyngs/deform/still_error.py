@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from dyngs.data.capture import View
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image
-from dyngs.data.times import static_cameras
+from dyngs.data.times import evenly_spaced, static_cameras
 from dyngs.deform.fixed_cameras.changes import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render

@@ -12,9 +12,9 @@ from typing import TypeAlias
 import torch
 
 from dyngs.data.capture import Capture
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
 from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import psnr

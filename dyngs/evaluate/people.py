@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from dyngs.data.images.silhouettes import silhouette_box
+from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image
 from dyngs.gaussians.rendering import Rendering
 from dyngs.metrics import Lpips, psnr, ssim

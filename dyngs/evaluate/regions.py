@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from dyngs.data.capture import View
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.times import static_cameras
+from dyngs.data.times import evenly_spaced, static_cameras
 from dyngs.metrics import psnr
 
 RegionName = Literal["foreground", "moving", "still"]

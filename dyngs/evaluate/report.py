@@ -16,7 +16,7 @@ from dyngs.config.kinds import field_of
 from dyngs.data.capture import Capture, Split, View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.true_tracks import read_true_tracks
+from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.own_poses import PoseRefinement, images_of_split, scores_from_own_poses
 from dyngs.evaluate.regions import RegionName, Regions

@@ -15,7 +15,7 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.times import SAME_TIME
-from dyngs.data.true_tracks import TRACKS_FILE, TrueTracks
+from dyngs.data.tracks import TRACKS_FILE, TrueTracks
 from dyngs.gaussians.scene import Scene
 
 CARRIERS = 4

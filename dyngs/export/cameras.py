@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.capture import Capture, PointCloud, Split, View
-from dyngs.data.geometry.poses import opengl_from_cam
+from dyngs.data.geometry import opengl_from_cam
 from dyngs.files.write import atomic_file, write_text
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.geometry.focus import focus_point, fraction_in_front
+from dyngs.data.geometry import focus_point, fraction_in_front
 
 _LEVEL = 0.2
 """Largest root-mean-square cosine between right axes and up of cameras that are held level: 11.5 degrees."""

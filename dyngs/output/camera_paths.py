@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.geometry.poses import cam_from_opengl, checked_pose
+from dyngs.data.geometry import cam_from_opengl, checked_pose
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import write_text
 from dyngs.output.keyframes import Keyframes, interpolate_keyframes

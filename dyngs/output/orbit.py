@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from dyngs.camera import Cameras
-from dyngs.data.geometry.focus import fraction_in_front
+from dyngs.data.geometry import fraction_in_front
 from dyngs.errors import DyngsError
 from dyngs.output.aim import look_at, look_at_point, perpendicular, unit, up_direction, with_poses, world_from_cam
 

@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from dyngs.config import Config
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field

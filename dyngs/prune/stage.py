@@ -18,8 +18,8 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import PruneConfig
 from dyngs.config.kinds import field_of
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image
+from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.metrics import psnr

@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, Strategy
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import View
-from dyngs.data.geometry.frusta import MIN_VIEWS, outside_of_cube, points_in_frusta
+from dyngs.data.scene_space import MIN_VIEWS, outside_of_cube, points_in_frusta
 from dyngs.gaussians import Gaussians
 
 START_OPACITY = 0.1

@@ -13,9 +13,9 @@ import torch
 
 from dyngs.api.train import num_cores
 from dyngs.config.io import load_resolved
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text

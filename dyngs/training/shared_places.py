@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.camera import Cameras
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import ImageLoader
+from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.affine import SATURATED
 from dyngs.gaussians.rendering import Rendering
 from dyngs.training.other_views import grid_of

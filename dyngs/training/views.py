@@ -10,7 +10,7 @@ from dyngs.camera import Cameras
 from dyngs.capture.first_points import AROUND_ORIGIN
 from dyngs.config import Config, DataConfig
 from dyngs.data.capture import Capture, View
-from dyngs.data.geometry.intrinsics import scaled_intrinsics
+from dyngs.data.geometry import scaled_intrinsics
 from dyngs.data.images.images import target_size
 from dyngs.static.init import Surroundings
 

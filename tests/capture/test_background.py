@@ -1,10 +1,21 @@
-"""Masks by the difference from the background: a disc that crosses an image with texture, noise and its shadow."""
+"""Masks by the difference from the background."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from dyngs.capture.background import background_of, person_mask, separation
+from dyngs.capture.background import background_of, person_mask, separation, with_background_masks
+from dyngs.capture.fixed_camera import read_fixed_camera
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture
+from dyngs.data.images.images import read_image
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
 
 HEIGHT, WIDTH, FRAMES, RADIUS = 120, 240, 12, 22
 
@@ -53,3 +64,76 @@ def test_nobody_is_not_found() -> None:
     images, _ = clip(16.0)
     empty = np.repeat(images[:1, :, 120:], 5, axis=0)
     assert not person_mask(background_of(empty), empty[0]).any()
+
+
+SIZE, COUNT = (60, 90), 9
+
+
+def ground() -> np.ndarray:
+    return np.random.default_rng(0).uniform(80, 180, (6, 9, 3)).repeat(10, 0).repeat(10, 1).astype(np.uint8)
+
+
+def moving_block(folder: Path, step: int, turn: int = 0) -> Capture:
+    """A bright block that moves by ``step`` px per image, before a background that moves by ``turn``."""
+    for i in range(COUNT):
+        image = np.roll(ground(), turn * i, axis=1)
+        image[20:50, 5 + step * i : 17 + step * i] = [250, 240, 20]
+        write_image(folder / f"f{i}.png", image)
+    return read_fixed_camera(DataConfig(root=folder))
+
+
+def mask_of(capture: Capture, index: int) -> np.ndarray:
+    silhouette = capture.splits["train"][index].silhouette
+    assert silhouette is not None
+    return read_image(silhouette.path)[..., 0].numpy() > 127
+
+
+def iou_of(mask: np.ndarray, step: int, index: int) -> float:
+    true = np.zeros(SIZE, bool)
+    true[20:50, 5 + step * index : 17 + step * index] = True
+    return (mask & true).sum() / (mask | true).sum()
+
+
+def test_who_walks_by_gets_masks(tmp_path: Path) -> None:
+    said: list[str] = []
+    capture = with_background_masks(moving_block(tmp_path / "c", 8), tmp_path / "m", say=said.append)
+    assert capture.has_alpha
+    assert all(iou_of(mask_of(capture, i), 8, i) > 0.9 for i in range(COUNT))
+    assert len(said) == 1
+    assert "of the outlines lie on edges" in said[0]
+
+
+def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
+    capture = moving_block(tmp_path / "c", 0)
+    with pytest.raises(DyngsError, match="--background"):
+        with_background_masks(capture, tmp_path / "m")
+    write_image(tmp_path / "empty.png", ground())
+    found = with_background_masks(capture, tmp_path / "m", tmp_path / "empty.png", say=lambda _: None)
+    assert iou_of(mask_of(found, 4), 0, 4) > 0.9
+    write_image(tmp_path / "plates" / "0.png", ground())
+    again = with_background_masks(capture, tmp_path / "n", tmp_path / "plates", say=lambda _: None)
+    assert np.array_equal(mask_of(again, 4), mask_of(found, 4))
+
+
+def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="moves, so there is no background"):
+        with_background_masks(moving_block(tmp_path / "c", 8, turn=2), tmp_path / "m")
+    capture = moving_block(tmp_path / "d", 8)
+    views = list(capture.splits["train"])
+    pose = views[3].cam_from_world.copy()
+    pose[0, 3] = 0.1
+    views[3] = replace(views[3], cam_from_world=pose)
+    with pytest.raises(DyngsError, match="moves, so there is no background"):
+        with_background_masks(capture.replace(splits={"train": tuple(views)}), tmp_path / "m")
+
+
+def test_bad_backgrounds_are_refused(tmp_path: Path) -> None:
+    capture = moving_block(tmp_path / "c", 8)
+    write_image(tmp_path / "wide.png", np.zeros((20, 90, 3), np.uint8))
+    with pytest.raises(DyngsError, match="take it with the same camera"):
+        with_background_masks(capture, tmp_path / "m", tmp_path / "wide.png")
+    with pytest.raises(DyngsError, match="no image of the background"):
+        with_background_masks(capture, tmp_path / "m", tmp_path / "none")
+    few = capture.replace(splits={"train": capture.splits["train"][:3]})
+    with pytest.raises(DyngsError, match="has 3 images, too few"):
+        with_background_masks(few, tmp_path / "m")

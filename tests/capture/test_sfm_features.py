@@ -11,6 +11,7 @@ from skimage.filters import gaussian
 
 from dyngs.capture.photos import Photo
 from dyngs.capture.sfm_features import FeatureTask, find_features
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import report_nothing
 from dyngs.data.images.images import read_header
 from dyngs.files.write import write_image
@@ -23,9 +24,7 @@ def test_weak_features_are_left_out_where_images_have_many(tmp_path: Path) -> No
         texture = gaussian(rng.random((96, 128)), 1.5)
         write_image(tmp_path / "images" / name, np.repeat((texture - 0.2).clip(0, 1)[..., None], 3, 2))
     photos = [Photo(name, read_header(tmp_path / "images" / name)) for name in names]
-    task = FeatureTask(
-        tmp_path / "all.db", tmp_path / "images", names, photos, None, "SIMPLE_RADIAL", True, 8192, 1600, 0, 1
-    )
+    task = FeatureTask(tmp_path / "all.db", tmp_path / "images", names, photos, SfmOptions(num_threads=1))
     assert find_features(task, report_nothing) == 1.0
     with pycolmap.Database.open(task.database) as opened:
         count = opened.num_keypoints() / len(names)

@@ -13,7 +13,7 @@ def _model(focal: float, known: bool = False) -> Model:
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, 480, 270)
     camera.has_prior_focal_length = known
     found.add_camera(camera)
-    return Model(found, "global", 1, 1.0)
+    return Model(found, "global", 1.0)
 
 
 @pytest.mark.parametrize(("focal", "known", "real"), [(400, False, True), (6100, False, False), (6100, True, True)])

@@ -16,11 +16,11 @@ from dyngs.capture.triangulate import (
     clip_pairs,
     points_over_clip,
     triangulated_points,
-    views_of_a_moment,
+    views_of_a_time_step,
 )
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
-from dyngs.data.geometry.projection import projected
+from dyngs.data.geometry import projected
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
@@ -41,7 +41,7 @@ def train_views(options: DataConfig) -> list[View]:
 
 
 def test_points_lie_on_the_surfaces(room: DataConfig) -> None:
-    views = views_of_a_moment(train_views(room), 24)
+    views = views_of_a_time_step(train_views(room), 24)
     found = triangulated_points(views, room.model_copy(update={"longest_side": 20}))
     assert found is not None
     assert len(found.xyz) > 50
@@ -56,7 +56,7 @@ def test_points_lie_on_the_surfaces(room: DataConfig) -> None:
 
 
 def test_the_same_images_give_the_same_points(room: DataConfig) -> None:
-    views = views_of_a_moment(train_views(room), 24)
+    views = views_of_a_time_step(train_views(room), 24)
     first, second = (triangulated_points(views, room) for _ in range(2))
     assert first is not None
     assert second is not None
@@ -65,7 +65,7 @@ def test_the_same_images_give_the_same_points(room: DataConfig) -> None:
 
 
 def test_two_places_are_too_few(room: DataConfig) -> None:
-    views = views_of_a_moment(train_views(room), 24)
+    views = views_of_a_time_step(train_views(room), 24)
     assert triangulated_points(views[:2] * 3, room) is None
     assert triangulated_points([], room) is None
 
@@ -77,13 +77,13 @@ def test_images_without_features_have_no_points(blender_root: Path) -> None:
 
 def test_a_handful_of_points_is_none(room: DataConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     """A model that begins with them would have to grow all the rest."""
-    views = views_of_a_moment(train_views(room), 24)
+    views = views_of_a_time_step(train_views(room), 24)
     monkeypatch.setattr("dyngs.capture.triangulate.MIN_POINTS", 100_000)
     assert triangulated_points(views, room) is None
 
 
 def test_a_missing_image_is_named(room: DataConfig, tmp_path: Path) -> None:
-    views = views_of_a_moment(train_views(room), 24)
+    views = views_of_a_time_step(train_views(room), 24)
     views[1] = replace(views[1], image_path=tmp_path / "gone.png")
     with pytest.raises(DyngsError, match=r"gone\.png"):
         triangulated_points(views, room)
@@ -92,14 +92,14 @@ def test_a_missing_image_is_named(room: DataConfig, tmp_path: Path) -> None:
 def test_the_moment_is_the_middle_one_of_those_with_most_views(room: DataConfig) -> None:
     view = train_views(room)[0]
     views = [replace(view, time=time) for time in (0.0, 0.2, 0.2, 0.4, 0.4, 0.6, 0.6, 0.8)]
-    assert [chosen.time for chosen in views_of_a_moment(views, 24)] == [0.4, 0.4]
-    assert len(views_of_a_moment(views, 1)) == 1
-    assert views_of_a_moment(views, 0) == views_of_a_moment([], 24) == []
+    assert [chosen.time for chosen in views_of_a_time_step(views, 24)] == [0.4, 0.4]
+    assert len(views_of_a_time_step(views, 1)) == 1
+    assert views_of_a_time_step(views, 0) == views_of_a_time_step([], 24) == []
 
 
 def test_without_times_the_views_are_evenly_chosen(room: DataConfig) -> None:
     views = [replace(view, time=None, name=str(i)) for i, view in enumerate((train_views(room) * 2)[:12])]
-    assert [view.name for view in views_of_a_moment(views, 4)] == ["0", "3", "6", "9"]
+    assert [view.name for view in views_of_a_time_step(views, 4)] == ["0", "3", "6", "9"]
 
 
 def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(

@@ -10,7 +10,7 @@ import pytest
 import dyngs
 from dyngs.cli import main
 from dyngs.config import DataConfig
-from dyngs.data.geometry.poses import camera_center
+from dyngs.data.geometry import camera_center
 from dyngs.data.read import read_capture
 
 

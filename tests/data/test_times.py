@@ -1,4 +1,4 @@
-"""Checks of times, one fault at a time."""
+"""Times: from files, names and frame numbers, one fault at a time; selection; time steps of several videos."""
 
 from __future__ import annotations
 
@@ -12,8 +12,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
-from dyngs.data.capture import Split, View
-from dyngs.data.times import clip_seconds, sequence_warnings, span_in_files, still_if_constant, unit_times, videos
+from dyngs.data.capture import Split, Splits, View, all_views
+from dyngs.data.times import (
+    SECONDS_FILE,
+    Taken,
+    clip_seconds,
+    distinct_times,
+    hold_out_frames,
+    parse_frames,
+    read_seconds,
+    select_frames,
+    sequence_warnings,
+    span_in_files,
+    split_by_camera,
+    still_if_constant,
+    taken_frames,
+    times_by_name,
+    unit_times,
+    videos,
+    write_seconds,
+)
 from dyngs.errors import DyngsError
 
 ROOT = Path("capture")
@@ -160,3 +178,229 @@ def test_videos_are_those_of_fixed_cameras_or_of_the_one_that_moves() -> None:
     jumps = [view(f"{i}", i / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)]
     assert videos(jumps) == []
     assert videos([view(f"{i}", None, i) for i in range(5)]) == []
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    assert read_seconds(tmp_path) == {}
+    write_seconds(tmp_path, {"a.png": 0.0, "b/c.png": 1.25})
+    assert read_seconds(tmp_path) == {"a.png": 0.0, "b/c.png": 1.25}
+
+
+@pytest.mark.parametrize("text", ["[1]", "{}", '{"seconds": [1]}', '{"seconds": {"a.png": "soon"}}', "{"])
+def test_a_damaged_file_is_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / SECONDS_FILE).write_text(text)
+    with pytest.raises(DyngsError, match=SECONDS_FILE) as caught:
+        read_seconds(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def _at(name: str, time: float | None) -> View:
+    return View(name, ROOT / f"{name}.png", np.eye(4), np.eye(3), 4, 4, time=time)
+
+
+def splits(train: list[float], test: list[float]) -> dict[Split, tuple[View, ...]]:
+    return {
+        "train": tuple(_at(f"train/{i}", time) for i, time in enumerate(train)),
+        "test": tuple(_at(f"test/{i}", time) for i, time in enumerate(test)),
+    }
+
+
+limits = st.none() | st.integers(-12, 12)
+
+
+@given(limits, limits, limits.filter(lambda step: step != 0), st.integers(1, 10))
+def test_as_python_slices(start: int | None, stop: int | None, step: int | None, count: int) -> None:
+    text = ":".join("" if x is None else str(x) for x in (start, stop, step))
+    assert parse_frames(text) == slice(start, stop, step)
+    expected = sorted(range(count)[start:stop:step])
+    times = [i / max(count - 1, 1) for i in range(count)]
+    if not expected:
+        with pytest.raises(DyngsError, match=f"picks none of the capture's {count} times"):
+            select_frames(ROOT, splits(times, []), text)
+        return
+    kept = select_frames(ROOT, splits(times, times[:1]), text)
+    assert [int(v.name.split("/")[1]) for v in kept["train"]] == expected
+    assert len(kept["test"]) == (0 in expected)
+    new = [v.time for v in kept["train"]]
+    assert new == pytest.approx([(i - expected[0]) / max(expected[-1] - expected[0], 1) for i in expected]), (
+        "the first is 0, the last 1, the others in proportion"
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "5", "a:b", "1:2:3:4", "0.5:1", "0:1_0", "1-2", "0:10:2 x", "[0:2]", "1:2,4", "1:\u0665"]
+)
+def test_bad_slices(text: str) -> None:
+    with pytest.raises(DyngsError, match=r"data\.frames=.*start:stop:step") as caught:
+        parse_frames(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_step_zero() -> None:
+    with pytest.raises(DyngsError, match="step must not be 0"):
+        parse_frames("0:10:0")
+
+
+def test_times_are_counted_over_all_splits() -> None:
+    """Uneven times keep their proportions; files rounded differently agree; order in the files does not matter."""
+    kept = select_frames(ROOT, splits([0.9, 0.0, 0.30000001, 0.1], [0.3, 1.0, 0.6]), "1:5")
+    assert [(v.name, v.time) for v in kept["train"]] == [
+        ("train/0", 1.0),
+        ("train/2", pytest.approx(0.25)),
+        ("train/3", 0.0),
+    ]
+    assert [(v.name, v.time) for v in kept["test"]] == [
+        ("test/0", pytest.approx(0.25)),
+        ("test/2", pytest.approx(0.625)),
+    ]
+    assert kept["train"][1].time == kept["test"][0].time
+
+
+def test_a_hair_apart_is_one_time() -> None:
+    """Also where rounding to decimals would part them; the distance to the neighbour counts."""
+    times = [0.0, 0.5, 0.5000004, 0.5000008, 0.500003, 1.0]
+    assert list(distinct_times(splits(times, [])["train"]).values()) == [0.0, 0.5, 0.5, 0.5, 0.500003, 1.0]
+    assert len(select_frames(ROOT, splits(times, []), "1:2")["train"]) == 3
+
+
+def test_what_cannot_be_selected() -> None:
+    with pytest.raises(DyngsError, match=r"data\.frames=0:1 picks times, but the capture has none"):
+        select_frames(ROOT, {"train": (_at("a", None),)}, "0:1")
+    with pytest.raises(DyngsError, match="picks 1 of 2 times, none of them with training views"):
+        select_frames(ROOT, splits([0.0], [1.0]), "1:")
+
+
+def test_nothing_but_time_changes() -> None:
+    before = splits([0.0, 0.25, 0.5], [])["train"]
+    after = select_frames(ROOT, {"train": before}, ":2")["train"]
+    assert after == (before[0], replace(before[1], time=1.0))
+
+
+def filmed(camera: int, split: Split) -> dict[Split, tuple[View, ...]]:
+    """A camera at five times."""
+    views = (_at(f"c{camera}/{i}", i / 4) for i in range(5))
+    return {split: tuple(replace(own, camera_id=camera) for own in views)}
+
+
+@pytest.mark.parametrize("frames", ["-2::", "3:", "3:5"])
+def test_held_out_frames_are_a_clip_of_their_own(frames: str) -> None:
+    kept, held = hold_out_frames(ROOT, filmed(0, "train"), frames)
+    assert [(v.name, v.time) for v in kept["train"]] == [("c0/0", 0), ("c0/1", 0.5), ("c0/2", 1)]
+    assert [(v.name, v.time) for v in held] == [("c0/3", 0), ("c0/4", 1)]
+
+
+def test_held_out_frames_are_seen_from_the_test_cameras_if_there_are_any() -> None:
+    splits = filmed(0, "train") | filmed(1, "test")
+    kept, held = hold_out_frames(ROOT, splits, "1::2")
+    assert [v.name for v in held] == ["c1/1", "c1/3"]
+    assert [v.name for v in kept["train"]] == ["c0/0", "c0/2", "c0/4"]
+    assert [v.name for v in kept["test"]] == ["c1/0", "c1/2", "c1/4"]
+    mixed: dict[Split, tuple[View, ...]] = {"train": splits["train"][:4], "test": splits["train"][4:]}
+    assert [v.name for v in hold_out_frames(ROOT, mixed, "3:")[1]] == ["c0/3", "c0/4"], "one camera"
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (":", "leaves no training views"),
+        ("9:", "picks none of the capture's 5 times"),
+        ("3", "data.pose_frames='3': write"),
+    ],
+)
+def test_frames_that_cannot_be_held_out(frames: str, message: str) -> None:
+    with pytest.raises(DyngsError, match=message):
+        hold_out_frames(ROOT, filmed(0, "train"), frames)
+
+
+def test_cameras_that_are_trained_on() -> None:
+    splits: dict[Split, tuple[View, ...]] = {"train": (), "test": filmed(0, "test")["test"]}
+    splits["train"] = tuple(view for camera in (1, 2) for view in filmed(camera, "train")["train"])
+    found = split_by_camera(ROOT, splits, (0, 2))
+    assert {name: {view.camera_id for view in views} for name, views in found.items()} == {"train": {0, 2}, "test": {1}}
+    with pytest.raises(DyngsError, match=r"train_cameras=\[3\]: no camera 3; there are 3, from 0 to 2"):
+        split_by_camera(ROOT, splits, (3,))
+    with pytest.raises(DyngsError, match="are all cameras of the capture; leave one for testing"):
+        split_by_camera(ROOT, splits, (0, 1, 2))
+
+
+def _views(*names: str) -> tuple[View, ...]:
+    return tuple(View(name, ROOT / f"{name}.png", np.eye(4), np.eye(3), 4, 4) for name in names)
+
+
+def _times(*names: str, test: tuple[str, ...] = ()) -> tuple[dict[str, float | None], str]:
+    splits: Splits = {"train": _views(*names), "test": _views(*test)}
+    timed, line = times_by_name(ROOT, splits)
+    return {view.name: view.time for view in all_views(timed)}, line
+
+
+def test_numbers_at_the_end_are_times_and_gaps_stay_gaps() -> None:
+    times, line = _times("frame_00001", "frame_00004", test=("frame_00002",))
+    assert times == {"frame_00001": 1, "frame_00004": 4, "frame_00002": 2}
+    assert "from 1 to 4" in line
+
+
+def test_folders_are_cameras_that_share_their_numbers() -> None:
+    times, _ = _times("left/7", "left/8", "right/8", "right/7")
+    assert times == {"left/7": 7, "left/8": 8, "right/8": 8, "right/7": 7}
+
+
+def test_other_names_are_in_natural_order() -> None:
+    times, line = _times("shot9-a", "shot10-a", "shot1-a")
+    assert times == {"shot1-a": 0, "shot9-a": 1, "shot10-a": 2}
+    assert "shot1-a first" in line
+
+
+def test_the_same_number_twice_is_no_time() -> None:
+    assert _times("a_1", "b_1", "c_1")[0] == {"a_1": 0, "b_1": 1, "c_1": 2}
+
+
+def test_a_frame_rate_makes_seconds_of_numbers() -> None:
+    splits: Splits = {"train": _views("frame_10", "frame_25", "frame_60")}
+    timed, line = times_by_name(ROOT, splits, 25.0)
+    assert [view.time for view in timed["train"]] == [0.4, 1.0, 2.4]
+    assert "data.times=order at 25 per second: 2 s" in line
+
+
+@pytest.mark.parametrize("names", [("one",), ("left/a", "left/b", "right/a")])
+def test_what_has_no_order_is_one_line(names: tuple[str, ...]) -> None:
+    with pytest.raises(DyngsError, match=r"data\.times=order"):
+        _times(*names)
+
+
+def _taken(*clips: tuple[float, float, int], most: int | None = None) -> tuple[list[Taken], str]:
+    """The frames taken of videos, each with its start in seconds, frames per second, and number of frames."""
+    clocks = [start + np.arange(count) / rate for start, rate, count in clips]
+    return taken_frames(Path("rig"), clocks, [rate for _, rate, _ in clips], most)
+
+
+def test_frames_of_one_time_step_have_one_time() -> None:
+    taken, line = _taken((0.0, 10, 30), (0.5, 10, 30))
+    assert list(taken[0].numbers) == list(range(5, 30))
+    assert list(taken[1].numbers) == list(range(25))
+    assert taken[0].seconds == pytest.approx(0.5 + np.arange(25) / 10)
+    assert np.array_equal(taken[0].seconds, taken[1].seconds)
+    assert "25 time steps of 2.40 s" in line
+
+
+def test_different_rates_share_the_time_steps_of_the_slower_one() -> None:
+    taken, _ = _taken((0.0, 50, 100), (0.0, 25, 50))
+    assert list(taken[0].numbers) == list(range(0, 100, 2))
+    assert list(taken[1].numbers) == list(range(50))
+
+
+def test_frames_between_time_steps_keep_their_own_time() -> None:
+    taken, _ = _taken((0.0, 10, 20), (0.04, 10, 20))
+    assert taken[1].seconds - taken[0].seconds == pytest.approx(np.full(20, 0.04))
+
+
+def test_the_number_of_time_steps_is_bounded_and_said() -> None:
+    films = ((0.0, 30, 3000), (0.0, 30, 3000))
+    taken, line = _taken(*films)
+    assert len(taken[0].numbers) == 300
+    assert "of 3000" in line
+    assert len(_taken(*films, most=12)[0][0].numbers) == 12
+
+
+def test_videos_of_different_events_are_refused() -> None:
+    with pytest.raises(DyngsError, match="share no two time steps"):
+        _taken((0.0, 10, 20), (5.0, 10, 20))

@@ -18,7 +18,7 @@ from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.data.true_tracks import TrueTracks, write_true_tracks
+from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import (
     evaluate_run,

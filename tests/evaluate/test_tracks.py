@@ -20,7 +20,7 @@ from dyngs.data.capture import View, all_views
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.scenes import SceneName
-from dyngs.data.true_tracks import TrueTracks, read_true_tracks
+from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks

@@ -24,7 +24,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.times import evenly_spaced
 from dyngs.deform.scene import DynamicScene
 from dyngs.prune.stage import Pruned, PruneStage, distinct_cameras, prune_
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dyngs.data.capture import Capture, View
-from dyngs.data.geometry.poses import inverse_rigid, pose_fault
+from dyngs.data.geometry import inverse_rigid, pose_fault
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 
-BACKGROUND = np.array([24, 26, 30], np.uint8)
+BACKGROUND = (24, 26, 30)
 SPLIT_COLORS = {"train": (255, 170, 60), "val": (120, 230, 120), "test": (80, 190, 255), "pose": (80, 190, 255)}
 
 
@@ -21,9 +20,6 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
 
     Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours.
     Up is the mean of the cameras' up axes. Points far beyond the cameras, and views without a rigid pose, are left out.
-
-    Raises:
-        DyngsError: no view has a usable pose, or the file cannot be written.
     """
     views = [(split, view) for split, views in capture.splits.items() for view in views]
     usable = [(split, view) for split, view in views if pose_fault(view) is None]
@@ -41,30 +37,49 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     for title, horizontal, vertical in (("from above", 0, 1), ("from the side", 0, 2)):
         shown = [horizontal, vertical]
         middle = 0.5 * (low + high)[shown]
-        panel = _Panel(np.tile(BACKGROUND, (size, size, 1)), axes[shown], middle, extent)
-        _draw_points(panel, xyz, rgb)
+        panel = _Panel(size, axes[shown], middle, extent)
+        panel.draw_points(xyz, rgb)
         for (split, view), pose in zip(usable, poses, strict=True):
-            _draw_frustum(panel, view, pose, depth, SPLIT_COLORS[split])
-        _write_title(panel.pixels, title)
-        panels.append(panel.pixels)
+            panel.draw_frustum(view, pose, depth, SPLIT_COLORS[split])
+        panels.append(panel.finished(title))
     write_image(out, np.concatenate(panels, axis=1))
 
 
-@dataclass(frozen=True)
 class _Panel:
-    """One square of the plot: ``pixels`` (S, S, 3) show ``extent`` units around ``center`` (2,), axes (2, 3)."""
+    """One square of the plot, drawn at twice its size: ``extent`` units around ``center`` (2,), axes (2, 3)."""
 
-    pixels: np.ndarray
-    axes: np.ndarray
-    center: np.ndarray
-    extent: float
+    def __init__(self, size: int, axes: np.ndarray, center: np.ndarray, extent: float) -> None:
+        from PIL import Image, ImageDraw
 
-    def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns (P,) int of world points (P, 3); they may lie outside the panel."""
-        size = len(self.pixels)
-        flat = (points @ self.axes.T - self.center) / self.extent + 0.5
-        inside = np.clip(flat, -10.0, 10.0)
-        return ((1 - inside[:, 1]) * (size - 1)).round().astype(int), (inside[:, 0] * (size - 1)).round().astype(int)
+        self._size, self._axes, self._center, self._extent = size, axes, center, extent
+        self._image = Image.new("RGB", (2 * size, 2 * size), BACKGROUND)
+        self._draw = ImageDraw.Draw(self._image)
+
+    def draw_points(self, xyz: np.ndarray, rgb: np.ndarray) -> None:
+        for (x, y), colour in zip(self._places(xyz), np.maximum(rgb, 60).tolist(), strict=True):
+            self._draw.rectangle((x, y, x + 1, y + 1), fill=tuple(colour))
+
+    def draw_frustum(self, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]) -> None:
+        """Draw lines from the camera's centre to the corners of its image, and the image's border, ``depth`` away."""
+        corners = np.array([[0, 0, 1], [view.width, 0, 1], [view.width, view.height, 1], [0, view.height, 1]], float)
+        rays = corners @ np.linalg.inv(view.intrinsics).T
+        rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
+        tips = self._places(np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3])
+        self._draw.line([tips[i] for i in (0, 1, 2, 0, 3, 4, 0)], fill=color, width=2)
+        self._draw.line([tips[i] for i in (2, 3)], fill=color, width=2)
+        self._draw.line([tips[i] for i in (4, 1)], fill=color, width=2)
+
+    def finished(self, title: str) -> np.ndarray:
+        """Return the (S, S, 3) uint8 panel with its title at the upper left."""
+        from PIL import ImageFont
+
+        self._draw.text((16, 12), title, fill=(204, 204, 204), font=ImageFont.load_default(28))
+        return np.asarray(self._image.resize((self._size, self._size)))
+
+    def _places(self, points: np.ndarray) -> list[tuple[float, float]]:
+        """Return columns and rows of world points (P, 3); they may lie outside the panel."""
+        flat = np.clip((points @ self._axes.T - self._center) / self._extent + 0.5, -10.0, 10.0)
+        return [(x, y) for x, y in ((flat * (1, -1) + (0, 1)) * (2 * self._size - 1)).tolist()]
 
 
 def _drawing_axes(poses: np.ndarray) -> np.ndarray:
@@ -91,36 +106,3 @@ def _near_points(capture: Capture, centers: np.ndarray) -> tuple[np.ndarray, np.
     near = np.flatnonzero(distance <= limit)
     near = near[:: max(len(near) // 20_000, 1)]
     return xyz[near], rgb[near]
-
-
-def _draw_points(panel: _Panel, xyz: np.ndarray, rgb: np.ndarray) -> None:
-    rows, columns = panel.place(xyz)
-    size = len(panel.pixels)
-    inside = (rows >= 0) & (rows < size) & (columns >= 0) & (columns < size)
-    panel.pixels[rows[inside], columns[inside]] = np.maximum(rgb[inside], 60)
-
-
-def _draw_frustum(panel: _Panel, view: View, pose: np.ndarray, depth: float, color: tuple[int, int, int]) -> None:
-    """Lines from the camera's centre to the corners of its image, and the image's border, ``depth`` away."""
-    from skimage.draw import line_aa
-
-    corners = np.array([[0, 0, 1], [view.width, 0, 1], [view.width, view.height, 1], [0, view.height, 1]], float)
-    rays = corners @ np.linalg.inv(view.intrinsics).T
-    rays *= depth / np.linalg.norm(rays, axis=1, keepdims=True)
-    tips = np.concatenate([np.zeros((1, 3)), rays]) @ pose[:3, :3].T + pose[:3, 3]
-    rows, columns = panel.place(tips)
-    size = len(panel.pixels)
-    for a, b in ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)):
-        r, c, weight = line_aa(rows[a], columns[a], rows[b], columns[b])
-        inside = (r >= 0) & (r < size) & (c >= 0) & (c < size)
-        r, c, weight = r[inside], c[inside], 0.8 * weight[inside, None]
-        panel.pixels[r, c] = ((1 - weight) * panel.pixels[r, c] + weight * np.array(color)).astype(np.uint8)
-
-
-def _write_title(pixels: np.ndarray, text: str) -> None:
-    """Draw ``text`` at the upper left, in place; nothing where no font is installed."""
-    import OpenImageIO as oiio
-
-    canvas = oiio.ImageBuf(np.ascontiguousarray(pixels))
-    if oiio.ImageBufAlgo.render_text(canvas, 8, 20, text, 14, textcolor=(0.8, 0.8, 0.8)):
-        pixels[:] = canvas.get_pixels(oiio.UINT8)

@@ -1,19 +1,155 @@
-"""Report on a capture: facts and problems, as ``dyngs data inspect`` shows them."""
+"""Report on a capture, as ``dyngs data inspect`` shows it: facts as pairs of a name and a value, and problems."""
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from dyngs.capture.first_points import checked_points
-from dyngs.capture.inspection.facts import facts_of
-from dyngs.capture.inspection.problems import problems_of, transforms_file_problems
-from dyngs.capture.inspection.scene_problems import listed
+from dyngs.capture.inspection.problems import counted, listed, problems_of, transforms_file_problems
 from dyngs.config import DataConfig
-from dyngs.data.capture import Capture
+from dyngs.data.capture import Capture, View, all_views
+from dyngs.data.geometry import camera_center
+from dyngs.data.images.lens import is_pinhole, kept_fraction
+from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError, printable, reading
 from dyngs.files.containment import images_up_to, leaving_links
+
+SAME_LIGHT = 1.05
+"""Factor between the most and the least light up to which images count as equally exposed."""
+MUCH_LOST = 90
+"""Per cent of an image below which a wider pinhole is worth a word."""
+MOST_LENSES = 20
+"""Different lenses that are looked at; more are not needed to tell how much is lost."""
+
+
+def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
+    """Return what a capture holds as (name, value) pairs, in the order in which they are shown."""
+    views = all_views(capture.splits)
+    sizes = Counter(f"{view.width}x{view.height}" for view in views)
+    lenses = Counter(view.lens.model for view in views)
+    focal_px = [float(f) for view in views for f in (view.intrinsics[0, 0], view.intrinsics[1, 1])]
+    fov_deg = [float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views]
+    centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3)
+    facts = [
+        ("format", capture.format),
+        ("views", ", ".join(f"{len(views)} {split}" for split, views in capture.splits.items() if views)),
+        ("sizes", counted(sizes)),
+        ("cameras", str(len({view.camera_id for view in views}))),
+        ("focal length", f"{_range(focal_px)} px"),
+        ("field of view", f"{_range(fov_deg)} degrees across"),
+        ("lens", counted(lenses) + _kept(views)),
+        *_exposures(views),
+        ("alpha", "transparent background" if capture.has_alpha else "none"),
+        ("masks", _masks(views)),
+        *_prior_facts(capture),
+        *_time_facts(capture),
+        ("points", _points(capture)),
+    ]
+    if len(centers):
+        spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+        box = ", ".join(_range(axis) for axis in centers.T)
+        facts.append(("camera centres", f"{box}; within {spread:.4g} of their mean"))
+    if np.any(capture.world_offset):
+        facts.append(("world offset", " ".join(f"{x:.10g}" for x in capture.world_offset) + " (rebased)"))
+    if capture.body is not None:
+        frames = ", ".join(
+            f"{len(capture.body[name].frames)} {name}" for name in capture.splits if name in capture.body
+        )
+        facts.append(("body", f"{next(iter(capture.body.values())).kind}, frames: {frames}"))
+    return tuple(facts)
+
+
+def _kept(views: Sequence[View]) -> str:
+    """Return how much of the images is left after their lens distortion is removed; empty where there is none."""
+    lenses = {(view.lens, view.intrinsics.tobytes(), view.width, view.height): view for view in views}
+    distorted = [view for view in lenses.values() if not is_pinhole(view.lens)][:MOST_LENSES]
+    if not distorted:
+        return ""
+    fractions = [100 * kept_fraction(view.lens, view.intrinsics, view.width, view.height) for view in distorted]
+    ratios = [view.lens.focal_ratio for view in distorted]
+    if max(ratios) > 1:
+        how = f"to a pinhole with {_range([1 / ratio for ratio in ratios])} of the focal length"
+    else:
+        how = "with the same focal length"
+    more = " (data.undistort=wide keeps more)" if max(ratios) == 1 and min(fractions) < MUCH_LOST else ""
+    return f"; undistorted {how}, which keeps {_range(fractions)} % of each image{more}"
+
+
+def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
+    """Return how much the light let in differs by the tags of images; nothing where they do not say."""
+    known = [view.exposure for view in views if view.exposure is not None]
+    if not known:
+        return []
+    factor = max(known) / min(known)
+    said = f"by EXIF tags of {len(known)} of {len(views)} images, "
+    if factor < SAME_LIGHT:
+        return [("exposure", f"{said}the same")]
+    return [("exposure", f"{said}up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters")]
+
+
+def _masks(views: Sequence[View]) -> str:
+    count = sum(view.mask_path is not None for view in views)
+    return f"{count} of {len(views)} images; white counts, black is ignored" if count else "none"
+
+
+def _points(capture: Capture) -> str:
+    if capture.points is None:
+        return "none"
+    return str(len(capture.points.xyz)) + ("" if capture.points_file is None else f" ({capture.points_file.name})")
+
+
+def _prior_facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    """Yield how many views have which priors; nothing where there are none."""
+    views = all_views(capture.splits)
+    counts = {
+        "depth maps": sum(view.depth_path is not None for view in views),
+        "motion masks": sum(view.motion_mask_path is not None for view in views),
+        "flow fields": sum(view.flow_path is not None for view in views),
+        "file of tracks": int(capture.tracks_path is not None),
+    }
+    found = [f"{count} {what}" for what, count in counts.items() if count]
+    if found:
+        yield "priors", ", ".join(found)
+
+
+def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    """Distinct times, cameras by times, the frame rate, and how many frames of videos are decoded."""
+    views = [view for view in all_views(capture.splits) if view.time is not None]
+    if not views:
+        yield "times", "none (a static scene)"
+        return
+    times = set(distinct_times(views).values())
+    written = "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
+    yield "times", f"{len(times)} in {_range(times)}{written}"
+    cameras: defaultdict[int, set[bytes]] = defaultdict(set)
+    for view in views:
+        cameras[view.camera_id].add(view.cam_from_world.round(9).tobytes())
+    what = "camera" + ("s" if len(cameras) > 1 else "")
+    moving = sum(len(poses) > 1 for poses in cameras.values())
+    motion = "" if not moving else " (moving)" if moving == len(cameras) else f" ({moving} moving)"
+    yield "sequence", f"{len(cameras)} {what}{motion} x {len(times)} times, {len(views)} images"
+    if capture.fps is not None:
+        yield "frame rate", f"{capture.fps:.6g} per second"
+    if capture.seconds is not None:
+        yield "duration", f"{capture.seconds:.4g} seconds from time 0 to time 1"
+    frames = [view.image_path for view in views if view.video is not None]
+    if frames:
+        yield "video frames", f"{sum(path.is_file() for path in frames)} of {len(frames)} are decoded already"
+
+
+def _range(values: Iterable[float]) -> str:
+    """Return "lowest to highest", or one number where both are about the same."""
+    listed = list(values)
+    if not listed:
+        return "none"
+    low, high = min(listed), max(listed)
+    return f"{low:.4g}" if np.isclose(low, high) else f"{low:.4g} to {high:.4g}"
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.capture.multi_video.films import Film, SmallImages, open_film, shrunk_grey, videos_in
-from dyngs.capture.multi_video.given import NAME, read_given
-from dyngs.capture.multi_video.planes import motion_of
+from dyngs.capture.multi_video.films import (
+    VIDEOS_FILE,
+    Film,
+    SmallImages,
+    open_film,
+    read_given,
+    shrunk_grey,
+    videos_in,
+)
+from dyngs.capture.multi_video.lags import motion_of
 from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
-from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.images.video import opened_video, read_frames
+from dyngs.data.images.video import opened_video, orientation_of, read_frames
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import reading
 from dyngs.files.containment import inside
 
@@ -46,14 +53,6 @@ class VideoFacts:
     stands: bool
 
 
-@dataclass(frozen=True)
-class _Looked:
-    """What was seen in the frames: small images, and the sharpness of each."""
-
-    small: SmallImages
-    sharpness: np.ndarray
-
-
 def video_report(path: Path) -> str:
     """Return a report on a video file, or on the videos of a folder, as lines of text.
 
@@ -72,27 +71,24 @@ def video_report(path: Path) -> str:
 
 
 def video_facts(path: Path) -> VideoFacts:
-    """Return what there is to know about a video; its frames are decoded once.
-
-    Raises:
-        DyngsError: the video cannot be read.
-    """
+    """Return what there is to know about a video; its frames are decoded once."""
     film = open_film(inside(path))
-    looked = _look(film)
-    steady = steadiness(looked.small.grey)
-    rotation, sound = _streams(path)
+    small, sharpness = _look(film)
+    steady = steadiness(small.grey)
+    shown, sound = _streams(path)
     seconds = film.seconds
     facts = (
-        ("size", f"{film.info.width}x{film.info.height}" + (f" (turned by {rotation} degrees)" if rotation else "")),
+        ("size", f"{film.info.width}x{film.info.height}" + shown),
         ("frames", f"{len(seconds)} in {seconds[-1] + 1 / film.rate:.2f} s, {_rate(film)}"),
         ("sound", sound),
-        ("sharpness", _sharpness(looked.sharpness)),
-        ("camera", _camera(looked.small, steady)),
+        ("sharpness", _sharpness(sharpness)),
+        ("camera", _camera(small, steady)),
     )
     return VideoFacts(film, facts, steady.stands)
 
 
-def _look(film: Film) -> _Looked:
+def _look(film: Film) -> tuple[SmallImages, np.ndarray]:
+    """Return small images of the frames, and the sharpness of each."""
     small, sharpness = [], []
     for number, rgb in enumerate(read_frames(film.path)):
         if number >= min(MAX_FRAMES, len(film.seconds)):
@@ -103,16 +99,27 @@ def _look(film: Film) -> _Looked:
         sharpness.append(
             float(np.diff(grey, axis=0).std() + np.diff(grey, axis=1).std()) if min(grey.shape) > 1 else 0.0
         )
-    return _Looked(SmallImages(np.stack(small), film.seconds[: len(small)]), np.array(sharpness))
+    return SmallImages(np.stack(small), film.seconds[: len(small)]), np.array(sharpness)
 
 
-def _streams(path: Path) -> tuple[int, str]:
-    """Return by how many degrees images are turned on reading, and what sound there is."""
+_ORIENTATIONS = (
+    "",
+    "mirrored",
+    "rotated by 180 degrees",
+    "mirrored upside down",
+    "mirrored and rotated by 270 degrees",
+)
+_ORIENTATIONS += ("rotated by 90 degrees", "mirrored and rotated by 90 degrees", "rotated by 270 degrees")
+"""What is done to frames on reading, by their orientation."""
+
+
+def _streams(path: Path) -> tuple[str, str]:
+    """Return what is done to frames on reading, in brackets, and what sound there is."""
     with reading(path, "it must be a video; copy or convert it again"), opened_video(path) as container:
         first = next(container.decode(container.streams.video[0]))
-        rotation = round(getattr(first, "rotation", 0) / 90) % 4 * 90
+        done = _ORIENTATIONS[orientation_of(first) - 1]
         audio = container.streams.audio
-        return rotation, f"{audio[0].codec_context.name}, {audio[0].rate} Hz" if audio else "none"
+        return f" ({done})" if done else "", f"{audio[0].codec_context.name}, {audio[0].rate} Hz" if audio else "none"
 
 
 def _rate(film: Film) -> str:
@@ -153,7 +160,7 @@ def _lines(found: VideoFacts) -> list[str]:
 def _next(path: Path, found: VideoFacts) -> list[str]:
     where = shlex.quote(str(path))
     if found.stands:
-        return ["next: one camera that stands shows no depth; put videos of two or more that ran at once into a folder"]
+        return ["next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"]
     return [
         f"next: dyngs train static data.root={where}     # nothing but the camera moves",
         f"      dyngs train dynamic data.root={where}    # something else moves, too",
@@ -163,12 +170,12 @@ def _next(path: Path, found: VideoFacts) -> list[str]:
 def _next_of_folder(folder: Path, reports: Sequence[VideoFacts]) -> list[str]:
     moving = [found.film.name for found in reports if not found.stands]
     if moving:
-        return [f"next: take {', '.join(moving[:5])} out: of several videos, only cameras that stand still get poses"]
+        return [f"next: take {', '.join(moving[:5])} out: of several videos, only fixed cameras get poses"]
     names = [found.film.name for found in reports]
     rates = {round(found.film.rate, 2) for found in reports}
-    known = "found by sound or motion" if read_given(folder, names).starts is None else f"as {NAME} says"
+    known = "found by sound or motion" if read_given(folder, names).starts is None else f"as {VIDEOS_FILE} says"
     return [
-        f"{len(names)} cameras that stand, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
+        f"{len(names)} fixed cameras, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
         f"offsets between them: {known}",
         f"next: dyngs train dynamic data.root={shlex.quote(str(folder))}",
     ]

@@ -1,1 +1,1 @@
-"""Several videos of one moment: offsets between their clocks, poses of cameras that stand, one capture of all."""
+"""Several videos of one time step: offsets between their clocks, poses of fixed cameras, one capture of all."""

@@ -1,10 +1,9 @@
-"""Poses of cameras that stand, one each, from one image per camera: what stands in it, of many moments together."""
+"""Poses of fixed cameras, one each, from one image per camera: what stands in it, of many time steps together."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.multi_video.films import Film
+from dyngs.capture.sfm_work import SfmOptions, quiet_colmap
 from dyngs.conventions import ReportProgress
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.images.video import read_numbered_frames
-from dyngs.errors import DyngsError
+from dyngs.data.times import evenly_spaced
 from dyngs.files.write import write_image
 
 if TYPE_CHECKING:
@@ -42,22 +41,7 @@ _FEATURES = 8192
 
 
 @dataclass(frozen=True)
-class StandingOptions:
-    """Options of the poses of fixed cameras.
-
-    Attributes:
-        camera_model: COLMAP's name of the lens model.
-        seed: of everything random.
-        num_threads: 0 = all cores.
-    """
-
-    camera_model: str = "SIMPLE_RADIAL"
-    seed: int = 0
-    num_threads: int = 0
-
-
-@dataclass(frozen=True)
-class StandingModel:
+class FixedModel:
     """Poses, lenses and points.
 
     Attributes:
@@ -76,15 +60,12 @@ class StandingModel:
         return self.model.num_reg_images()
 
 
-def standing_image(film: Film, num_frames: int) -> np.ndarray:
+def image_without_movers(film: Film, num_frames: int) -> np.ndarray:
     """Return the (H, W, 3) uint8 median of frames over the clip: what moves is not in it, and noise is weaker.
 
     Args:
-        film: of a camera that stands.
+        film: of a fixed camera.
         num_frames: frames that count, from the first one on.
-
-    Raises:
-        DyngsError: damage in the video.
     """
     most = max(MEDIAN_BYTES // max(film.info.width * film.info.height * 3, 1), 3)
     wanted = evenly_spaced(num_frames, min(MOMENTS, most))
@@ -95,10 +76,10 @@ def standing_image(film: Film, num_frames: int) -> np.ndarray:
     return median
 
 
-def standing_model(
-    films: Sequence[Film], images: Sequence[np.ndarray], work: Path, options: StandingOptions, report: ReportProgress
-) -> StandingModel | None:
-    """Return the poses of cameras that stand, None where no two cameras match.
+def fixed_model(
+    films: Sequence[Film], images: Sequence[np.ndarray], work: Path, options: SfmOptions, report: ReportProgress
+) -> FixedModel | None:
+    """Return the poses of fixed cameras, None where no two cameras match.
 
     SIFT features, all pairs matched, incremental mapping from several random seeds; of the models, that with most
     cameras, then with most observations. Where a camera or observations are missing, features are also found with
@@ -106,14 +87,9 @@ def standing_model(
     that fits badly.
 
     Args:
-        films: the videos.
         images: (H, W, 3) uint8 of each.
         work: a folder for COLMAP's files.
-        options: lens model, seed, threads.
-        report: is told of each attempt.
-
-    Raises:
-        DyngsError: COLMAP fails.
+        options: of which lens model, seed and threads count.
     """
 
     folder = work / "fixed"
@@ -121,16 +97,16 @@ def standing_model(
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"  # a folder has one lens where lenses are shared
         write_image(folder / size / f"{film.name}.png", rgb)
     attempts = [("usual", True), ("affine", True), ("affine", False), ("usual", False)]
-    best: StandingModel | None = None
-    with _quiet(options.seed):
+    best: FixedModel | None = None
+    with quiet_colmap(options.seed):
         for number, (features, shared) in enumerate(attempts):
             if not _worth_trying(best, features, shared, len(films)):
                 continue
             found = _attempt(work / f"{features}_{shared}", folder, features == "affine", shared, options)
             report("poses of the cameras, attempts", number + 1, len(attempts))
             if found is not None:
-                _refine(found, options)
-                tried = StandingModel(found, shared, f"{features} features")
+                _refine(found, options.num_threads)
+                tried = FixedModel(found, shared, f"{features} features")
                 best = tried if best is None or _is_better(tried, best) else best
         report("poses of the cameras, attempts", len(attempts), len(attempts))
     return best
@@ -141,7 +117,7 @@ def camera_name(image: pycolmap.Image) -> str:
     return Path(image.name).stem
 
 
-def _worth_trying(best: StandingModel | None, features: str, shared: bool, count: int) -> bool:
+def _worth_trying(best: FixedModel | None, features: str, shared: bool, count: int) -> bool:
     if best is None or best.registered < count:
         return True
     if shared:
@@ -149,7 +125,7 @@ def _worth_trying(best: StandingModel | None, features: str, shared: bool, count
     return best.tries.startswith(features) and best.model.compute_mean_reprojection_error() > LONE_LENSES
 
 
-def _is_better(one: StandingModel, other: StandingModel) -> bool:
+def _is_better(one: FixedModel, other: FixedModel) -> bool:
     if one.registered != other.registered:
         return one.registered > other.registered
     errors = [each.model.compute_mean_reprojection_error() for each in (one, other)]
@@ -159,7 +135,7 @@ def _is_better(one: StandingModel, other: StandingModel) -> bool:
 
 
 def _attempt(
-    work: Path, images: Path, affine: bool, shared: bool, options: StandingOptions
+    work: Path, images: Path, affine: bool, shared: bool, options: SfmOptions
 ) -> pycolmap.Reconstruction | None:
     """Return the best model of one kind of features, None without any."""
     import pycolmap
@@ -195,7 +171,7 @@ def _attempt(
     return best
 
 
-def _refine(model: pycolmap.Reconstruction, options: StandingOptions) -> None:
+def _refine(model: pycolmap.Reconstruction, num_threads: int) -> None:
     """Adjust poses, lenses and points once more, with a robust loss, and without what fits badly or two cameras see.
 
     Repeated patterns give matches that only two cameras agree on; those bend the model.
@@ -206,7 +182,7 @@ def _refine(model: pycolmap.Reconstruction, options: StandingOptions) -> None:
     adjustment.print_summary = False
     adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     adjustment.ceres.loss_function_scale = 0.5
-    adjustment.ceres.solver_options.num_threads = options.num_threads or -1
+    adjustment.ceres.solver_options.num_threads = num_threads or -1
     for _ in range(2):
         problem = pycolmap.BundleAdjustmentConfig()
         for image in model.images.values():
@@ -240,7 +216,7 @@ def _extent(model: pycolmap.Reconstruction) -> tuple[int, int]:
     return model.num_reg_images(), model.compute_num_observations()
 
 
-def _mapping(options: StandingOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def _mapping(options: SfmOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
     import pycolmap
 
     mapping = pycolmap.IncrementalPipelineOptions()
@@ -252,25 +228,3 @@ def _mapping(options: StandingOptions, seed: int) -> pycolmap.IncrementalPipelin
     mapping.triangulation.ignore_two_view_tracks = False
     mapping.ba_use_gpu = False
     return mapping
-
-
-@contextmanager
-def _quiet(seed: int) -> Iterator[None]:
-    """Keep COLMAP's log out of the terminal, and make it start from a seed.
-
-    Raises:
-        DyngsError: COLMAP fails in the block.
-    """
-    import pycolmap
-
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
-    pycolmap.set_random_seed(seed)
-    try:
-        yield
-    except (RuntimeError, ValueError) as error:
-        if isinstance(error, DyngsError):
-            raise
-        reason = str(error).strip().splitlines()
-        raise DyngsError(f"structure from motion failed: {reason[-1] if reason else error}") from error
-    finally:
-        pycolmap.logging.minloglevel = level

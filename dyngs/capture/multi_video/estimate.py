@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,28 +13,112 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.multi_video.camera_poses import (
-    StandingModel,
-    StandingOptions,
+    FixedModel,
     camera_name,
-    standing_image,
-    standing_model,
+    fixed_model,
+    image_without_movers,
 )
-from dyngs.capture.multi_video.capture import write_facts, write_images, write_model
-from dyngs.capture.multi_video.films import Film, SmallImages, open_films, small_images
-from dyngs.capture.multi_video.given import checked_starts, read_given
-from dyngs.capture.multi_video.moments import taken_frames
-from dyngs.capture.multi_video.planes import Watcher, motion_of
+from dyngs.capture.multi_video.films import (
+    VIDEOS_FILE,
+    Film,
+    SmallImages,
+    checked_starts,
+    open_films,
+    read_given,
+    small_images,
+)
+from dyngs.capture.multi_video.lags import Watcher, motion_of
 from dyngs.capture.multi_video.starts import found_starts, given_starts
 from dyngs.capture.multi_video.steadiness import STANDS, steadiness
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.readers.shared.camera_sequences import MIN_CAMERAS_TO_HOLD_OUT
+from dyngs.data.images.video import read_numbered_frames
+from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
+from dyngs.data.readers.colmap import TEST_LIST
+from dyngs.data.times import Taken, taken_frames, write_seconds
 from dyngs.errors import DyngsError
 from dyngs.files.containment import MAX_MEGAPIXELS, images_up_to, staying_within
 from dyngs.files.fields import first_few
 from dyngs.files.temporary import temporary_folder_beside
+from dyngs.files.write import write_image, write_text
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+def write_images(root: Path, films: Sequence[Film], taken: Sequence[Taken], report: ReportProgress) -> list[list[str]]:
+    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below ``images`` by camera."""
+    total, done = sum(len(frames.numbers) for frames in taken), 0
+    names: list[list[str]] = []
+    for film, frames in zip(films, taken, strict=True):
+        own = []
+        for number, rgb in read_numbered_frames(film.path, [int(number) for number in frames.numbers]):
+            own.append(f"{film.name}/frame_{number:05d}.png")
+            write_image(root / "images" / own[-1], rgb)
+            done += 1
+            report("frames of the videos", done, total)
+        names.append(own)
+    return names
+
+
+def write_model(
+    root: Path, films: Sequence[Film], names: Sequence[Sequence[str]], standing: pycolmap.Reconstruction
+) -> None:
+    """Write ``root/sparse/0``: a lens for each camera, its one pose for all its images, and the points.
+
+    The first image of each camera has the observations of the points.
+
+    Args:
+        names: images of each.
+        standing: poses, one image for each camera.
+    """
+    import pycolmap
+
+    whole = pycolmap.Reconstruction()
+    posed = {camera_name(image): image for image in standing.images.values() if image.has_pose}
+    first_ids: dict[int, int] = {}
+    image_id = 0
+    for number, (film, own) in enumerate(zip(films, names, strict=True)):
+        image = posed[film.name]
+        lens = standing.cameras[image.camera_id]
+        camera = pycolmap.Camera(
+            camera_id=number + 1, model=lens.model, width=lens.width, height=lens.height, params=lens.params
+        )
+        whole.add_camera_with_trivial_rig(camera)
+        places = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+        for place, name in enumerate(own):
+            image_id += 1
+            seen = places if place == 0 else np.zeros((0, 2))
+            new = pycolmap.Image(name=name, keypoints=seen, camera_id=number + 1, image_id=image_id)
+            whole.add_image_with_trivial_frame(new, image.cam_from_world())
+        first_ids[image.image_id] = image_id - len(own) + 1
+    for number in sorted(standing.points3D):
+        point = standing.points3D[number]
+        track = pycolmap.Track()
+        for element in point.track.elements:
+            if element.image_id in first_ids:
+                track.add_element(first_ids[element.image_id], element.point2D_idx)
+        whole.add_point3D(point.xyz, track, point.color)
+    whole.update_point_3d_errors()
+    folder = root / "sparse" / "0"
+    folder.mkdir(parents=True)
+    whole.write(folder)
+
+
+def write_facts(root: Path, seconds: Mapping[str, float], starts: Mapping[str, float], test: Sequence[str]) -> None:
+    """Write the seconds of the images, which of them are for testing, and when each video begins.
+
+    Args:
+        seconds: image below ``images`` to the second at which it was taken, in the clock of all videos.
+        starts: camera to the second at which its video begins.
+        test: cameras that are held out.
+    """
+    write_seconds(root, {name: round(second, 6) for name, second in seconds.items()})
+    held_out = [name for name in seconds if name.partition("/")[0] in test]
+    if held_out:
+        write_text(root / "sparse" / "0" / TEST_LIST, "".join(f"{name}\n" for name in held_out))
+    rounded = {name: round(start, 6) for name, start in starts.items()}
+    write_text(root / VIDEOS_FILE, json.dumps({"starts": rounded, "test": list(test)}, indent=1) + "\n")
 
 
 @dataclass(frozen=True)
@@ -41,7 +126,7 @@ class VideosOptions:
     """Options for several videos.
 
     Attributes:
-        num_moments: moments to take at most, evenly spaced; None: as many as fit ``moments.MOST_MOMENTS``.
+        num_steps: time steps to take at most, evenly spaced; None: ``times.MOST_STEPS``, fewer for many cameras.
         starts: camera to the second at which its video begins; None: as in ``videos.json``, else found.
         seed: of everything random.
         num_threads: 0 = all cores.
@@ -49,7 +134,7 @@ class VideosOptions:
         max_megapixels: larger videos are refused.
     """
 
-    num_moments: int | None = None
+    num_steps: int | None = None
     starts: dict[str, float] | None = None
     seed: int = 0
     num_threads: int = 0
@@ -77,15 +162,14 @@ class VideosResult:
 def poses_of_videos(
     source: Path, out: Path, options: VideosOptions = VideosOptions(), report: ReportProgress = report_nothing
 ) -> VideosResult:
-    """Make a capture of a folder of videos that ran at once, of cameras that stand.
+    """Make a capture of a folder of videos that ran at once, of fixed cameras.
 
     All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is whole or absent.
 
     Args:
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
-        options: moments, offsets, effort.
-        report: is told how far the work has come.
+        options: time steps, offsets, effort.
 
     Raises:
         DyngsError: a camera that moves, poses or offsets that cannot be found, with what to do; an ``out`` in use.
@@ -119,13 +203,14 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
     if options.starts is not None:
         starts = checked_starts(options.starts, [film.name for film in films], "--start")
     small = small_images(films, report)
-    lines = [_require_standing(source, films, small)]
+    lines = [_require_fixed(source, films, small)]
     films, small, found, line = _posed(work, films, small, options, report)
     lines.append(line)
     watchers = [_watcher(film, images, found.model) for film, images in zip(films, small, strict=True)]
-    begun = found_starts(films, watchers) if starts is None else given_starts(films, starts)
-    lines.append(begun.line)
-    taken, line = taken_frames(films, begun.seconds, options.num_moments)
+    begun, line = found_starts(films, watchers) if starts is None else given_starts(films, starts)
+    lines.append(line)
+    clocks = [film.seconds + start for film, start in zip(films, begun, strict=True)]
+    taken, line = taken_frames(source, clocks, [film.rate for film in films], options.num_steps)
     lines.append(line)
     names = write_images(work, films, taken, report)
     write_model(work, films, names, found.model)
@@ -135,18 +220,14 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
         for own, frames in zip(names, taken, strict=True)
         for name, second in zip(own, frames.seconds, strict=True)
     }
-    write_facts(work, seconds, {film.name: float(x) for film, x in zip(films, begun.seconds, strict=True)}, test)
+    write_facts(work, seconds, {film.name: float(x) for film, x in zip(films, begun, strict=True)}, test)
     if test:
         lines.append(f"held out for testing: {first_few(test)}")
     return lines
 
 
-def _require_standing(source: Path, films: Sequence[Film], small: Sequence[SmallImages]) -> str:
-    """Return a line that says that all cameras stand.
-
-    Raises:
-        DyngsError: one of them moves, or is too short to tell.
-    """
+def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[SmallImages]) -> str:
+    """Return a line that says that all cameras stand."""
     found = [steadiness(images.grey) for images in small]
     moving = [
         f"{film.name} ({'far' if np.isinf(steady.displaced) else f'up to {steady.displaced:.1%} of its width'})"
@@ -166,20 +247,14 @@ def _require_standing(source: Path, films: Sequence[Film], small: Sequence[Small
 
 def _posed(
     work: Path, films: list[Film], small: list[SmallImages], options: VideosOptions, report: ReportProgress
-) -> tuple[list[Film], list[SmallImages], StandingModel, str]:
-    """Return the cameras that have a pose, with their small images, the poses, and a line on them.
-
-    Raises:
-        DyngsError: fewer than two poses.
-    """
+) -> tuple[list[Film], list[SmallImages], FixedModel, str]:
+    """Return the cameras that have a pose, with their small images, the poses, and a line on them."""
     images = []
     for film, shown in zip(films, small, strict=True):
-        images.append(standing_image(film, len(shown.grey)))
+        images.append(image_without_movers(film, len(shown.grey)))
         report("what stands, cameras", len(images), len(films))
     folder = work / "colmap"
-    found = standing_model(
-        films, images, folder, StandingOptions(seed=options.seed, num_threads=options.num_threads), report
-    )
+    found = fixed_model(films, images, folder, SfmOptions(seed=options.seed, num_threads=options.num_threads), report)
     shutil.rmtree(folder)
     names = set() if found is None else {camera_name(image) for image in found.model.images.values() if image.has_pose}
     if found is None or len(names) < 2:

@@ -1,9 +1,9 @@
-"""Videos of a folder: what they are, and small grey images of them that motion is measured in."""
+"""Videos of a folder, small grey images of them, and what ``videos.json`` next to them says."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,8 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo, frame_seconds, probe_video, read_frames
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
+from dyngs.files.fields import first_few, is_number
+from dyngs.files.json_files import read_json_object
 
 SMALL_SIDE = 160
 """Longer side of the small images, px."""
@@ -76,34 +78,18 @@ def videos_in(folder: Path) -> list[Path]:
 
 
 def open_films(folder: Path) -> list[Film]:
-    """Return the videos of a folder, by name.
-
-    Raises:
-        DyngsError: one of them cannot be read.
-    """
+    """Return the videos of a folder, by name."""
     return [open_film(inside(path)) for path in videos_in(folder)]
 
 
 def open_film(path: Path) -> Film:
-    """Return a video.
-
-    Raises:
-        DyngsError: it cannot be read.
-    """
+    """Return a video."""
     info = probe_video(path)
     return Film(path.stem, path, info, np.array(frame_seconds(path, info.num_frames)))
 
 
 def small_images(films: Sequence[Film], report: ReportProgress = report_nothing) -> list[SmallImages]:
-    """Return small grey images of all videos, of the first frames where all would take too much memory.
-
-    Args:
-        films: the videos.
-        report: is told of each video.
-
-    Raises:
-        DyngsError: damage in a video.
-    """
+    """Return small grey images of all videos, of the first frames where all would take too much memory."""
     limit = SMALL_BYTES // max(len(films) * SMALL_SIDE * SMALL_SIDE, 1)
     images = []
     for number, film in enumerate(films):
@@ -127,3 +113,76 @@ def _first(frames: Iterator[np.ndarray], count: int) -> Iterator[np.ndarray]:
         if number >= count:
             return
         yield rgb
+
+
+VIDEOS_FILE = "videos.json"
+MAX_SECONDS = 86_400.0
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is known of several videos beforehand.
+
+    Attributes:
+        starts: camera to the second, in one clock, at which its first frame was taken; None: to be found.
+        test: cameras that are held out; None: the usual rule.
+    """
+
+    starts: dict[str, float] | None = None
+    test: tuple[str, ...] | None = None
+
+
+def read_given(folder: Path, names: Sequence[str]) -> Given:
+    """Read ``videos.json``: ``{"starts": {"cam00": 0, "cam01": 1.25}, "test": ["cam00"]}``; all keys are optional.
+
+    ``"starts": 0`` says that all videos begin at once.
+
+    Args:
+        folder: the videos' folder.
+        names: of all cameras.
+
+    Raises:
+        DyngsError: a camera that is not there or missing, or something that is no number.
+    """
+    path = folder / VIDEOS_FILE
+    if not path.is_file():
+        return Given()
+    fields = read_json_object(path)
+    unknown = sorted(fields.keys() - {"starts", "test"})
+    if unknown:
+        raise DyngsError(f"{path}: unknown key {unknown[0]!r:.60}; there are 'starts' and 'test'")
+    test = fields.get("test")
+    if test is not None and not (isinstance(test, list) and all(name in names for name in test)):
+        raise DyngsError(f"{path}: 'test' must list cameras of {first_few(sorted(names))}, got {test!r:.80}")
+    if test is not None and set(test) == set(names):
+        raise DyngsError(f"{path}: 'test' names all cameras, which leaves none to train on")
+    starts = fields.get("starts")
+    if starts == 0 and is_number(starts):
+        starts = dict.fromkeys(names, 0.0)
+    elif starts is not None and not isinstance(starts, dict):
+        raise DyngsError(f"{path}: 'starts' must map cameras to seconds, or be 0, got {starts!r:.40}")
+    return Given(
+        None if starts is None else checked_starts(starts, names, str(path)), None if test is None else tuple(test)
+    )
+
+
+def checked_starts(starts: Mapping[str, object], names: Sequence[str], where: str) -> dict[str, float]:
+    """Return the seconds at which the videos begin, for every camera.
+
+    Args:
+        starts: camera to seconds, as given.
+        names: of all cameras.
+
+    Raises:
+        DyngsError: a camera that is not there or missing, or something that is no number of at most a day.
+    """
+    unknown = sorted(starts.keys() - set(names))
+    missing = sorted(set(names) - starts.keys())
+    if unknown:
+        raise DyngsError(f"{where}: no video is called {first_few(unknown)}; there are {first_few(sorted(names))}")
+    if missing:
+        raise DyngsError(f"{where}: says nothing on {first_few(missing)}; give the second at which every video begins")
+    for name, second in starts.items():
+        if not (is_number(second) and math.isfinite(second) and abs(second) <= MAX_SECONDS):
+            raise DyngsError(f"{where}: the start of {name} must be a number of seconds, got {second!r:.40}")
+    return {name: float(second) for name, second in starts.items() if is_number(second)}

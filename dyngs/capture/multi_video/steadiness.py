@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
-from dyngs.data.frame_selection import evenly_spaced
+from dyngs.data.times import evenly_spaced
 
 STANDS = 0.002
 """A camera stands if its image is never displaced by more than this fraction of its longer side."""
 SAMPLES = 16
 """Images that are compared with the typical one."""
-SWEEPING = 0.02
-"""Fraction of the longer side by which each image is displaced against the last one where the camera moves fast."""
 _ITERATIONS = 16
 _TOLD, _FLAT = 0.4, 1.0
 """Pixels that are looked at: this fraction of them, where the image changes most, by so many grey levels per pixel."""
@@ -43,7 +42,7 @@ def steadiness(grey: np.ndarray) -> Steadiness:
     """Return how far the images of a video are displaced against their median.
 
     An affine displacement and a change of brightness are fitted to what most pixels show (iterated least squares with
-    Cauchy weights), so that what moves before a camera that stands does not count. A camera that jumps far leaves
+    Cauchy weights), so that what moves before a fixed camera does not count. A camera that jumps far leaves
     no sharp median, and does not fit.
 
     Args:
@@ -118,10 +117,4 @@ def _sampled(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarra
     """Return the image at places in px, bilinear, and which of them lie inside."""
     height, width = image.shape
     is_inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
-    left, top = np.minimum(x.astype(int), max(width - 2, 0)), np.minimum(y.astype(int), max(height - 2, 0))
-    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    fx, fy = x - left, y - top
-    upper = image[top, left] * (1 - fx) + image[top, right] * fx
-    lower = image[below, left] * (1 - fx) + image[below, right] * fx
-    return upper * (1 - fy) + lower * fy, is_inside
+    return map_coordinates(image, [y, x], order=1, mode="nearest"), is_inside

@@ -1,4 +1,4 @@
-"""EXIF tags of images: how they are turned, the focal length, and how much light was let in."""
+"""EXIF tags of images: how they are rotated, the focal length, and how much light was let in."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def tags_of(spec: OpenImageIO.ImageSpec) -> PhotoTags:
 
 
 def is_lying(orientation: int) -> bool:
-    """Whether width and height are exchanged when an image of this orientation is turned upright."""
+    """Whether width and height are exchanged when an image of this orientation is rotated upright."""
     return orientation >= 5
 
 
-def turned_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+def rotated_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return the (H, W, D) image as the orientation of EXIF says it is to be shown; exact."""
     match orientation:
         case 2:

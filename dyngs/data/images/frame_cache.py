@@ -1,6 +1,6 @@
 """Cache of video frames as image files: decoded once, within a disk limit, found again by the video's content.
 
-The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` beside them holds
+The frames of a video lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to them holds
 the video's size and frame rate and marks the folder as ours. Nothing is ever written to a capture. Only files named
 like ours in folders with that mark are removed, never through a link.
 """
@@ -60,11 +60,7 @@ class VideoFrames:
 
 
 def planned_frames(video: Path) -> VideoFrames:
-    """Return the frames of ``video`` and where they are cached; nothing is written.
-
-    Raises:
-        DyngsError: the video cannot be opened.
-    """
+    """Return the frames of ``video`` and where they are cached; nothing is written."""
     inside(video)
     try:
         status = video.stat()
@@ -86,7 +82,6 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
     The least recently used frames of other captures are removed to make room, unless a running process uses them.
 
     Args:
-        root: the capture, for messages.
         frames: image file, as ``planned_frames`` named it, to the frame of a video that it holds.
         limit_mb: 1e6 bytes on disk that all cached frames together may take.
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.data.images.exif import PhotoTags, is_lying, tags_of, turned_upright
+from dyngs.data.images.exif import PhotoTags, is_lying, rotated_upright, tags_of
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside, max_decoded_mb
 from dyngs.files.image_errors import image_error
@@ -25,7 +25,8 @@ _TAIL_BYTES = 4096
 _STRIP_PIXELS = 2**18
 """Pixels of an image that are shrunk at a time."""
 _PNG_END = b"IEND"
-_END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+"""What complete files end in, by suffix."""
 
 
 @dataclass(frozen=True)
@@ -69,16 +70,12 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Read size and channels of an image without decoding it.
-
-    Raises:
-        DyngsError: the file is missing or is no image.
-    """
+    """Read size and channels of an image without decoding it."""
     with _reading(path):
         source = _open(path)
         spec = source.spec()
         source.close()
-        return ImageHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags_of(spec))
+        return _header(spec)
 
 
 def header_if_readable(path: Path) -> ImageHeader | None:
@@ -104,12 +101,9 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
 
     Args:
         path: a file.
-        size: (width, height) of its camera; an image that has this shape only when it is turned as its EXIF tag says
-            is turned. None: as stored.
+        size: (width, height) of its camera; an image that has this shape only when it is rotated as its EXIF tag says
+            is rotated. None: as stored.
         upright: turn it as its EXIF tag says in any case.
-
-    Raises:
-        DyngsError: the file is missing, truncated, no image, or larger than ``data.max_megapixels``.
     """
     with _reading(path):
         return _decoded(path, size, upright)
@@ -124,7 +118,7 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
 
     source = _open(path)
     spec = source.spec()
-    tags = tags_of(spec)
+    header = _header(spec)
     check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
     is_linear = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
     pixels = source.read_image(oiio.FLOAT if is_linear else oiio.UINT8)
@@ -135,11 +129,11 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
         reason = message or "the data ends early"
         raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
-    header = ImageHeader(spec.width, spec.height, spec.nchannels, spec.alpha_channel >= 0, tags)
     if upright or (size is not None and header.size_for(size) != header.size):
-        pixels = turned_upright(pixels, tags.orientation)
-    alpha = pixels[..., spec.alpha_channel] if spec.alpha_channel >= 0 else None
-    colour_channels = [i for i in range(spec.nchannels) if i != spec.alpha_channel]
+        pixels = rotated_upright(pixels, header.tags.orientation)
+    alpha_channel = _alpha_channel(spec)
+    alpha = None if alpha_channel is None else pixels[..., alpha_channel]
+    colour_channels = [i for i in range(spec.nchannels) if i != alpha_channel]
     if not colour_channels:
         raise DyngsError(f"{path}: the image has no colour channel; use an RGB or RGBA image")
     colour_channels = colour_channels[:3] if len(colour_channels) >= 3 else colour_channels[:1] * 3
@@ -150,11 +144,7 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
 
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
-    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers.
-
-    Raises:
-        DyngsError: as ``read_image``.
-    """
+    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers."""
     import OpenImageIO as oiio
 
     with _reading(path):
@@ -171,23 +161,15 @@ def read_raw(path: Path) -> tuple[np.ndarray, bool]:
 
 
 def read_mask(path: Path) -> Tensor:
-    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half.
-
-    Raises:
-        DyngsError: as ``read_image``.
-    """
+    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one half."""
     return read_image(path)[..., :3].float().mean(dim=-1) >= 127.5
 
 
 def check_image(path: Path) -> ImageHeader:
-    """Read the header and check that the file is very likely complete; a JPEG without end marker is decoded for that.
-
-    Raises:
-        DyngsError: the file is missing, truncated or no image.
-    """
+    """Read the header and check that the file is very likely complete; a JPEG without an end is decoded for that."""
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
-    marker = _END_MARKERS.get(path.suffix.lower())
+    marker = END_MARKERS.get(path.suffix.lower())
     if marker:
         with _reading(path), path.open("rb") as file:
             file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
@@ -210,7 +192,7 @@ def target_size(width: int, height: int, downscale: float = 1.0, longest_side: i
 def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
     """Return a (height, width, D) image; each pixel is the exact mean of the area of ``pixels`` (H, W, D) it covers.
 
-    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered share.
+    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered fraction.
     """
     return _shrink_axis(_shrink_axis(pixels, 0, _all_of(pixels.shape[0], height)), 1, _all_of(pixels.shape[1], width))
 
@@ -264,6 +246,16 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
     return source
 
 
+def _header(spec: OpenImageIO.ImageSpec) -> ImageHeader:
+    has_alpha = _alpha_channel(spec) is not None
+    return ImageHeader(spec.width, spec.height, spec.nchannels, has_alpha, tags_of(spec))
+
+
+def _alpha_channel(spec: OpenImageIO.ImageSpec) -> int | None:
+    """Return the index of alpha; OpenImageIO counts it from 1 for GIF."""
+    return min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel >= 0 else None
+
+
 def _encode_linear(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     """uint8 sRGB and alpha from linear premultiplied floats."""
     rgb = np.nan_to_num(rgb, nan=0.0, posinf=1.0, neginf=0.0)
@@ -297,7 +289,7 @@ def _shrink_axis(pixels: Tensor, axis: int, span: _Span) -> Tensor:
         return pixels
     if size > old:
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
-    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the shares exact.
+    # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the fractions exact.
     starts = torch.arange(span.begin, span.end + 1, device=pixels.device) * old
     first = starts[:-1] // size
     shape = [1] * pixels.ndim

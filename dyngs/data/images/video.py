@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from dyngs.data.images.exif import rotated_upright
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import check_size
 from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
@@ -30,7 +32,7 @@ class VideoInfo:
     """Size, length and frame rate of a video.
 
     Attributes:
-        width, height: pixels of an image, turned as the rotation tag says.
+        width, height: pixels of an image, rotated as the rotation tag says.
         num_frames: images that there should be; those of a truncated file may not all be readable.
         fps: mean images per second, 0 if the file does not say.
     """
@@ -48,7 +50,7 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
         DyngsError: no such file, no video in it, or damage (at the damaged place).
     """
     for _, frame in _decoded(path, "AUTO"):
-        yield _turned_rgb(frame)
+        yield _rotated_rgb(frame)
 
 
 def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
@@ -56,9 +58,6 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
 
     One image is in memory at a time. Nothing behind the last wanted one is decoded; unwanted ones before it are (each
     image builds on others), but not converted.
-
-    Raises:
-        DyngsError: as ``read_frames``; a wanted image is damaged or missing: names its number.
     """
     wanted = set(numbers)
     left = len(wanted)
@@ -68,7 +67,7 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
             continue
         if frame.is_corrupt:
             raise _broken(path, index, "its data is damaged")
-        yield index, _turned_rgb(frame)
+        yield index, _rotated_rgb(frame)
         left -= 1
         if left == 0:
             return
@@ -87,7 +86,7 @@ def probe_video(path: Path) -> VideoInfo:
     first = next((frame for _, frame in _decoded(path)), None)
     if first is None:
         raise _broken(path, 0, "it holds no image")
-    height, width = _turned_rgb(first).shape[:2]
+    height, width = _rotated_rgb(first).shape[:2]
     counted = hidden = 0
     with _reading(path), opened_video(path) as container:
         stream = container.streams.video[0]
@@ -109,9 +108,6 @@ def frame_seconds(path: Path, num_frames: int) -> list[float]:
 
     Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or too few, the mean
     rate does, and 30 frames per second where the file names none either.
-
-    Raises:
-        DyngsError: as ``probe_video``.
     """
     from av.error import FFmpegError
 
@@ -187,7 +183,24 @@ def _broken(path: Path, index: int, why: str) -> DyngsError:
     )
 
 
-def _turned_rgb(frame: av.VideoFrame) -> np.ndarray:
-    rgb = frame.to_ndarray(format="rgb24")
-    quarter_turns = round(getattr(frame, "rotation", 0) / 90) % 4
-    return np.ascontiguousarray(np.rot90(rgb, quarter_turns))
+def orientation_of(frame: av.VideoFrame) -> int:
+    """Return how a frame is to be shown, as EXIF numbers it: 1 upright, 2 mirrored, 3 by 180 degrees, and so on to 8.
+
+    By its display matrix, which maps (x, y) to (a x + c y, b x + d y), rounded to quarter turns.
+    """
+    found: list[Any] = list(frame.side_data)
+    matrix = next((bytes(x) for x in found if x.type.name == "DISPLAYMATRIX"), b"")
+    if len(matrix) < 36:
+        return 1
+    a, b, _, c, d = struct.unpack("9i", matrix[:36])[:5]
+    if abs(a) + abs(d) >= abs(b) + abs(c):
+        return {(1, 1): 1, (-1, 1): 2, (-1, -1): 3, (1, -1): 4}[_sign(a), _sign(d)]
+    return {(1, 1): 5, (1, -1): 6, (-1, -1): 7, (-1, 1): 8}[_sign(b), _sign(c)]
+
+
+def _sign(x: int) -> int:
+    return -1 if x < 0 else 1
+
+
+def _rotated_rgb(frame: av.VideoFrame) -> np.ndarray:
+    return rotated_upright(frame.to_ndarray(format="rgb24"), orientation_of(frame))

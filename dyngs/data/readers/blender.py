@@ -1,18 +1,21 @@
-"""Reader for Blender captures: NeRF-synthetic, and with ``time`` per frame D-NeRF."""
+"""Readers of transforms files: Blender (NeRF-synthetic, D-NeRF), nerfstudio and instant-ngp, people with body files."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
-from dyngs.data.capture import Capture, Split, Splits
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.point_files import FoundPoints, find_points
-from dyngs.data.readers.shared.transforms import read_frame_file, read_views, tracks_path_of
-
-
-def is_blender(root: Path) -> bool:
-    """Whether the folder holds ``transforms_train.json``."""
-    return (root / "transforms_train.json").is_file()
+from dyngs.data.body_frames import read_body_file, rows_of
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Split, Splits, View
+from dyngs.data.readers.transforms import (
+    FoundPoints,
+    FrameFile,
+    find_points,
+    read_frame_file,
+    read_views,
+    tracks_path_of,
+)
+from dyngs.errors import DyngsError
 
 
 def read_blender(root: Path) -> Capture:
@@ -20,9 +23,6 @@ def read_blender(root: Path) -> Capture:
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
     Points: see ``find_points``.
-
-    Raises:
-        DyngsError: see ``dyngs.data.readers.shared.transforms.read_views``.
     """
     splits: Splits = {}
     warnings: list[str] = []
@@ -47,4 +47,113 @@ def read_blender(root: Path) -> Capture:
     )
 
 
-FORMAT = CaptureFormat("blender", "transforms_train.json", is_blender, read_blender)
+FORMAT = CaptureFormat(
+    "blender", "transforms_train.json", lambda root: (root / "transforms_train.json").is_file(), read_blender
+)
+
+
+def read_nerfstudio(root: Path) -> Capture:
+    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if there, a ``.ply`` file of points.
+
+    The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val list without a test
+    list is used for testing. Points and poses are read as they stand: ``applied_transform``
+    has been applied to both.
+    """
+    file = read_frame_file(root / "transforms.json")
+    views, warnings = read_views(file)
+    splits, notes = _nerfstudio_splits(file, views)
+    found = find_points(file)
+    return Capture(
+        root,
+        "nerfstudio",
+        splits,
+        found.points,
+        fps=file.fps,
+        points_file=found.path,
+        tracks_path=tracks_path_of(file),
+        warnings=(*warnings, *notes, *found.warnings),
+    )
+
+
+def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:
+    """Splits by the lists in the file, all views for training where it has none; and warnings."""
+    names: tuple[Split, ...] = ("train", "val", "test")
+    listed = {name: file.fields.get(f"{name}_filenames") for name in names}
+    if all(value is None for value in listed.values()):
+        return {"train": tuple(views.values())}, []
+    splits: Splits = {}
+    unknown: list[str] = []
+    for name in names:
+        value = listed[name]
+        if value is None:
+            continue
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise DyngsError(f"{file.path}: '{name}_filenames' must be a list of file paths")
+        splits[name] = tuple(views[item] for item in dict.fromkeys(value) if item in views)
+        unknown += [item for item in value if item not in views]
+    held_out = {view.name for kept in splits.values() for view in kept}
+    splits.setdefault("train", tuple(view for view in views.values() if view.name not in held_out))
+    if "test" not in splits and "val" in splits:
+        splits["test"] = splits.pop("val")
+    used = {view.name for kept in splits.values() for view in kept}
+    notes = [f"{len(unknown)} listed images have no frame, first {unknown[0]}"] if unknown else []
+    if len(used) < len(views):
+        notes.append(f"{len(views) - len(used)} frames are in no split and are ignored")
+    return splits, notes
+
+
+NERFSTUDIO_FORMAT = CaptureFormat(
+    "nerfstudio", "transforms.json", lambda root: (root / "transforms.json").is_file(), read_nerfstudio
+)
+
+
+_TRAIN = "body_train.npz"
+_NEW_POSES = cast(Split, "pose")
+
+
+def read_body_json(root: Path) -> Capture:
+    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first file are optional.
+
+    Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T, 3), betas and, if
+    there, scale; row n is for the frame whose ``frame`` is n. Without such a file, val and test show the frames of
+    train. ``surface_model_type`` "anny" says that betas are of the free template's shape space.
+    ``pose`` is another clip, with frame numbers, times and parameters of its own. Parameters and cameras share
+    one world; unlike with AMASS files nothing is rotated to make it y up.
+    """
+    capture = read_blender(root)  # whose points are of no use: people begin on a template
+    splits, warnings = dict(capture.splits), capture.warnings
+    path = root / "transforms_pose.json"
+    if path.is_file():
+        views, notes = read_views(read_frame_file(path))
+        splits[_NEW_POSES] = tuple(views.values())
+        warnings = (*warnings, *(f"{path.name}: {note}" for note in notes))
+    train = read_body_file(root / _TRAIN)
+    body: dict[Split, BodyFrames] = {name: _body_of(root, name, views, train) for name, views in splits.items()}
+    return capture.replace(
+        format="body_json",
+        splits=splits,
+        points=None,
+        points_file=None,
+        body={"val": train, "test": train, **body},
+        warnings=warnings,
+    )
+
+
+def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrames) -> BodyFrames:
+    path = root / f"body_{split}.npz"
+    if not path.is_file() and split == _NEW_POSES:
+        raise DyngsError(
+            f"{path}: no such file; transforms_pose.json shows another clip, which needs its own parameters"
+        )
+    body = read_body_file(path) if path.is_file() and split != "train" else train
+    rows_of(path if path.is_file() else root / _TRAIN, body, views)
+    return body
+
+
+BODY_FORMAT = CaptureFormat(
+    "body_json",
+    "transforms_train.json and body_train.npz",
+    lambda root: (root / "transforms_train.json").is_file() and any(root.glob("body_*.npz")),
+    read_body_json,
+    extends="blender",
+)

@@ -1,40 +1,163 @@
-"""Reader for sequences of several static cameras: a folder or a video file per camera, and ``cameras.json``."""
+"""Readers for sequences of fixed cameras, a folder or a video each: cameras.json, and LLFF's poses_bounds.npy (N3V)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dyngs.data.capture import Capture, Splits, View
-from dyngs.data.geometry.poses import checked_pose, opengl_from_cam
-from dyngs.data.readers.shared.camera_sequences import (
-    MIN_CAMERAS_TO_HOLD_OUT,
-    find_cameras,
-    open_camera,
-    sequence_views,
-    video_fps,
-)
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.transforms import MAX_FPS
+import numpy as np
+
+from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
+from dyngs.data.geometry import OPENGL_FROM_OPENCV, checked_pose, match_size, opengl_from_cam, rescale_warning
+from dyngs.data.images.frame_cache import VideoFrames, planned_frames
+from dyngs.data.images.images import SUFFIXES
+from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo
+from dyngs.data.readers.transforms import MAX_FPS, Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.fields import first_few, is_number, matrix_of
 from dyngs.files.json_files import read_json_object
+from dyngs.files.numpy_files import read_npy
 
-CALIBRATION = "cameras.json"
+MIN_CAMERAS_TO_HOLD_OUT = 3
+"""From this number on, the first camera is for testing where the capture names none."""
 
 
 @dataclass(frozen=True)
-class _CalibrationFile:
-    """The fields of ``cameras.json``: camera name to calibration, frames per second, and ``test`` as written."""
+class CameraSource:
+    """The images of one camera.
 
-    cameras: dict[str, object]
-    fps: float | None
-    test: object
+    Attributes:
+        name: name of its folder, or of its video without the suffix.
+        images: frame number to file; frames of a video may have to be decoded first.
+        video: frames of the video, None for a folder.
+    """
+
+    name: str
+    images: dict[int, Path]
+    video: VideoFrames | None = None
 
 
-def is_camera_folders(root: Path) -> bool:
-    """Whether the folder holds ``cameras.json``."""
-    return (root / CALIBRATION).is_file()
+def find_cameras(root: Path) -> dict[str, Path]:
+    """Map camera names, sorted, to folders of images, or to video files where there is no such folder.
+
+    Images lie in the folder itself or in ``images`` below it.
+
+    Raises:
+        DyngsError: two videos for one camera.
+    """
+    found: dict[str, Path] = {}
+    for path in sorted(root.iterdir()):
+        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and not path.name.startswith("."):
+            if path.stem in found:
+                raise DyngsError(f"{root}: {found[path.stem].name} and {path.name} are one camera; remove one of them")
+            found[path.stem] = path
+    for path in sorted(root.iterdir()):
+        if path.is_dir() and not path.name.startswith("."):
+            folder = next((f for f in (path, path / "images") if _images(f)), None)
+            if folder is not None:
+                found[path.name] = folder
+    return dict(sorted(found.items()))
+
+
+def open_camera(name: str, path: Path) -> CameraSource:
+    """List the images of the camera that ``find_cameras`` found at ``path``.
+
+    Raises:
+        DyngsError: an image without a number, two with the same one, or a video that cannot be opened.
+    """
+    if path.is_file():
+        planned = planned_frames(path)
+        return CameraSource(name, dict(enumerate(planned.paths)), planned)
+    images: dict[int, Path] = {}
+    for image in _images(path):
+        digits = re.findall(r"\d+", image.stem)
+        if not digits:
+            raise DyngsError(f"{image}: no frame number in its name; call it frame_0000{image.suffix} or the like")
+        other = images.setdefault(int(digits[-1]), image)
+        if other != image:
+            raise DyngsError(f"{path}: {other.name} and {image.name} have the same frame number; remove one of them")
+    return CameraSource(name, images)
+
+
+def sequence_views(
+    path: Path, cameras: Sequence[CameraSource], calibrations: Mapping[str, dict[str, object]]
+) -> tuple[dict[str, tuple[View, ...]], list[str]]:
+    """Return the views of each camera, and warnings; times run from 0 at the lowest frame number to 1 at the highest.
+
+    Args:
+        path: the calibration file in the capture's folder.
+        cameras: in the order of their ``camera_id``.
+        calibrations: by camera name, the fields of a frame in a transforms file: ``fl_x``, ``transform_matrix``, ...
+    """
+    numbers = sorted({number for camera in cameras for number in camera.images})
+    span = max(numbers[-1] - numbers[0], 1)
+    views: dict[str, tuple[View, ...]] = {}
+    warnings = _rate_warning(cameras)
+    for index, camera in enumerate(cameras):
+        own = dict(calibrations[camera.name])
+        where = f"{path}, camera {camera.name}"
+        if camera.video is not None and ("w" not in own or "h" not in own):
+            own |= {"w": camera.video.info.width, "h": camera.video.info.height}
+        frames = []
+        for number, image in sorted(camera.images.items()):
+            times = {"frame": number, "time": (number - numbers[0]) / span}
+            fields = {**own, **times, "file_path": str(image), "camera": index}
+            video = None if camera.video is None else VideoFrame(camera.video.source, number)
+            frames.append(Frame(where, fields, {}, image, video))
+        read, notes = read_views(FrameFile(path, {}, tuple(frames)))
+        views[camera.name], more = tuple(read.values()), []
+        if camera.video is not None:
+            views[camera.name], more = _at_video_size(camera.name, camera.video.info, views[camera.name], where)
+        warnings += [*notes, *more]
+    return views, warnings
+
+
+def video_fps(cameras: Sequence[CameraSource]) -> float | None:
+    """Return the frame rate of the first video that has one, None if none has."""
+    rates = (camera.video.info.fps for camera in cameras if camera.video is not None)
+    return next((fps for fps in rates if fps > 0), None)
+
+
+def _at_video_size(
+    name: str, video: VideoInfo, views: tuple[View, ...], where: str
+) -> tuple[tuple[View, ...], list[str]]:
+    """Return the views named after the video and with its size: its frames may not be decoded yet."""
+    sized, rescaled = [], []
+    for view in views:
+        described = (view.width, view.height)
+        intrinsics, size, changed = match_size(view.intrinsics, described, (video.width, video.height), where)
+        rescaled += [where] if changed else []
+        frame = f"{name}/{view.image_path.stem}"
+        sized.append(replace(view, name=frame, intrinsics=intrinsics, width=size[0], height=size[1]))
+    return tuple(sized), rescale_warning(rescaled)
+
+
+def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
+    videos = [
+        (camera.name, camera.video.info.fps)
+        for camera in cameras
+        if camera.video is not None and camera.video.info.fps > 0
+    ]
+    odd = [(name, fps) for name, fps in videos if not math.isclose(fps, videos[0][1], rel_tol=0.01)]
+    if not odd:
+        return []
+    first, (name, fps) = videos[0], odd[0]
+    return [
+        f"{first[0]} has {first[1]:g} frames per second, {name} {fps:g}: frames of one number are taken for "
+        "simultaneous; convert the videos to one rate"
+    ]
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+
+
+CALIBRATION = "cameras.json"
 
 
 def read_camera_folders(root: Path) -> Capture:
@@ -43,13 +166,9 @@ def read_camera_folders(root: Path) -> Capture:
     The file holds ``{"cameras": {NAME: {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", .., "transform_matrix" (OpenGL
     camera-to-world) or "cam_from_world" (OpenCV)}}, "fps": .., "test": [NAME, ..]}``. Without ``test`` the first camera
     is held out where there are three or more. Times run from the first frame number to the last one.
-
-    Raises:
-        DyngsError: broken or incomplete calibration, no images, images without a number in their name, bad videos.
     """
     path = root / CALIBRATION
-    file = _read_calibration(path)
-    calibrated = file.cameras
+    calibrated, fps, test = _read_calibration(path)
     found = find_cameras(root)
     names = [name for name in sorted(calibrated) if name in found]
     if not names:
@@ -64,12 +183,12 @@ def read_camera_folders(root: Path) -> Capture:
     cameras = [open_camera(name, found[name]) for name in names]
     own = {name: _calibration(calibrated[name], f"{path}, camera {name}") for name in names}
     views, notes = sequence_views(path, cameras, own)
-    splits, more = _splits(path, file.test, views)
-    fps = file.fps or video_fps(cameras)
-    return Capture(root, "camera_folders", splits, fps=fps, warnings=(*warnings, *notes, *more))
+    splits, more = _splits(path, test, views)
+    return Capture(root, "camera_folders", splits, fps=fps or video_fps(cameras), warnings=(*warnings, *notes, *more))
 
 
-def _read_calibration(path: Path) -> _CalibrationFile:
+def _read_calibration(path: Path) -> tuple[dict[str, object], float | None, object]:
+    """Return camera name to calibration, frames per second, and ``test`` as written."""
     wrong = "must be an object whose 'cameras' maps camera names to calibrations"
     fields = read_json_object(path, wrong)
     cameras = fields.get("cameras")
@@ -78,7 +197,7 @@ def _read_calibration(path: Path) -> _CalibrationFile:
     fps = fields.get("fps")
     if fps is not None and not (is_number(fps) and 0 < fps < MAX_FPS):
         raise DyngsError(f"{path}: 'fps' must be a positive number, got {fps!r:.40}")
-    return _CalibrationFile(cameras, None if fps is None else float(fps), fields.get("test"))
+    return cameras, None if fps is None else float(fps), fields.get("test")
 
 
 def _calibration(value: object, where: str) -> dict[str, object]:
@@ -117,4 +236,83 @@ def _splits(path: Path, test: object, views: dict[str, tuple[View, ...]]) -> tup
     }, notes
 
 
-FORMAT = CaptureFormat("camera_folders", CALIBRATION, is_camera_folders, read_camera_folders)
+FORMAT = CaptureFormat("camera_folders", CALIBRATION, lambda root: (root / CALIBRATION).is_file(), read_camera_folders)
+
+
+POSES = "poses_bounds.npy"
+
+
+def read_llff(root: Path) -> Capture:
+    """Read ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, sorted by name.
+
+    Each row holds a 3x5 matrix, row by row, and the near and far bounds (not used). Its columns: the camera's down,
+    right and backward axes and its position in the world, then height, width and focal length of the full image in
+    pixels (Mildenhall et al. 2019). The first camera is the test view, as in N3V.
+
+    Raises:
+        DyngsError: an unreadable file, rows and cameras that differ in number, bad poses, images or videos.
+    """
+    path = root / POSES
+    rows = _read_rows(path)
+    found = find_cameras(root)
+    # There may be folders of other programs, too.
+    found = {name: at for name, at in found.items() if re.fullmatch(r"cam[-_]?\d+", name, re.IGNORECASE)} or found
+    names = list(found)
+    if len(names) != len(rows):
+        ends = f" ({names[0]} to {names[-1]})" if names else ""
+        few = "restore the missing ones" if len(names) < len(rows) else "remove those without a pose"
+        raise DyngsError(
+            f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there"
+            f"{ends}{_gaps(names)}; {few}, or remove the rows of cameras that are not there"
+        )
+    cameras = [open_camera(name, found[name]) for name in names]
+    calibrations = {name: _llff_calibration(row) for name, row in zip(names, rows, strict=True)}
+    views, notes = sequence_views(path, cameras, calibrations)
+    numbers = [int(digits) for name in names for digits in re.findall(r"\d+$", name)]
+    if numbers != sorted(numbers):
+        notes.append(f"{path.name}: its rows are matched with cameras in the order {', '.join(names[:4])}, .. by name")
+    return Capture(root, "llff", _llff_splits(views, names), fps=video_fps(cameras), warnings=tuple(notes))
+
+
+def _read_rows(path: Path) -> np.ndarray:
+    """Read the (V, 17) float64 rows of ``poses_bounds.npy``."""
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+        raise DyngsError(f"{path}: must have 17 columns, one row per camera; got shape {rows.shape}")
+    bad = ~np.isfinite(rows[:, :15]).all(axis=1)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DyngsError(f"{path}: row {row} holds NaN or infinite numbers; repair it or remove this camera")
+    return rows
+
+
+def _llff_calibration(row: np.ndarray) -> dict[str, object]:
+    matrix = row[:15].reshape(3, 5)
+    down, right, backward, position, (height, width, focal) = matrix.T
+    world_from_cam = np.eye(4)
+    world_from_cam[:3] = np.stack([right, down, -backward, position], axis=1)
+    return {
+        "fl_x": float(focal),
+        "w": float(width),
+        "h": float(height),
+        "transform_matrix": (world_from_cam @ OPENGL_FROM_OPENCV).tolist(),
+    }
+
+
+def _llff_splits(views: dict[str, tuple[View, ...]], names: list[str]) -> Splits:
+    """Hold out the first camera for testing if there is another one to train on."""
+    test = names[:1] if len(names) > 1 else []
+    return {
+        "train": tuple(view for name in names[len(test) :] for view in views[name]),
+        "test": tuple(view for name in test for view in views[name]),
+    }
+
+
+def _gaps(names: list[str]) -> str:
+    """Say which numbers are missing between the first and the last name."""
+    numbers = {int(digits) for name in names for digits in re.findall(r"\d+$", name)}
+    missing = sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
+    return f", without number {', '.join(map(str, missing[:5]))}" if 0 < len(missing) < len(numbers) else ""
+
+
+LLFF_FORMAT = CaptureFormat("llff", POSES, lambda root: (root / POSES).is_file(), read_llff)

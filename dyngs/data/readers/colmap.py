@@ -1,26 +1,27 @@
-"""Reader for COLMAP models, binary or text, through pycolmap."""
+"""Reader for COLMAP models, binary or text, through pycolmap, after a check of their structure.
+
+pycolmap trusts the counts in binary files: a truncated file can hang or abort the process."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import struct
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View
-from dyngs.data.frame_seconds import read_seconds
-from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
-from dyngs.data.geometry.poses import checked_pose, repair_warning
+from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View
+from dyngs.data.geometry import checked_pose, match_size, pinhole_matrix, repair_warning, rescale_warning
 from dyngs.data.images.images import SUFFIXES, header_if_readable
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.colmap_check import check_model_file
-from dyngs.data.readers.shared.transforms import view_name
+from dyngs.data.readers.transforms import view_name
+from dyngs.data.times import read_seconds
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 
 if TYPE_CHECKING:
     import pycolmap
+
 
 TEST_LIST = "test.txt"
 """Names of the images for testing, a line each, in the model's folder (as 3DGS has it)."""
@@ -61,10 +62,6 @@ def read_colmap(root: Path) -> Capture:
 
     Registered images become training views, but for those that ``test.txt`` in the model's folder lists; distorted
     camera models are kept as ``View.lens``.
-
-    Raises:
-        DyngsError: incomplete or inconsistent model files, no ``images`` folder, an unsupported camera model, images
-            whose aspect ratio is not their camera's.
     """
     folder = find_model(root)
     if folder is None:
@@ -112,9 +109,6 @@ def read_colmap(root: Path) -> Capture:
 
 def pinhole_and_lens(camera: pycolmap.Camera, where: str) -> tuple[np.ndarray, Lens]:
     """Return the (3, 3) matrix and the lens distortion of a COLMAP camera.
-
-    Args:
-        where: the image, for messages.
 
     Raises:
         DyngsError: the camera model is not one that OpenCV's formulas express, or a parameter is not usable.
@@ -204,3 +198,131 @@ def _warnings(folder: Path, model: pycolmap.Reconstruction, views: list[View], h
 
 
 FORMAT = CaptureFormat("colmap", f"cameras.bin or cameras.txt in {', '.join(MODEL_FOLDERS)}", is_colmap, read_colmap)
+
+
+# Number of parameters by camera model id, in COLMAP's numbering.
+_NUM_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
+_TEXT_FIELDS = {"cameras": 5, "images": 10, "points3D": 8}
+
+
+class _Bytes:
+    """Bytes of a file with a read position; running out of bytes is an error that names the file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data = path.read_bytes()
+        self.at = 0
+
+    def take(self, layout: struct.Struct) -> tuple[int, ...]:
+        begin = self.at
+        self.skip(layout.size)
+        return layout.unpack_from(self.data, begin)
+
+    def skip(self, size: int) -> None:
+        self.at += size
+        if self.at > len(self.data):
+            self.fail()
+
+    def skip_string(self) -> None:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            self.fail()
+        self.at = end + 1
+
+    def fail(self) -> None:
+        raise DyngsError(f"{self.path}: the COLMAP file is truncated ({len(self.data)} bytes); copy or export it again")
+
+
+def check_model_file(path: Path) -> None:
+    """Check that a model file (``cameras|images|points3D|rigs|frames``, ``.bin`` or ``.txt``) is complete.
+
+    Raises:
+        DyngsError: missing, truncated, trailing bytes, or text lines with too few fields.
+    """
+    if not inside(path).is_file():
+        raise DyngsError(f"{path}: the COLMAP model lacks this file; export the whole model again")
+    if path.suffix == ".txt":
+        _check_text(path)
+        return
+    source = _Bytes(path)
+    for _ in range(source.take(_COUNT)[0]):
+        {"cameras": _skip_camera, "rigs": _skip_rig}.get(path.stem, _skip_record)(source)
+    if source.at != len(source.data):
+        extra = len(source.data) - source.at
+        raise DyngsError(f"{path}: {extra} bytes follow the end of the COLMAP file; copy or export it again")
+
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_RIG = struct.Struct("<II")
+_SENSOR = struct.Struct("<iIB")
+_SENSORS = struct.Struct("<I")
+_POSE_BYTES = 7 * 8
+_RECORDS = {
+    "images": (4 + _POSE_BYTES + 4, _COUNT, 24),
+    "points3D": (8 + 3 * 8 + 3 + 8, _COUNT, 8),
+    "frames": (8 + _POSE_BYTES, _SENSORS, 16),
+}
+"""Bytes of a record, then of images a name, then a count and the bytes of each item that it counts."""
+
+
+def _skip_camera(source: _Bytes) -> None:
+    camera, model, _, _ = source.take(_CAMERA)
+    if not 0 <= model < len(_NUM_PARAMS):
+        raise DyngsError(f"{source.path}: camera {camera} has the unknown model id {model}; undistort with COLMAP")
+    source.skip(8 * _NUM_PARAMS[model])
+
+
+def _skip_rig(source: _Bytes) -> None:
+    _, sensors = source.take(_RIG)
+    source.skip(8 if sensors else 0)
+    for _ in range(sensors - 1):
+        has_pose = source.take(_SENSOR)[2]
+        source.skip(_POSE_BYTES if has_pose else 0)
+
+
+def _skip_record(source: _Bytes) -> None:
+    size, count, item_size = _RECORDS[source.path.stem]
+    source.skip(size)
+    if source.path.stem == "images":
+        source.skip_string()
+    source.skip(item_size * source.take(count)[0])
+
+
+def _check_text(path: Path) -> None:
+    """Check that there are as many entries as the header says, if it does, and that each has all its fields."""
+    if path.stem not in _TEXT_FIELDS:
+        return
+    announced, entries = None, 0
+    for number, line in _entry_lines(path):
+        if line.startswith("#"):
+            announced = _announced_count(line) if announced is None else announced
+            continue
+        entries += 1
+        if len(line.split()) < _TEXT_FIELDS[path.stem]:
+            raise DyngsError(f"{path}, line {number}: the line is truncated; copy or export the file again")
+    if announced is not None and entries < announced:
+        raise DyngsError(f"{path}: truncated, holds {entries} of {announced} entries; copy or export the file again")
+
+
+def _entry_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield numbered comments and first lines of entries; in images.txt each entry has a second line, perhaps empty."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            skip_next = False
+            for number, line in enumerate(file, start=1):
+                line = line.strip()
+                if skip_next:
+                    skip_next = False
+                elif line:
+                    skip_next = path.stem == "images" and not line.startswith("#")
+                    yield number, line
+    except (OSError, UnicodeDecodeError) as error:
+        raise DyngsError(f"{path}: cannot be read ({error})") from None
+
+
+def _announced_count(comment: str) -> int | None:
+    """Return N of a comment like ``# Number of images: N, mean ...``."""
+    head, _, tail = comment.partition(":")
+    digits = tail.strip().split(",")[0].strip()
+    return int(digits) if "Number of" in head and digits.isdigit() else None

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Capture, PointCloud, Splits
-from dyngs.data.geometry.poses import OPENGL_FROM_OPENCV
+from dyngs.data.capture import Capture, CaptureFormat, PointCloud, Splits
+from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, header_if_readable
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
+from dyngs.data.readers.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.fields import is_number
 from dyngs.files.json_files import read_json_object
@@ -39,20 +38,12 @@ class _Images:
     files: dict[str, Path]
 
 
-def is_nerfies(root: Path) -> bool:
-    """Whether the folder holds ``dataset.json`` and the folder ``camera``."""
-    return (root / "dataset.json").is_file() and (root / "camera").is_dir()
-
-
 def read_nerfies(root: Path) -> Capture:
     """Read the capture, in the world scaled as ``scene.json`` says, with the largest images that exist.
 
     Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th image); the time is
     ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if present, are the sparse points, grey.
     Cameras (Park et al. 2021): ``orientation`` has the camera's OpenCV axes as rows, ``position`` is its centre.
-
-    Raises:
-        DyngsError: anything missing, broken or inconsistent; names the file.
     """
     dataset = read_json_object(root / "dataset.json")
     lists = {key: _ids(root, dataset, key) for key in ("ids", "train_ids", "val_ids")}
@@ -218,4 +209,9 @@ def _points(path: Path, scene: _Scene) -> PointCloud | None:
     return PointCloud(scene.apply(xyz), np.full(xyz.shape, 128, np.uint8)) if len(xyz) else None
 
 
-FORMAT = CaptureFormat("nerfies", "dataset.json and camera/", is_nerfies, read_nerfies)
+FORMAT = CaptureFormat(
+    "nerfies",
+    "dataset.json and camera/",
+    lambda root: (root / "dataset.json").is_file() and (root / "camera").is_dir(),
+    read_nerfies,
+)

@@ -10,10 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import BodyFrames, Capture, Silhouette, Split, Splits, View
-from dyngs.data.geometry.poses import checked_pose
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Split, Splits, View
+from dyngs.data.geometry import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
-from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, first_few, numbers_of
@@ -25,11 +24,6 @@ ALIGNMENTS = "alignments.npy"
 FITS = ("smpl_output_optimized.pkl", "smpl_output_romp.pkl")
 
 
-def is_neuman(root: Path) -> bool:
-    """Whether the folder holds a COLMAP model and one of the files of body parameters."""
-    return is_colmap(root) and any((root / name).is_file() for name in (ALIGNED, ALIGNMENTS, *FITS))
-
-
 def read_neuman(root: Path) -> Capture:
     """Read the capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's world and unit.
 
@@ -38,15 +32,7 @@ def read_neuman(root: Path) -> Capture:
     (pose, betas of one person) with ``alignments.npy`` (image name to a (4, 3) matrix M, ``world = [v 1] M``). Masks
     in ``segmentations`` under the images' names are black where the person is. Splits are those of
     ``{train,val,test}_split.txt``, if there.
-
-    Raises:
-        DyngsError: anything missing, broken or inconsistent; names the file.
     """
-    with reading(root):
-        return _read(root)
-
-
-def _read(root: Path) -> Capture:
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
     names = [view.image_path.name for view in posed]
@@ -144,5 +130,9 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
 
 
 FORMAT = CaptureFormat(
-    "neuman", "a COLMAP model and alignments.npy or 4d_humans", is_neuman, read_neuman, extends="colmap"
+    "neuman",
+    "a COLMAP model and alignments.npy or 4d_humans",
+    lambda root: is_colmap(root) and any((root / name).is_file() for name in (ALIGNED, ALIGNMENTS, *FITS)),
+    read_neuman,
+    extends="colmap",
 )

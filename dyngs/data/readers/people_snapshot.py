@@ -1,4 +1,4 @@
-"""Reader for PeopleSnapshot folders: a video of a turning person, ``camera.pkl``, masks and poses in HDF5 files."""
+"""Reader for PeopleSnapshot folders: a video of a rotating person, ``camera.pkl``, masks and poses in HDF5 files."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import BodyFrames, Capture, Silhouette
-from dyngs.data.geometry.poses import opengl_from_cam
-from dyngs.data.images.silhouettes import MASKS
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette
+from dyngs.data.geometry import opengl_from_cam
+from dyngs.data.images.maps import MASKS
 from dyngs.data.images.video import VIDEO_SUFFIXES
-from dyngs.data.readers.shared.camera_sequences import open_camera, sequence_views, video_fps
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.errors import DyngsError, reading
+from dyngs.data.readers.camera_folders import open_camera, sequence_views, video_fps
+from dyngs.errors import DyngsError
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, numbers_of
 from dyngs.files.hdf5 import hdf5_length, read_hdf5
@@ -24,11 +23,6 @@ from dyngs.files.pickles import read_pickle
 CAMERA = "camera.pkl"
 MASK_FILE = "masks.hdf5"
 POSE_FILE = "reconstructed_poses.hdf5"
-
-
-def is_people_snapshot(root: Path) -> bool:
-    """Whether the folder holds ``camera.pkl`` and one of the two HDF5 files."""
-    return (root / CAMERA).is_file() and any((root / name).is_file() for name in (MASK_FILE, POSE_FILE))
 
 
 def read_people_snapshot(root: Path) -> Capture:
@@ -41,11 +35,6 @@ def read_people_snapshot(root: Path) -> Capture:
     Raises:
         DyngsError: h5py is not installed; anything missing, broken or inconsistent; names the file.
     """
-    with reading(root):
-        return _read(root)
-
-
-def _read(root: Path) -> Capture:
     camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)
     usable = set(body.frames) & set(range(hdf5_length(root / MASK_FILE, MASKS)))
@@ -113,5 +102,8 @@ def _body(path: Path) -> BodyFrames:
 
 
 FORMAT = CaptureFormat(
-    "people_snapshot", f"{CAMERA}, {MASK_FILE}, {POSE_FILE}", is_people_snapshot, read_people_snapshot
+    "people_snapshot",
+    f"{CAMERA}, {MASK_FILE}, {POSE_FILE}",
+    lambda root: (root / CAMERA).is_file() and any((root / name).is_file() for name in (MASK_FILE, POSE_FILE)),
+    read_people_snapshot,
 )

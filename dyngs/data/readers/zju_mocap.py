@@ -10,12 +10,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
-from dyngs.data.capture import BodyFrames, Capture, Silhouette, Splits, View
-from dyngs.data.geometry.poses import checked_pose, opengl_from_cam
-from dyngs.data.readers.shared.camera_sequences import MIN_CAMERAS_TO_HOLD_OUT
-from dyngs.data.readers.shared.capture_format import CaptureFormat
-from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
-from dyngs.errors import DyngsError, reading
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
+from dyngs.data.geometry import checked_pose, opengl_from_cam
+from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
+from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.errors import DyngsError
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, first_few, numbers_of
 from dyngs.files.pickles import read_pickle, read_pickled_array
@@ -48,11 +47,6 @@ class _Shot:
     where: str
 
 
-def is_zju_mocap(root: Path) -> bool:
-    """Whether the folder holds ``annots.npy``, or ``cameras.pkl`` beside ``images``."""
-    return (root / ANNOTATIONS).is_file() or ((root / CAMERAS).is_file() and (root / "images").is_dir())
-
-
 def read_zju_mocap(root: Path) -> Capture:
     """Read the capture of a person by several calibrated static cameras or by one; units are metres.
 
@@ -64,15 +58,7 @@ def read_zju_mocap(root: Path) -> Capture:
 
     Parameters: v = Rh LBS(x; poses) + Th, about the template's origin: kept as ``BodyFrames.turns``. OpenCV calibrated
     these cameras, with pixel centres at whole numbers: half a pixel is added to the principal point.
-
-    Raises:
-        DyngsError: anything missing, broken or inconsistent; names the file.
     """
-    with reading(root):
-        return _read(root)
-
-
-def _read(root: Path) -> Capture:
     if (root / ANNOTATIONS).is_file():
         path, shots = root / ANNOTATIONS, _annotated_shots(root / ANNOTATIONS)
         found, body = _params_per_file(root, {shot.frame for shot in shots})
@@ -250,4 +236,9 @@ def _items(where: object, fields: object, key: str) -> list[object]:
     return list(value)
 
 
-FORMAT = CaptureFormat("zju_mocap", f"{ANNOTATIONS}, or {CAMERAS} and {MESHES}", is_zju_mocap, read_zju_mocap)
+FORMAT = CaptureFormat(
+    "zju_mocap",
+    f"{ANNOTATIONS}, or {CAMERAS} and {MESHES}",
+    lambda root: (root / ANNOTATIONS).is_file() or ((root / CAMERAS).is_file() and (root / "images").is_dir()),
+    read_zju_mocap,
+)

@@ -77,7 +77,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Box:
-    """A box turned by ``yaw`` radians about the vertical."""
+    """A box rotated by ``yaw`` radians about the vertical; its methods are as those of ``Sphere``."""
 
     center: tuple[float, float, float]
     half_extents: tuple[float, float, float]
@@ -90,7 +90,6 @@ class Box:
         return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray misses."""
         start = (origins - _f32(self.center)) @ self._axes().T
         towards = directions @ self._axes().T
         enter, leave = _through_box(start, towards, _f32(self.half_extents))
@@ -102,7 +101,6 @@ class Box:
         return turned / _f32(self.half_extents)
 
     def placed(self, local: np.ndarray) -> np.ndarray:
-        """(R, 3) surface points, of those in the box's axes: the inverse of ``local``."""
         return (local * _f32(self.half_extents)) @ self._axes() + _f32(self.center)
 
     def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
@@ -115,7 +113,6 @@ class Box:
         return local.astype(np.float32)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
-        """(R, 3) unit normals at surface points."""
         local = self.local(points)
         face = np.abs(local).argmax(axis=1)
         side = np.sign(np.take_along_axis(local, face[:, None], axis=1)).astype(np.float32)
@@ -207,7 +204,6 @@ class Sheet:
         return np.concatenate([flat, np.zeros_like(flat[:, :1])], axis=1)
 
     def placed(self, local: np.ndarray) -> np.ndarray:
-        """(R, 3) surface points, of those in material coordinates: the inverse of ``local``."""
         u, v = (local[:, :2] * _f32(self.half_extents)).T
         return np.stack([u, v, self.height(u, v)], axis=1) + _f32(self.center)
 

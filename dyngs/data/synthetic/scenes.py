@@ -32,9 +32,7 @@ def still_life() -> Scene:
     """The demo scene: three painted balls and a box on a checkered plate, inside |x|, |y|, |z| <= 1.1."""
     return Scene(
         (
-            Box(
-                (0.0, 0.0, -0.40), (0.98, 0.98, 0.06), _checkers(6, (0.80, 0.77, 0.70), (0.10, 0.16, 0.22)), gloss=0.05
-            ),
+            _plate((0.80, 0.77, 0.70), (0.10, 0.16, 0.22)),
             Sphere((-0.34, 0.40, 0.13), 0.47, _swirl((0.85, 0.20, 0.12), (0.95, 0.80, 0.55)), gloss=0.4),
             Sphere((0.52, -0.40, -0.02), 0.32, _dots((0.08, 0.30, 0.62), (0.95, 0.92, 0.80)), gloss=0.6),
             Sphere((-0.40, -0.52, -0.10), 0.24, _sectors(8, (0.95, 0.68, 0.10), (0.10, 0.42, 0.30)), gloss=0.6),
@@ -54,14 +52,9 @@ def scene_at(name: SceneName, time: float) -> Scene:
     Raises:
         DyngsError: no such scene.
     """
-    if name == "spin":
-        return _spin(time)
-    if name == "wave":
-        return _wave(time)
-    if name == "merge":
-        return _merge(time)
-    if name == "room":
-        return _room(time)
+    moving = {"spin": _spin, "wave": _wave, "merge": _merge, "room": _room}
+    if name in moving:
+        return moving[name](time)
     raise DyngsError(f"there is no moving scene '{name}'; choose one of {', '.join(get_args(SceneName))}")
 
 
@@ -173,7 +166,7 @@ def _ease(fraction: float) -> float:
     return x * x * (3.0 - 2.0 * x)
 
 
-def _checkers(count: int, light: tuple[float, float, float], dark: tuple[float, float, float]) -> Paint:
+def _checkers(count: int, light: Rgb, dark: Rgb) -> Paint:
     """``count`` x ``count`` squares seen from above, a plain dark rim."""
 
     def paint(local: np.ndarray) -> np.ndarray:
@@ -184,7 +177,7 @@ def _checkers(count: int, light: tuple[float, float, float], dark: tuple[float, 
     return paint
 
 
-def _swirl(first: tuple[float, float, float], second: tuple[float, float, float]) -> Paint:
+def _swirl(first: Rgb, second: Rgb) -> Paint:
     """Bands that wind around the pole, with soft edges."""
 
     def paint(local: np.ndarray) -> np.ndarray:
@@ -195,7 +188,7 @@ def _swirl(first: tuple[float, float, float], second: tuple[float, float, float]
     return paint
 
 
-def _dots(ground: tuple[float, float, float], dot: tuple[float, float, float]) -> Paint:
+def _dots(ground: Rgb, dot: Rgb) -> Paint:
     """24 round dots spread over the sphere."""
     i = np.arange(24) + 0.5
     z = 1 - 2 * i / 24
@@ -209,7 +202,7 @@ def _dots(ground: tuple[float, float, float], dot: tuple[float, float, float]) -
     return paint
 
 
-def _sectors(count: int, first: tuple[float, float, float], second: tuple[float, float, float]) -> Paint:
+def _sectors(count: int, first: Rgb, second: Rgb) -> Paint:
     """A beach ball with ``count`` sectors about a tilted axis and white caps."""
 
     def paint(local: np.ndarray) -> np.ndarray:
@@ -222,7 +215,7 @@ def _sectors(count: int, first: tuple[float, float, float], second: tuple[float,
     return paint
 
 
-def _framed(frame: tuple[float, float, float], panel: tuple[float, float, float]) -> Paint:
+def _framed(frame: Rgb, panel: Rgb) -> Paint:
     """A frame around every face and fine rings, as of wood, on its panel."""
 
     def paint(local: np.ndarray) -> np.ndarray:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import HumanModel
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import Frame

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
+from dyngs.data.body_frames import numbered
 from dyngs.data.capture import Capture, View
-from dyngs.data.fitted_body import numbered
 from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError
 from dyngs.gaussians.parameters import Parameters

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dyngs.capture.background_masks import with_background_masks
+from dyngs.capture.background import with_background_masks
 from dyngs.capture.fixed_camera import FORMAT, is_plain_clip, read_fixed_camera, silhouettes_of, zoomed
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View

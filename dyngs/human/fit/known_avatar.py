@@ -14,8 +14,8 @@ from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import ImageLoader
+from dyngs.data.times import evenly_spaced
 from dyngs.human.avatar.pose_comparison import SILHOUETTES
 from dyngs.human.avatar.pose_fit import fitted_to_images
 from dyngs.human.avatar.scene import HumanScene

@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 from dyngs.config.io import load_config
+from dyngs.data.body_frames import read_body_file
 from dyngs.data.capture import BodyFrames
-from dyngs.data.fitted_body import read_body_file
 from dyngs.errors import DyngsError, reading
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.load import rest_shape

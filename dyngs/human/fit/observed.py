@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.images.images import area_downscale
-from dyngs.data.images.silhouettes import silhouette_box
+from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image
 from dyngs.human.template.joints import JOINT_NAMES
 

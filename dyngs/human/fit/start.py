@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.images.silhouettes import silhouette_box
+from dyngs.data.images.maps import silhouette_box
+from dyngs.data.times import evenly_spaced
 from dyngs.human.fit.headings import (
     MOST_ANCHORS,
     NUM_HEADINGS,

@@ -1,4 +1,4 @@
-"""Writer of a fitted capture in the layout that ``dyngs.data.readers.body_json`` reads.
+"""Writer of a fitted capture in the layout that ``dyngs.data.readers.blender`` reads.
 
 Local letters: F frames, J joints, B shape parameters.
 """
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from dyngs.data.capture import Split, View
-from dyngs.data.geometry.poses import opengl_from_cam
+from dyngs.data.geometry import opengl_from_cam
 from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image
 from dyngs.files.write import atomic_file, write_image, write_text

@@ -110,7 +110,7 @@ class PosedMesh:
 
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
-    """Write images of a walking person in the layout that ``dyngs.data.readers.body_json`` reads; returns ``out``.
+    """Write images of a walking person in the layout that ``dyngs.data.readers.blender`` reads; returns ``out``.
 
     Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m,
     y up, floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``.

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image
+from dyngs.data.times import evenly_spaced
 from dyngs.training.priors.depth_maps import Kind, values_of
 
 PAIRS = 12
@@ -220,7 +220,7 @@ def _blurred(pixels: Tensor) -> Tensor:
 
 def distance_to_scene(cameras: Sequence[Cameras]) -> float | None:
     """Return the median distance of cameras from the point that they look at, None where their axes are parallel."""
-    from dyngs.data.geometry.focus import focus_point
+    from dyngs.data.geometry import focus_point
 
     poses = torch.linalg.inv(torch.cat([c.cam_from_world for c in cameras]).double())
     focus = focus_point(poses.numpy())

@@ -16,7 +16,7 @@ from dyngs.capture.inspection.camera_plot import draw_cameras
 from dyngs.capture.inspection.report import format_report, inspect_capture, report_on
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.geometry.poses import cam_from_opengl
+from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.synthetic.captures import StillOptions, hemisphere_cameras, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image

@@ -40,7 +40,7 @@ def test_a_camera_that_stands_and_a_folder_of_them(tmp_path: Path, capsys: pytes
     assert "shows no depth" in video_report(tmp_path / "rig" / "a.mp4")
     assert main(["data", "inspect", str(tmp_path / "rig")]) == 0
     shown = capsys.readouterr().out
-    assert "2 cameras that stand, 10 frames per second; offsets between them: found by sound or motion" in shown
+    assert "2 fixed cameras, 10 frames per second; offsets between them: found by sound or motion" in shown
     assert f"next: dyngs train dynamic data.root={tmp_path / 'rig'}" in shown
 
 

@@ -47,7 +47,7 @@ def test_photos_are_upright_for_colmap_and_for_us(tmp_path: Path, orientation: i
     """What COLMAP sees is what the loader gets for a camera of the size that COLMAP saw."""
     path = _photo(tmp_path / "photos" / "a b.png", orientation, UPRIGHT)
     shown = read_image(path, upright=True).numpy()
-    photos = gather_photos(tmp_path / "photos", tmp_path / "images", tmp_path / "out")
+    photos, _ = gather_photos(tmp_path / "photos", tmp_path / "images", tmp_path / "out")
     (name,) = lay_out(photos, tmp_path / "images", tmp_path / "images", {})
     with Image.open(tmp_path / "images" / name) as image:
         seen = np.asarray(image)

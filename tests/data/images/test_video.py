@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from pathlib import Path
 
 import av
@@ -134,3 +135,36 @@ def test_mutated_videos_are_read_or_refused_in_one_line(video: Path) -> None:
         except DyngsError as error:
             lines.append(str(error))
     assert all(line.isprintable() for line in lines)
+
+
+MATRICES = {1: (1, 0, 0, 1), 2: (-1, 0, 0, 1), 3: (-1, 0, 0, -1), 4: (1, 0, 0, -1)}
+MATRICES |= {5: (0, 1, 1, 0), 6: (0, 1, -1, 0), 7: (0, -1, -1, 0), 8: (0, -1, 1, 0)}
+"""Display matrices (a, b, c, d) by the orientation of EXIF that they mean."""
+
+
+def _display_matrix(a: int, b: int, c: int, d: int) -> bytes:
+    return struct.pack(">9i", *(65536 * x for x in (a, b, 0, c, d, 0, 0, 0)), 1 << 30)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_display_matrices_rotate_and_mirror(tmp_path: Path, orientation: int) -> None:
+    """As each pixel (x, y) is shown at (a x + c y, b x + d y), moved into the image."""
+    path = tmp_path / "a.mp4"
+    stored = np.kron(np.array([[20, 80], [140, 220]], np.uint8), np.ones((16, 24), np.uint8))
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(np.dstack([stored] * 3), format="rgb24")))
+        container.mux(stream.encode(None))
+    data, upright = path.read_bytes(), _display_matrix(1, 0, 0, 1)
+    place = data.index(upright, data.index(b"tkhd"))
+    a, b, c, d = MATRICES[orientation]
+    path.write_bytes(data[:place] + _display_matrix(a, b, c, d) + data[place + len(upright) :])
+    rows, columns = np.mgrid[:32, :48]
+    x, y = a * columns + c * rows, b * columns + d * rows
+    shown = np.zeros((np.ptp(y) + 1, np.ptp(x) + 1), np.uint8)
+    shown[y - y.min(), x - x.min()] = stored
+    (frame,) = read_frames(path)
+    assert frame.shape[:2] == shown.shape
+    assert np.abs(frame[..., 1].astype(int) - shown).max() < 30, "but for the edges of a compressed image"
+    assert (probe_video(path).width, probe_video(path).height) == shown.shape[::-1]

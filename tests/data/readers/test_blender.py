@@ -1,14 +1,22 @@
+"""Captures of transforms files: Blender, nerfstudio, people with body files."""
+
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from tiny_captures import edit_json, opengl_pose, random_pixels, write_frames, write_image
+from tiny_captures import edit_json, opengl_pose, pixel_of, random_pixels, write_frames, write_image
 
-from dyngs.data.readers.blender import is_blender, read_blender
-from dyngs.data.readers.shared.transforms import view_name
+from dyngs.config import DataConfig
+from dyngs.data.body_frames import about_pelvis, rows_of
+from dyngs.data.capture import BodyFrames, Capture, Lens, View
+from dyngs.data.images.images import read_image
+from dyngs.data.read import read_capture
+from dyngs.data.readers.blender import BODY_FORMAT, FORMAT, read_blender, read_body_json, read_nerfstudio
+from dyngs.data.readers.transforms import view_name
 from dyngs.errors import DyngsError
 
 
@@ -50,7 +58,7 @@ def test_explicit_intrinsics_win_and_frame_beats_file(blender_root: Path) -> Non
 
 
 def test_val_and_test_may_be_absent(blender_root: Path) -> None:
-    assert is_blender(blender_root)
+    assert FORMAT.recognise(blender_root)
     (blender_root / "transforms_test.json").unlink()
     assert set(read_blender(blender_root).splits) == {"train"}
 
@@ -156,3 +164,266 @@ def test_lego(shared: Path) -> None:
     capture = read_blender(shared / "lego400")
     assert {name: len(views) for name, views in capture.splits.items()} == {"train": 100, "test": 50}
     assert capture.splits["train"][0].intrinsics[0, 0] == pytest.approx(555.5555155968841)
+
+
+def names(views: tuple) -> list[str]:
+    return [view.name for view in views]
+
+
+def test_intrinsics_and_distortion_of_the_file(nerfstudio_root: Path) -> None:
+    view = read_nerfstudio(nerfstudio_root).splits["train"][0]
+    np.testing.assert_array_equal(view.intrinsics, [[10, 0, 6.5], [0, 11, 3.5], [0, 0, 1]])
+    assert view.lens == Lens("opencv", (0.1, 0.0, 0.0, -0.01))
+    assert view.name == "images/00"
+
+
+def test_intrinsics_and_distortion_of_a_frame(nerfstudio_root: Path) -> None:
+    own = {"fl_x": 20.0, "fl_y": 20.0, "cx": 6.0, "cy": 4.0, "k1": 0.0, "k3": 0.5}
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][4].update(own))
+    view = read_nerfstudio(nerfstudio_root).splits["train"][4]
+    np.testing.assert_array_equal(view.intrinsics, [[20, 0, 6], [0, 20, 4], [0, 0, 1]])
+    assert view.lens == Lens("opencv", (0.0, 0.0, 0.0, -0.01, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("fields", "lens"),
+    [
+        ({"camera_model": "PINHOLE"}, Lens()),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.2}, Lens("fisheye", (0.1, 0.0, 0.0, 0.2))),
+        ({"camera_model": None, "is_fisheye": True}, Lens("fisheye", (0.1, 0.0, 0.0, 0.0))),
+        ({"camera_model": None}, Lens("opencv", (0.1, 0.0, 0.0, -0.01))),
+        ({"k1": 0, "p2": 0}, Lens()),
+        ({"camera_model": "FULL_OPENCV", "k4": 0.2}, Lens("opencv", (0.1, 0.0, 0.0, -0.01, 0.0, 0.2))),
+    ],
+)
+def test_camera_models(nerfstudio_root: Path, fields: dict, lens: Lens) -> None:
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(fields))
+    assert read_nerfstudio(nerfstudio_root).splits["train"][0].lens == lens
+
+
+@pytest.mark.parametrize(("fields", "word"), [({"camera_model": "EQUIRECTANGULAR"}, "EQUI"), ({"k4": 0.1}, "k4")])
+def test_models_that_we_cannot_undo_are_refused(nerfstudio_root: Path, fields: dict, word: str) -> None:
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(fields))
+    with pytest.raises(DyngsError, match=word):
+        read_nerfstudio(nerfstudio_root)
+
+
+def test_split_lists(nerfstudio_root: Path) -> None:
+    lists = {
+        "train_filenames": ["images/00.jpg", "images/02.jpg"],
+        "val_filenames": ["images/01.jpg"],
+        "test_filenames": ["images/05.jpg", "images/99.jpg"],
+    }
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(lists))
+    capture = read_nerfstudio(nerfstudio_root)
+    assert names(capture.splits["train"]) == ["images/00", "images/02"]
+    assert names(capture.splits["val"]) == ["images/01"]
+    assert names(capture.splits["test"]) == ["images/05"]
+    assert any("images/99.jpg" in warning for warning in capture.warnings)
+    assert any("6 frames are in no split" in warning for warning in capture.warnings)
+
+
+def test_val_list_alone_is_what_is_held_out(nerfstudio_root: Path) -> None:
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(val_filenames=["images/01.jpg"]))
+    splits = read_nerfstudio(nerfstudio_root).splits
+    assert names(splits["test"]) == ["images/01"]
+    assert len(splits["train"]) == 9
+    assert "val" not in splits
+
+
+def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
+    change = {"file_path": "images\\03.jpg", "mask_path": "masks/03.png"}
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][3].update(change))
+    view = read_nerfstudio(nerfstudio_root).splits["train"][3]
+    assert view.name == "images/03"
+    assert view.mask_path == nerfstudio_root / "masks/03.png"
+
+
+@pytest.mark.parametrize("width", [24, 6])
+def test_resized_images_rescale_the_intrinsics(nerfstudio_root: Path, width: int) -> None:
+    """The JSON speaks of images of another size but the same shape."""
+    scale = 12 / width
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(w=width, h=width * 8 / 12))
+    capture = read_nerfstudio(nerfstudio_root)
+    view = capture.splits["train"][0]
+    wanted = [[10 * scale, 0, 6.5 * scale], [0, 11 * scale, 3.5 * scale], [0, 0, 1]]
+    np.testing.assert_allclose(view.intrinsics, wanted, rtol=1e-12)
+    assert (view.width, view.height) == (12, 8)
+    assert any("rescaled" in warning for warning in capture.warnings)
+
+
+def test_another_shape_is_an_error(nerfstudio_root: Path) -> None:
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(w=8, h=12))
+    with pytest.raises(DyngsError, match=r"12x8 but its intrinsics are for 8x12 \(rotated"):
+        read_nerfstudio(nerfstudio_root)
+
+
+def test_points_of_a_ply_in_double(nerfstudio_root: Path) -> None:
+    """Georeferenced points keep their millimetres; colours come along."""
+    header = ["ply", "format ascii 1.0", "element vertex 2", *[f"property double {axis}" for axis in "xyz"]]
+    header += [*[f"property uchar {channel}" for channel in ("red", "green", "blue")], "end_header"]
+    rows = ["4567890.123 1.5 -2 255 0 7", "4567890.124 0 0 1 2 3"]
+    (nerfstudio_root / "points.ply").write_text("\n".join(header + rows) + "\n")
+    edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(ply_file_path="points.ply"))
+    points = read_nerfstudio(nerfstudio_root).points
+    assert points is not None
+    np.testing.assert_allclose(points.xyz[:, 0], [4567890.123, 4567890.124], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(points.rgb, [[255, 0, 7], [1, 2, 3]])
+
+
+def test_fox(shared: Path) -> None:
+    capture = read_nerfstudio(shared / "fox")
+    views = capture.splits["train"]
+    assert len(views) == 50
+    assert views[0].lens == Lens("opencv", (0.0578421, -0.0805099, -0.000980296, 0.00015575))
+    assert views[0].intrinsics[0, 0] == 343.88
+
+
+LENS = {"w": 4, "h": 3, "fl_x": 5.0, "fl_y": 5.0, "cx": 2.0, "cy": 1.5}
+
+
+def write_body(path: Path, count: int, first: float = 0.0, **changes: Any) -> None:
+    """Parameters whose numbers tell their frame."""
+    numbers = first + np.arange(count, dtype=np.float32)[:, None]
+    fields = {"poses": numbers * np.ones(165), "trans": numbers * np.ones(3), "betas": np.zeros(10), "scale": 1.5}
+    fields |= {"gender": "neutral", "mocap_frame_rate": 12.0, "surface_model_type": "smplx"}
+    np.savez(path, **{name: value for name, value in (fields | changes).items() if value is not None})
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """3 frames by 2 cameras to train on and 1 to test, and 2 frames of another clip."""
+    for split, count, cameras in (("train", 3, (0, 1)), ("test", 3, (2,)), ("pose", 2, (2,))):
+        names = [f"images/{split}/f{frame}_c{camera}.png" for frame in range(count) for camera in cameras]
+        path = tmp_path / f"transforms_{split}.json"
+        write_frames(path, names, LENS)
+        edit_json(path, lambda c, n=count, k=cameras: number_frames(c, n, k))
+        for i, name in enumerate(names):
+            write_image(tmp_path / name, random_pixels(3, 4, 4, seed=i))
+    write_body(tmp_path / "body_train.npz", 3)
+    write_body(tmp_path / "body_pose.npz", 2, first=10)
+    return tmp_path
+
+
+def number_frames(content: dict[str, Any], count: int, cameras: tuple[int, ...]) -> None:
+    keys = [(frame, camera) for frame in range(count) for camera in cameras]
+    for own, (frame, camera) in zip(content["frames"], keys, strict=True):
+        own.update(frame=frame, camera=camera, time=frame / (count - 1))
+
+
+def bodies(capture: Capture) -> dict[str, BodyFrames]:
+    body: Any = capture.body
+    return body
+
+
+def test_every_split_has_its_frames(root: Path) -> None:
+    assert BODY_FORMAT.recognise(root)
+    capture = read_body_json(root)
+    assert (capture.format, capture.warnings) == ("body_json", ())
+    found = {
+        str(split): [(view.frame, view.camera_id, view.time) for view in views]
+        for split, views in capture.splits.items()
+    }
+    assert found == {
+        "train": [(f, c, f / 2) for f in range(3) for c in (0, 1)],
+        "test": [(f, 2, f / 2) for f in range(3)],
+        "pose": [(0, 2, 0.0), (1, 2, 1.0)],
+    }
+    body = bodies(capture)
+    assert body["test"] is body["train"] is body["val"]
+    assert [(b.kind, len(b.frames), b.scale[0], b.trans[0, 0]) for b in (body["train"], body["pose"])] == [
+        ("smplx", 3, 1.5, 0.0),
+        ("smplx", 2, 1.5, 10.0),
+    ]
+
+
+def test_a_split_may_have_its_own_parameters(root: Path) -> None:
+    write_body(root / "body_test.npz", 3, first=5)
+    assert bodies(read_body_json(root))["test"].trans[:, 0].tolist() == [5, 6, 7]
+
+
+def test_other_splits_may_lack(root: Path) -> None:
+    for name in ("transforms_test.json", "transforms_pose.json", "body_pose.npz"):
+        (root / name).unlink()
+    write_body(root / "body_train.npz", 5, scale=None)
+    capture = read_body_json(root)
+    assert (set(capture.splits), set(bodies(capture))) == ({"train"}, {"train", "val", "test"})
+    assert bodies(capture)["train"].scale.tolist() == [1] * 5
+
+
+def test_missing_files(root: Path) -> None:
+    (root / "body_pose.npz").unlink()
+    with pytest.raises(DyngsError, match=r"body_pose\.npz: no such file; transforms_pose\.json shows another clip"):
+        read_body_json(root)
+    write_body(root / "body_pose.npz", 2)
+    (root / "body_train.npz").unlink()
+    assert BODY_FORMAT.recognise(root)
+    with pytest.raises(DyngsError, match=r"body_train\.npz: no such file; it should hold the body parameters poses"):
+        read_body_json(root)
+    (root / "body_pose.npz").unlink()
+    assert not BODY_FORMAT.recognise(root)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"poses": np.zeros((3, 63))}, r"body_train\.npz: 'poses' has 63 numbers per frame"),
+        ({"trans": np.zeros((2, 3))}, r"body_train\.npz: 'trans' has 2 rows for 3 frames"),
+        ({"trans": np.full((3, 3), np.nan)}, r"body_train\.npz: 'trans' of frame 0 holds NaN"),
+        ({"scale": -1.0}, r"body_train\.npz: 'scale' must be positive"),
+        ({"betas": None}, r"body_train\.npz: the key 'betas' is missing"),
+        ({"poses": np.zeros(()), "trans": np.zeros(())}, r"body_train\.npz: holds no frame"),
+        ({"poses": np.zeros((2, 165)), "trans": np.zeros((2, 3))}, r"no body parameters for 1 frames .*\(2\)"),
+    ],
+)
+def test_bad_parameters(root: Path, change: dict[str, Any], line: str) -> None:
+    write_body(root / "body_train.npz", 3, **change)
+    with pytest.raises(DyngsError, match=line) as caught:
+        read_body_json(root)
+    assert "\n" not in str(caught.value)
+
+
+def test_images_need_frame_numbers(root: Path) -> None:
+    edit_json(root / "transforms_test.json", lambda content: content["frames"][1].pop("frame"))
+    with pytest.raises(DyngsError, match=r"body_train\.npz: .*f1_c2\.png has no frame number"):
+        read_body_json(root)
+
+
+@pytest.mark.parametrize("name", ["casual_m", "busi_f"])
+def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
+    """Cameras, frames and parameters of every split agree: the template's pelvis appears on opaque pixels."""
+    template = shared / "body" / "anny_smplx55_tpose.npz"
+    if not (shared / "human" / name).is_dir() or not template.is_file():
+        pytest.skip("the captures of people are not here")
+    capture = read_body_json(shared / "human" / name)
+    assert {str(split): len(views) for split, views in capture.splits.items()} == {"train": 160, "test": 80, "pose": 32}
+    pelvis = np.load(template)["J"][0].astype(float)
+    for split, body in bodies(capture).items():
+        views: tuple[View, ...] = dict(capture.splits).get(split, ())[::11]  # type: ignore[call-overload]
+        places = about_pelvis(body, pelvis)
+        for view, row in zip(views, rows_of(capture.root, body, views), strict=True):
+            x, y = pixel_of(view, places.scale[row] * pelvis + places.trans[row])
+            assert read_image(view.image_path)[int(y), int(x), 3] == 255, view.name
+
+
+def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
+    with pytest.raises(DyngsError, match=r"has a clip of new poses of its own; remove data\.pose_frames=2::"):
+        read_capture(DataConfig(root=root, pose_frames="2::"))
+    for name in ("transforms_pose.json", "body_pose.npz"):
+        (root / name).unlink()
+    capture = read_capture(DataConfig(root=root, pose_frames="2::"))
+    assert [view.name for view in capture.splits["pose"]] == ["images/test/f2_c2"]
+    (root / "body_train.npz").unlink()
+    with pytest.raises(DyngsError, match="is for people; here are no body parameters"):
+        read_capture(DataConfig(root=root, pose_frames="2::"))
+
+
+def test_times_that_are_not_given_follow_from_frame_numbers(root: Path) -> None:
+    """Or else every image would be compared with the first pose."""
+    timed = read_capture(DataConfig(root=root))
+    for split in ("train", "test", "pose"):
+        edit_json(root / f"transforms_{split}.json", lambda content: [own.pop("time") for own in content["frames"]])
+    found = read_capture(DataConfig(root=root))
+    for split, views in timed.splits.items():
+        assert [view.time for view in found.splits[split]] == [view.time for view in views]
+    assert {view.time for view in found.splits["train"]} == {0, 0.5, 1}

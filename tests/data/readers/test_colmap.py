@@ -12,8 +12,7 @@ from tiny_captures import opengl_pose, random_pixels, write_colmap, write_image
 from dyngs.config import DataConfig
 from dyngs.data.images.lens import distort
 from dyngs.data.read import read_capture
-from dyngs.data.readers.colmap import find_model, is_colmap, pinhole_and_lens, read_colmap
-from dyngs.data.readers.shared.colmap_check import check_model_file
+from dyngs.data.readers.colmap import check_model_file, find_model, is_colmap, pinhole_and_lens, read_colmap
 from dyngs.errors import DyngsError
 
 MODELS = {

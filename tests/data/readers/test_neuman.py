@@ -15,7 +15,7 @@ from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.read import read_capture
-from dyngs.data.readers.neuman import is_neuman, read_neuman
+from dyngs.data.readers.neuman import FORMAT, read_neuman
 from dyngs.errors import DyngsError
 
 COUNT = 9
@@ -77,7 +77,7 @@ def body_of(capture: Capture) -> BodyFrames:
 
 
 def test_views(root: Path) -> None:
-    assert is_neuman(root)
+    assert FORMAT.recognise(root)
     capture = read_neuman(root)
     assert (capture.format, capture.warnings, set(capture.splits)) == ("neuman", (), {"train"})
     assert capture.points is not None
@@ -108,7 +108,7 @@ def test_refined_parameters_come_first(root: Path) -> None:
     assert body.poses[4].ravel() == pytest.approx([0.1] * 3 + [0.2] * 69)
     for name in ("alignments.npy", "smpl_output_romp.pkl"):
         (root / name).unlink()
-    assert is_neuman(root)
+    assert FORMAT.recognise(root)
     assert body_of(read_neuman(root)).kind == "smpl"
 
 
@@ -139,16 +139,16 @@ def test_missing_masks_are_counted(root: Path) -> None:
 
 def test_missing_files(root: Path) -> None:
     (root / "alignments.npy").unlink()
-    assert is_neuman(root)
+    assert FORMAT.recognise(root)
     with pytest.raises(DyngsError, match=r"alignments\.npy: no such file"):
         read_neuman(root)
     write_fit(root, {1: fit()}, matrices())
     (root / "smpl_output_romp.pkl").unlink()
-    assert is_neuman(root)
+    assert FORMAT.recognise(root)
     with pytest.raises(DyngsError, match=r"smpl_output_optimized\.pkl: no such file"):
         read_neuman(root)
     (root / "alignments.npy").unlink()
-    assert not is_neuman(root)
+    assert not FORMAT.recognise(root)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 
 from dyngs.config import DataConfig
-from dyngs.data.images.silhouettes import cut_out
+from dyngs.data.images.maps import cut_out
 from dyngs.data.read import read_capture
-from dyngs.data.readers.people_snapshot import is_people_snapshot, read_people_snapshot
+from dyngs.data.readers.people_snapshot import FORMAT, read_people_snapshot
 from dyngs.errors import DyngsError
 
 h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
@@ -64,7 +64,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_frames_masks_and_parameters_go_together(root: Path) -> None:
-    assert is_people_snapshot(root)
+    assert FORMAT.recognise(root)
     capture = read_people_snapshot(root)
     assert (capture.format, capture.warnings, set(capture.splits)) == ("people_snapshot", (), {"train"})
     views = capture.splits["train"]
@@ -120,12 +120,12 @@ def test_missing_files(root: Path) -> None:
     for name in ("masks.hdf5", "reconstructed_poses.hdf5"):
         content = (root / name).read_bytes()
         (root / name).unlink()
-        assert is_people_snapshot(root)
+        assert FORMAT.recognise(root)
         with pytest.raises(DyngsError, match=f"{name}: no such file"):
             read_people_snapshot(root)
         (root / name).write_bytes(content)
     (root / "camera.pkl").unlink()
-    assert not is_people_snapshot(root)
+    assert not FORMAT.recognise(root)
 
 
 @pytest.mark.parametrize(

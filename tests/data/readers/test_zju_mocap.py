@@ -16,7 +16,7 @@ from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.read import read_capture
-from dyngs.data.readers.zju_mocap import is_zju_mocap, read_zju_mocap
+from dyngs.data.readers.zju_mocap import FORMAT, read_zju_mocap
 from dyngs.errors import DyngsError
 
 K = np.array([[20.0, 0, 7.5], [0, 21, 5.5], [0, 0, 1]])
@@ -92,7 +92,7 @@ def body_of(capture: Capture) -> BodyFrames:
 
 def test_cameras_frames_and_masks(tmp_path: Path) -> None:
     write_annots(tmp_path, frames=(3, 4, 7))
-    assert is_zju_mocap(tmp_path)
+    assert FORMAT.recognise(tmp_path)
     capture = read_zju_mocap(tmp_path)
     assert (capture.format, capture.warnings) == (
         "zju_mocap",
@@ -139,7 +139,7 @@ def test_global_motion_is_about_the_origin(tmp_path: Path, write: Callable[[Path
 
 def test_one_camera(tmp_path: Path) -> None:
     write_single(tmp_path)
-    assert is_zju_mocap(tmp_path)
+    assert FORMAT.recognise(tmp_path)
     capture = read_zju_mocap(tmp_path)
     assert (set(capture.splits), capture.warnings) == ({"train"}, ())
     view = capture.splits["train"][1]
@@ -215,7 +215,7 @@ def test_missing_files(tmp_path: Path) -> None:
     single = tmp_path / "single"
     write_single(single)
     (single / "mesh_infos.pkl").unlink()
-    assert is_zju_mocap(single)
+    assert FORMAT.recognise(single)
     with pytest.raises(DyngsError, match=r"mesh_infos\.pkl: no such file"):
         read_zju_mocap(single)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.data.capture import BodyFrames, Capture, View
-from dyngs.data.geometry.poses import cam_from_opengl
+from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.loader import Image
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose

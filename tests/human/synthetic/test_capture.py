@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import Capture, View
-from dyngs.data.geometry.poses import cam_from_opengl
+from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError

@@ -1,0 +1,226 @@
+"""Camera geometry: checks and changes of poses, pinhole matrices, projection, the point that cameras look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dyngs.data.capture import View
+from dyngs.errors import DyngsError
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+LARGEST = 1e12
+"""Largest entry of a pose: beyond it float64 is too coarse to recentre the scene."""
+ROTATION_TOLERANCE = 1e-3
+"""Largest entry of ``R^T R - I`` that is taken for rounding and repaired."""
+
+
+def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
+    """Return the rigid (4, 4) float64 transform nearest to ``matrix``, and its deviation from rigid.
+
+    Args:
+        matrix: (4, 4) or (3, 4), either direction and any axis convention.
+
+    Returns:
+        The pose, its rotation re-orthonormalised, and the largest entry of ``|R^T R - I|`` before that.
+
+    Raises:
+        DyngsError: not finite, not a pose, mirrored, scaled, or further than ``ROTATION_TOLERANCE`` from a rotation.
+    """
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise DyngsError(f"{where}: the pose must be a 4x4 matrix, got shape {matrix.shape}; export it again")
+    if not np.isfinite(matrix).all():
+        raise DyngsError(f"{where}: the pose holds NaN or infinite numbers; remove or repair this frame")
+    if np.abs(matrix).max() > LARGEST:
+        raise DyngsError(f"{where}: the pose holds numbers beyond {LARGEST:g}; use another unit or repair this frame")
+    if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise DyngsError(f"{where}: the last row of the pose must be 0 0 0 1; is the matrix transposed?")
+    rotation = matrix[:3, :3].astype(np.float64)
+    determinant = np.linalg.det(rotation)
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE or determinant <= 0:
+        raise DyngsError(f"{where}: {_rotation_fault(rotation, determinant, error)}")
+    u, _, vt = np.linalg.svd(rotation)
+    pose = np.eye(4)
+    pose[:3, :3] = u @ vt
+    pose[:3, 3] = matrix[:3, 3]
+    return pose, error
+
+
+def matrix_fault(matrix: np.ndarray, where: str) -> str | None:
+    """Return one line, beginning with ``where``, on why ``matrix`` is no rigid pose; None where it is."""
+    try:
+        checked_pose(matrix, where)
+    except DyngsError as error:
+        return str(error)
+    return None
+
+
+def pose_fault(view: View) -> str | None:
+    """Return one line on why the view's pose is not rigid, None where it is."""
+    return matrix_fault(view.cam_from_world, f"'{view.name}'")
+
+
+def cam_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
+    """Return the OpenCV ``cam_from_world`` of a rigid (4, 4) OpenGL camera-to-world pose: y up, z backward."""
+    return inverse_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
+
+
+def opengl_from_cam(cam_from_world: np.ndarray) -> np.ndarray:
+    """Return the (4, 4) OpenGL camera-to-world pose of a rigid OpenCV ``cam_from_world``."""
+    return inverse_rigid(cam_from_world) @ OPENGL_FROM_OPENCV
+
+
+def inverse_rigid(pose: np.ndarray) -> np.ndarray:
+    """Return the (4, 4) inverse of a rigid transform."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def camera_center(cam_from_world: np.ndarray) -> np.ndarray:
+    """Return the (3,) position of the camera in the world."""
+    return -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
+
+
+def repair_warning(errors: dict[str, float]) -> list[str]:
+    """Return one line about the rotations that were not orthonormal, none if all were.
+
+    Args:
+        errors: origin of each pose to its deviation as ``checked_pose`` returned it.
+    """
+    off = {where: error for where, error in errors.items() if error > 1e-5}
+    if not off:
+        return []
+    worst = max(off, key=lambda where: off[where])
+    return [f"{len(off)} rotations were not orthonormal and were repaired, the worst by {off[worst]:.1e} ({worst})"]
+
+
+def _rotation_fault(rotation: np.ndarray, determinant: float, error: float) -> str:
+    if determinant < 0:
+        return "the pose is mirrored (its determinant is negative); flip one axis when exporting"
+    if determinant > 0:
+        scale = determinant ** (1 / 3)
+        unit = rotation / scale
+        if np.abs(unit.T @ unit - np.eye(3)).max() <= ROTATION_TOLERANCE:
+            return f"the rotation is scaled by {scale:.6g}; scale the camera positions only and export again"
+    return f"the pose is not a rotation (R^T R differs from the identity by {error:.2g}); export it again"
+
+
+MAX_SIDE = 2**20
+"""Largest side of an image in pixels; more is taken for a mistake."""
+FOCAL_RANGE = (1e-4, 1e6)
+"""Plausible focal lengths, in units of the image's longer side: fields of view from 0.00006 to 179.99 degrees."""
+
+
+def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Return the (3, 3) float64 camera matrix, in pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def scaled_intrinsics(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray:
+    """Return the (3, 3) matrix for the image scaled by the two factors; exact, as pixel centres are at (0.5, 0.5)."""
+    return np.diag([scale_x, scale_y, 1.0]) @ intrinsics
+
+
+def match_size(
+    intrinsics: np.ndarray, described: tuple[int, int], stored: tuple[int, int] | None, where: str
+) -> tuple[np.ndarray, tuple[int, int], bool]:
+    """Return the intrinsics for the stored image, its (width, height), and whether they were rescaled.
+
+    Args:
+        intrinsics: (3, 3) for an image of ``described`` (width, height).
+        stored: (width, height) of the file, None where it could not be opened.
+
+    Raises:
+        DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal point.
+    """
+    _check_plausible(intrinsics, described, where)
+    if stored is None or stored == described:
+        return intrinsics, described, False
+    scale_x, scale_y = stored[0] / described[0], stored[1] / described[1]
+    # Each side of a shrunk image was rounded to whole pixels: half a pixel either way is the same aspect.
+    slack = max(0.5 / stored[0], 0.5 / stored[1]) + 1e-9
+    if abs(scale_x / scale_y - 1) > 2 * slack:
+        rotated = " (rotated by its EXIF tag?)" if stored == described[::-1] else ""
+        raise DyngsError(
+            f"{where}: the image is {stored[0]}x{stored[1]} but its intrinsics are for {described[0]}x{described[1]}"
+            f"{rotated}; correct the size and focal length or restore the original image"
+        )
+    return scaled_intrinsics(intrinsics, scale_x, scale_y), stored, True
+
+
+def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: str) -> None:
+    side = max(described)
+    low, high = FOCAL_RANGE[0] * side, FOCAL_RANGE[1] * side
+    fx, fy, *center = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if not (low <= fx <= high and low <= fy <= high):
+        raise DyngsError(
+            f"{where}: the focal length ({fx:g}, {fy:g}) px does not suit an image of {described[0]}x{described[1]}; "
+            "correct it, or the field of view that it follows from"
+        )
+    if not all(abs(x) <= high for x in center):
+        raise DyngsError(f"{where}: the principal point ({center[0]:g}, {center[1]:g}) px lies too far out; correct it")
+
+
+def rescale_warning(where: list[str]) -> list[str]:
+    """Return one line about the images whose intrinsics were rescaled, none if there are none."""
+    if not where:
+        return []
+    return [f"{len(where)} images have another size than their intrinsics, which were rescaled; first {where[0]}"]
+
+
+NEAREST = 1e-9
+"""Points nearer to a camera's plane than this, in world units, or behind it are not seen."""
+
+
+def projected(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places of points in an image: (P, 2) in [0, 1] across and down, and (P,) whether they lie in it.
+
+    As a pinhole camera sees them; places of points that are not in the image mean nothing.
+
+    Args:
+        points: (P, 3) float64 in the world of the view.
+        view: its camera; only pose, intrinsics and size count.
+    """
+    local = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    in_front = local[:, 2] > NEAREST
+    k, depth = view.intrinsics, np.where(in_front, local[:, 2], 1.0)
+    across = (k[0, 0] * local[:, 0] / depth + k[0, 2]) / view.width
+    down = (k[1, 1] * local[:, 1] / depth + k[1, 2]) / view.height
+    places = np.stack([across, down], axis=1)
+    return places, in_front & (places >= 0).all(axis=1) & (places < 1).all(axis=1)
+
+
+def times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
+    """Return (P,) int64: in how many of the views each of the points (P, 3) lies."""
+    counts = np.zeros(len(points), np.int64)
+    for view in views:
+        counts += projected(points, view)[1]
+    return counts
+
+
+def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
+    """Return the (3,) point nearest to all optical axes (least squares), None where the axes are nearly parallel.
+
+    It may lie behind the cameras; see ``fraction_in_front``.
+
+    Args:
+        world_from_cam: (V, 4, 4) rigid OpenCV poses.
+    """
+    centers, axes = world_from_cam[:, :3, 3], world_from_cam[:, :3, 2]
+    middle = centers.mean(axis=0)
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal_matrix = projectors.mean(axis=0)
+    if np.linalg.eigvalsh(normal_matrix)[0] <= 1e-4:
+        return None
+    right_side = np.einsum("vij,vj->i", projectors, centers - middle) / len(centers)
+    return middle + np.linalg.solve(normal_matrix, right_side)
+
+
+def fraction_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
+    """Return the fraction in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of them."""
+    depth = np.einsum("vi,vi->v", point - world_from_cam[:, :3, 3], world_from_cam[:, :3, 2])
+    return float((depth > 0).mean())

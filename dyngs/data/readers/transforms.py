@@ -1,0 +1,371 @@
+"""Transforms JSON files, as Blender, nerfstudio and instant-ngp captures have them: frames, views, points."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from dyngs.data.capture import Lens, PointCloud, VideoFrame, View
+from dyngs.data.geometry import (
+    MAX_SIDE,
+    cam_from_opengl,
+    checked_pose,
+    match_size,
+    pinhole_matrix,
+    repair_warning,
+    rescale_warning,
+)
+from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
+from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import inside
+from dyngs.files.fields import is_number, matrix_of
+from dyngs.files.json_files import read_json_object
+
+MAX_FPS = 1e6
+"""Higher frame rates are taken for mistakes."""
+_LARGEST = 1e300
+_LARGEST_INTEGER = 2**53
+_FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One entry of ``frames``; keys that it lacks are looked up at the file's top level.
+
+    Attributes:
+        where: file and index, for messages.
+        own: the frame's fields.
+        shared: the file's fields.
+        image: the image if ``file_path`` does not name it.
+        video: the video frame that the image is decoded from, if any.
+    """
+
+    where: str
+    own: dict[str, object]
+    shared: dict[str, object]
+    image: Path | None = None
+    video: VideoFrame | None = None
+
+    def number(self, key: str) -> float | None:
+        """Return the finite number at ``key``, None if absent."""
+        return _number(self.own.get(key, self.shared.get(key)), key, self.where)
+
+    def integer(self, key: str) -> int | None:
+        """Return the whole number at ``key`` of this frame alone, None if absent or no whole number."""
+        value = self.own.get(key)
+        if not is_number(value):
+            return None
+        return int(value) if value % 1 == 0 and abs(value) < _LARGEST_INTEGER else None
+
+    def text(self, key: str) -> str | None:
+        """Return the string at ``key``, None if absent."""
+        value = self.own.get(key, self.shared.get(key))
+        if value is not None and not isinstance(value, str):
+            raise DyngsError(f"{self.where}: '{key}' must be a string, got {value!r:.40}")
+        return value
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """A parsed transforms file: its path, all its fields, and its frames."""
+
+    path: Path
+    fields: dict[str, object]
+    frames: tuple[Frame, ...]
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second as the file says, None where it does not."""
+        fps = self.fields.get("fps")
+        if not is_number(fps) or not 0 < fps < MAX_FPS:
+            return None
+        return float(fps)
+
+
+def read_frame_file(path: Path) -> FrameFile:
+    """Read the fields and frames of a transforms file."""
+    wrong = "the list 'frames' is missing; is this a transforms file?"
+    fields = read_json_object(path, wrong)
+    listed = fields.get("frames")
+    if not isinstance(listed, list):
+        raise DyngsError(f"{path}: {wrong}")
+    frames = []
+    for index, own in enumerate(listed):
+        where = f"{path}, frame {index}"
+        if not isinstance(own, dict):
+            raise DyngsError(f"{where}: must be an object with file_path and transform_matrix")
+        if isinstance(own.get("file_path"), str):
+            where += f" ({own['file_path']:.200})"
+        frames.append(Frame(where, own, fields))
+    return FrameFile(path, fields, tuple(frames))
+
+
+def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
+    """Return views by ``file_path`` as written in the file, in its order, and warnings.
+
+    Raises:
+        DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same image twice.
+    """
+    root = file.path.parent
+    paths = [_image_path(root, frame) for frame in file.frames]
+    twice = [path for path, count in Counter(paths).items() if count > 1]
+    if twice:
+        raise DyngsError(f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames")
+    headers = [
+        header_if_readable(path) if frame.video is None else None
+        for frame, path in zip(file.frames, paths, strict=True)
+    ]
+    common = _common_size(file, paths, headers)
+    repaired: dict[str, float] = {}
+    rescaled: list[str] = []
+    views = {}
+    for frame, path, header in zip(file.frames, paths, headers, strict=True):
+        described = _described_size(frame)
+        stored = header.size_for(described) if header else None
+        view, repaired[frame.where], is_rescaled = _view(frame, root, path, stored, common)
+        rescaled += [frame.where] if is_rescaled else []
+        views[str(frame.own["file_path"])] = replace(view, exposure=header.tags.exposure if header else None)
+    return _with_flow_targets(views), repair_warning(repaired) + rescale_warning(rescaled)
+
+
+def tracks_path_of(file: FrameFile) -> Path | None:
+    """Return the file of 2D tracks that ``tracks_file_path`` names, None without one."""
+    written = file.fields.get("tracks_file_path")
+    if written is not None and not isinstance(written, str):
+        raise DyngsError(f"{file.path}: 'tracks_file_path' must be a string, got {written!r:.40}")
+    return _below(file.path.parent, written, str(file.path)) if written else None
+
+
+def view_name(path: Path, root: Path) -> str:
+    """Name of a view: the image's path below ``root`` without extension, safe as a relative file name."""
+    relative = PurePosixPath(os.path.relpath(path, root).replace(os.sep, "/")).with_suffix("")
+    return "/".join(part for part in relative.parts if part not in ("..", "/"))
+
+
+def _view(
+    frame: Frame, root: Path, path: Path, stored: tuple[int, int] | None, common: tuple[int, int] | None
+) -> tuple[View, float, bool]:
+    """Return a view, by how much its rotation was repaired, and whether its intrinsics were rescaled."""
+    described = _described_size(frame) or stored or common
+    if described is None:
+        described = read_header(path).upright_size  # raises the error
+    intrinsics, size, rescaled = match_size(_intrinsics(frame, *described), described, stored, frame.where)
+    pose, error = checked_pose(_matrix(frame), frame.where)
+    masks = [_named_file(root, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
+    camera = frame.integer("camera")
+    view = View(
+        name=view_name(path, root),
+        image_path=path,
+        cam_from_world=cam_from_opengl(pose),
+        intrinsics=intrinsics,
+        width=size[0],
+        height=size[1],
+        lens=_lens(frame),
+        camera_id=(camera if camera is not None else frame.integer("camera_id")) or 0,
+        mask_path=_named_file(root, frame, "mask_path"),
+        time=_number(frame.own.get("time"), "time", frame.where),
+        frame=frame.integer("frame"),
+        video=frame.video,
+        depth_path=_named_file(root, frame, "depth_file_path"),
+        motion_mask_path=masks[0] or masks[1],
+        motion_mask_labels=masks[0] is None and masks[1] is not None,
+        flow_path=_named_file(root, frame, "flow_file_path"),
+    )
+    return view, error, rescaled
+
+
+def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
+    """Return the views of a file with the next view of the same camera in ``flow_to`` where they have flow."""
+    if all(view.flow_path is None for view in views.values()):
+        return views
+    ordered = sorted(views.items(), key=lambda item: (item[1].camera_id, item[1].time or 0.0, item[1].name))
+    following = {
+        key: after.name if after.camera_id == view.camera_id else None for (key, view), (_, after) in pairwise(ordered)
+    }
+    return {key: replace(view, flow_to=following.get(key)) for key, view in views.items()}
+
+
+def _named_file(root: Path, frame: Frame, key: str) -> Path | None:
+    """Return the file that a frame names at ``key``, None where it names none."""
+    written = frame.text(key)
+    return _below(root, written, frame.where) if written else None
+
+
+def _number(value: object, key: str, where: str) -> float | None:
+    if value is None:
+        return None
+    if not is_number(value) or not abs(value) < _LARGEST:
+        raise DyngsError(f"{where}: '{key}' must be a finite number, got {value!r:.40}")
+    return float(value)
+
+
+def _below(root: Path, written: str, where: str) -> Path:
+    path = Path(os.path.normpath(root / written.replace("\\", "/")))
+    if not path.name or path == Path(os.path.normpath(root)) or "\0" in written:
+        raise DyngsError(f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder")
+    return path
+
+
+def _image_path(root: Path, frame: Frame) -> Path:
+    """The image's file; extensions are tried where none is written, PNG first."""
+    if frame.image is not None:
+        return frame.image
+    written = frame.own.get("file_path")
+    if not isinstance(written, str) or not written:
+        raise DyngsError(f"{frame.where}: the key 'file_path' is missing")
+    path = _below(root, written, frame.where)
+    if path.suffix.lower() in SUFFIXES or path.is_file():
+        return path
+    candidates = [path.with_name(path.name + ending) for suffix in SUFFIXES for ending in (suffix, suffix.upper())]
+    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
+
+
+def _described_size(frame: Frame) -> tuple[int, int] | None:
+    width, height = frame.number("w"), frame.number("h")
+    if width is None or height is None:
+        return None
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise DyngsError(f"{frame.where}: w and h must be from 1 to {MAX_SIDE:,}, got {width:g} and {height:g}")
+    return round(width), round(height)
+
+
+def _common_size(file: FrameFile, paths: list[Path], headers: list[ImageHeader | None]) -> tuple[int, int] | None:
+    """(width, height) of the images without a size of their own, which share the file's focal length."""
+    sizes: dict[tuple[int, int], Path] = {}
+    for frame, path, header in zip(file.frames, paths, headers, strict=True):
+        has_own = any(key in frame.own for key in _FOCAL_KEYS)
+        if header and not has_own and _described_size(frame) is None:
+            sizes.setdefault(header.upright_size, path)
+    if len(sizes) > 1:
+        (first, path), (second, other) = list(sizes.items())[:2]
+        raise DyngsError(
+            f"{file.path}: images of different sizes share one focal length ({path} is {first[0]}x{first[1]}, "
+            f"{other} is {second[0]}x{second[1]}); give w, h and fl_x for each frame"
+        )
+    return next(iter(sizes), None)
+
+
+def _intrinsics(frame: Frame, width: int, height: int) -> np.ndarray:
+    source = frame.own if any(key in frame.own for key in _FOCAL_KEYS) else frame.shared
+    focal_x = _focal(source, "x", width, frame.where)
+    focal_y = _focal(source, "y", height, frame.where)
+    if focal_x is None and focal_y is None:
+        raise DyngsError(f"{frame.where}: no focal length; give fl_x (px) or camera_angle_x (radians)")
+    cx, cy = frame.number("cx"), frame.number("cy")
+    return pinhole_matrix(
+        focal_x or focal_y or 0.0,
+        focal_y or focal_x or 0.0,
+        0.5 * width if cx is None else cx,
+        0.5 * height if cy is None else cy,
+    )
+
+
+def _focal(source: dict[str, object], axis: str, size: int, where: str) -> float | None:
+    """Focal length in pixels along one axis, None where the source does not give it."""
+    focal = _number(source.get(f"fl_{axis}"), f"fl_{axis}", where)
+    # An angle beside an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
+    if focal is None and not any(source.get(key) is not None for key in ("fl_x", "fl_y")):
+        angle = _number(source.get(f"camera_angle_{axis}"), f"camera_angle_{axis}", where)
+        if angle is None:
+            return None
+        if not 0 < angle < math.pi:
+            raise DyngsError(f"{where}: camera_angle_{axis} must lie between 0 and pi radians, got {angle:g}")
+        focal = 0.5 * size / max(math.tan(0.5 * angle), 1e-300)
+    if focal is not None and focal <= 0:
+        raise DyngsError(f"{where}: fl_{axis} must be positive, got {focal:g}")
+    return focal
+
+
+def _lens(frame: Frame) -> Lens:
+    model = (frame.text("camera_model") or "OPENCV").upper()
+    k1, k2, k3, k4, k5, k6, p1, p2 = (
+        frame.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    )
+    if model == "OPENCV_FISHEYE" or frame.own.get("is_fisheye", frame.shared.get("is_fisheye")) is True:
+        return Lens("fisheye", (k1, k2, k3, k4))
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return Lens()
+    if model not in ("OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"):
+        raise DyngsError(f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE")
+    if k4 and not (k5 or k6 or model == "FULL_OPENCV"):
+        raise DyngsError(f"{frame.where}: k4 has no agreed meaning for {model}; use FULL_OPENCV or set it to 0")
+    params = (k1, k2, p1, p2, k3, k4, k5, k6)
+    while len(params) > 4 and not params[-1]:
+        params = params[:-1]
+    return Lens("opencv", params) if any(params) else Lens()
+
+
+def _matrix(frame: Frame) -> np.ndarray:
+    value = frame.own.get("transform_matrix")
+    if value is None:
+        raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
+    return matrix_of(frame.where, "transform_matrix", value)
+
+
+USUAL_NAMES = ("points3d.ply", "points3D.ply", "fused.ply", "points.ply")
+"""Names that 4DGaussians, COLMAP and nerfstudio give to first points, in the order in which they are looked for."""
+KEY = "ply_file_path"
+
+
+@dataclass(frozen=True)
+class FoundPoints:
+    """Points next to a transforms file: the file that they are from, and warnings; None where there are none."""
+
+    points: PointCloud | None = None
+    path: Path | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def find_points(file: FrameFile) -> FoundPoints:
+    """Return the points that belong to a transforms file.
+
+    Those of its key ``ply_file_path``; else of the first of ``USUAL_NAMES`` that is in its folder; else of the only
+    ``.ply`` there. A file that is named nowhere and cannot be read is left out, with a warning.
+
+    Raises:
+        DyngsError: the file that the key names is missing, unreadable, or outside the capture.
+    """
+    root, written = file.path.parent, file.fields.get(KEY)
+    if isinstance(written, str) and written:
+        path = inside(root / written)
+        return FoundPoints(read_points(path), path)
+    usual = [root / name for name in USUAL_NAMES if (root / name).is_file()]
+    path = usual[0] if usual else _only_ply(root)
+    if path is None:
+        return FoundPoints()
+    try:
+        points = read_points(inside(path))
+    except DyngsError as error:
+        return FoundPoints(warnings=(f"not used as points: {error}",))
+    return FoundPoints(points, path) if len(points.xyz) else FoundPoints()
+
+
+def _only_ply(root: Path) -> Path | None:
+    """Return the only file of the folder that ends in .ply, None where there are none or several."""
+    found = [path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file()]
+    return found[0] if len(found) == 1 else None
+
+
+def read_points(path: Path) -> PointCloud:
+    """Read the points of a ``.ply`` file (through trimesh), grey where it has no colours."""
+    import trimesh
+
+    if not path.is_file():
+        raise DyngsError(f"{path}: no such point file; restore it or remove {KEY}")
+    # From an open file: given a path, trimesh would look for textures beside it.
+    with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
+        loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
+        xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        own = isinstance(loaded, trimesh.PointCloud)
+        colours = loaded.colors if own else getattr(loaded.visual, "vertex_colors", None)
+        rgb = np.full((len(xyz), 3), 128, np.uint8)
+        if colours is not None and len(colours) == len(xyz):
+            rgb = np.ascontiguousarray(np.asarray(colours)[:, :3].astype(np.uint8))
+    return PointCloud(xyz, rgb)
