@@ -54,8 +54,8 @@ from dyngs.human.motion.retarget import least_rotation
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
 from dyngs.human.synthetic.capture import Light, random_light
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES, JOINT_PARENTS
-from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import interpolate, normalized, rasterize
 
 SAMPLES = 3

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
 from dyngs.human.motion.gltf_file import GltfFile
-from dyngs.human.motion.rigs import match_joints
+from dyngs.human.motion.retarget import match_joints
 from dyngs.human.template.mesh import normalized
 
 

@@ -52,14 +52,13 @@ from dyngs.gaussians.colour.network import box_around, network_of
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions, Shader
 from dyngs.gaussians.scene import Scene, SceneTraining, render_options
-from dyngs.human.avatar.fine_limbs import pixel_size, surface_gaussians, surface_texels
-from dyngs.human.avatar.light import rest_normals
-from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes
+from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
+from dyngs.human.avatar.observations import Subject, first_look
+from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.subject import Subject, first_look
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.captured import captured_motion
-from dyngs.human.template.load import load_template, rest_shape
+from dyngs.human.motion.clip import captured_motion
+from dyngs.human.template.body_reader import load_template, rest_shape
 from dyngs.ops.device import device_for
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.fixed import FixedDensifier

@@ -19,7 +19,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.runs.checkpoint import CheckpointInfo, LoadedRun
 
 RESOLUTION = 64

@@ -22,13 +22,11 @@ from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
-from dyngs.human.avatar.light import TERMS
-from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
-from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.human.avatar.validation import require_body, require_shapes
+from dyngs.human.avatar.posing import TERMS, PoseBlendShapes, Skeleton
+from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.motion.placement import rest_clip
-from dyngs.human.template.load import template_path
+from dyngs.human.template.body_reader import template_path
 from dyngs.runs.checkpoint import LoadedRun, info_of
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 

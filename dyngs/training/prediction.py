@@ -17,12 +17,11 @@ from dyngs.gaussians.rendering import Rendering
 from dyngs.gaussians.scene import render_options
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.prediction.network import AtlasNetwork
+from dyngs.human.prediction.network import AtlasNetwork, PredictedAvatar, num_input_channels, predict_gaussians
 from dyngs.human.prediction.person import CapturedPerson, captured_person, spread_views
-from dyngs.human.prediction.predict import PredictedAvatar, num_input_channels, predict_gaussians
 from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atlas
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import load_template
+from dyngs.human.template.body_reader import load_template
 from dyngs.ops.device import CPU, device_for
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.transfer import sent

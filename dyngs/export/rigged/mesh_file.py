@@ -18,11 +18,11 @@ from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
 from dyngs.files.glb import INDICES, VERTICES, GlbDocument
 from dyngs.files.write import atomic_file
-from dyngs.human.avatar.light import LEFT_OUT
+from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import load_template
+from dyngs.human.template.body_reader import load_template
 from dyngs.runs.checkpoint import LoadedRun
 
 SUFFIX = ".glb"

@@ -21,7 +21,7 @@ from dyngs.files.glb import VERTICES, GlbDocument
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import heaviest_joints
-from dyngs.human.avatar.light import LEFT_OUT
+from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.splats.gltf import EXTENSION, gaussian_attributes, gaussian_primitive

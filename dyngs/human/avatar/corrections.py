@@ -15,8 +15,7 @@ from torch import Tensor
 from dyngs.config import HumanModel
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
-from dyngs.human.avatar.light import TERMS, Light
-from dyngs.human.avatar.posing import BodyPose, Skeleton
+from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.joints import mirrored_joints
@@ -72,7 +71,7 @@ def new_corrections(
     Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
     ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
     optionally ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``, ``light`` (8, 3) and
-    ``normals`` (N, 3), see ``dyngs.human.avatar.light``.
+    ``normals`` (N, 3), see ``dyngs.human.avatar.posing``.
     """
     unit = float(clip.scale.mean())
     zeros = {

@@ -1,6 +1,6 @@
 """Body poses fitted to images: the poses in which an avatar, which stays as it is, looks most like them.
 
-Either the whole images count, or their silhouettes alone (``dyngs.human.avatar.pose_comparison``). GART (Lei et al.
+Either the whole images count, or their silhouettes alone (``dyngs.human.avatar.pose_fit``). GART (Lei et al.
 2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test images like this before they score new poses.
 Local letters: F moments, J joints, V images of a moment.
 """
@@ -8,22 +8,83 @@ Local letters: F moments, J joints, V images of a moment.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from dyngs.data.images.images import area_downscale
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.gaussians.rendering import Rendering, RenderOptions
 from dyngs.gaussians.scene import Moment
-from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
-from dyngs.human.avatar.pose_comparison import IMAGES, Comparison
+from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.ops.adam import adam_step_
+from dyngs.ops.loss import l1_ssim_loss
+
+SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
+"""Of SSIM and of the mean error of alpha in the loss of whole images, as in training."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How renders of a person are compared with images, and what keeps the pose near that given.
+
+    Attributes:
+        difference: the loss () between a rendering and an image on a background (3,), with sides divided by a factor.
+        turn_weight: of the mean squared rotation that is added to the joints, 1 / rad^2.
+        shift_weight: of the mean squared translation that is added, 1 / m^2.
+        views_to_turn: fewest images of one moment from which rotations are fitted; from fewer the translation is.
+    """
+
+    difference: Callable[[Rendering, Image, Tensor, int], Tensor]
+    turn_weight: float
+    shift_weight: float = 0.0
+    views_to_turn: int = 1
+
+
+def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
+    """Return 0.8 L1 + 0.2 (1 - SSIM) + 0.1 of the mean error of alpha ()."""
+    rendered, truth, mask = drawn.rgb[0], image.composite(background), image.mask
+    error = None if image.alpha is None else (drawn.alpha[0] - image.alpha)[..., None]
+    if mask is not None:
+        rendered, truth = rendered * mask[..., None], truth * mask[..., None]
+        error = None if error is None else error * mask[..., None]
+        mask = shrunk(mask[..., None], shrink)[..., 0]
+    loss = l1_ssim_loss(shrunk(rendered, shrink), shrunk(truth, shrink), SSIM_WEIGHT, mask)
+    return loss if error is None else loss + ALPHA_WEIGHT * shrunk(error, shrink).abs().mean()
+
+
+def difference_of_silhouettes(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
+    """Return the squared error of alpha, over the area of the silhouette (); nothing else of the image is looked at.
+
+    Raises:
+        ValueError: an image without alpha.
+    """
+    if image.alpha is None:
+        raise ValueError(f"{image.name}: has no silhouette")
+    error, truth = drawn.alpha[0] - image.alpha, image.alpha
+    if image.mask is not None:
+        error, truth = error * image.mask, truth * image.mask
+    return shrunk(error[..., None], shrink).square().sum() / shrunk(truth[..., None], shrink).sum().clamp_min(1)
+
+
+IMAGES = Comparison(difference_of_images, turn_weight=POSE_WEIGHT / POSE_CM**2)
+SILHOUETTES = Comparison(difference_of_silhouettes, turn_weight=1.0, shift_weight=10.0, views_to_turn=2)
+"""One view hides how far limbs reach towards the camera: rotations fitted to it look wrong from elsewhere."""
+
+
+def shrunk(image: Tensor, factor: int) -> Tensor:
+    """Return the (H, W, C) image with its sides divided by ``factor``, averaged over pixel areas."""
+    if factor == 1:
+        return image
+    height, width = (max(1, round(side / factor)) for side in image.shape[:2])
+    return area_downscale(image, width, height)
+
 
 COARSE_PX = 40
 """Height of the person, px, in the coarsest of the three rounds."""

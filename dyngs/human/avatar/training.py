@@ -18,12 +18,10 @@ from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import Moment, Scene
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
-from dyngs.human.avatar.light import difference_of_sides
-from dyngs.human.avatar.neighbours import linked_neighbours
-from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, trust_in
+from dyngs.human.avatar.observations import Subject
+from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.subject import Subject
-from dyngs.human.avatar.unseen import HARDLY, filled, mirror_images, sightings, trust_in
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates

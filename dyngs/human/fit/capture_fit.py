@@ -23,13 +23,10 @@ from dyngs.human.fit.keypoints import Keypoints
 from dyngs.human.fit.lens_fit import LensFit, fit_lens
 from dyngs.human.fit.lens_fit import num_ticks as num_lens_ticks
 from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
-from dyngs.human.fit.pose_prior import near_given, usual
-from dyngs.human.fit.result import BodyFit, body_fit
-from dyngs.human.fit.solve import Stage, drawn_frame, new_fit, run_stage
+from dyngs.human.fit.solve import BodyFit, Stage, body_fit, drawn_frame, near_given, new_fit, run_stage, usual
 from dyngs.human.fit.start import first_poses, num_ticks
 from dyngs.human.fit.surface import Surface, surface_of
-from dyngs.human.motion.captured import CapturedMotion, captured_motion
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 
 IMAGE_SIDE = 512

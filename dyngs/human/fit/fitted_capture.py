@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,18 +14,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig
-from dyngs.conventions import ReportProgress
-from dyngs.data.capture import Capture, Split
+from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.data.capture import Capture, Split, View
 from dyngs.data.fitted_body import numbered
 from dyngs.data.frame_selection import evenly_spaced
-from dyngs.data.loader import ImageLoader
+from dyngs.data.geometry.poses import opengl_from_cam
+from dyngs.data.images.images import straight_uint8
+from dyngs.data.loader import Image, ImageLoader
+from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import require_new_folder
+from dyngs.errors import DyngsError, reading
+from dyngs.files.cache import cache_folder
 from dyngs.files.temporary import temporary_folder_beside
-from dyngs.files.write import write_image, write_text
-from dyngs.human.avatar.posing import frame_pose
+from dyngs.files.write import atomic_file, write_image, write_text
+from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
-from dyngs.human.fit.clips import FittedClip, fitted_clips
+from dyngs.human.fit.clips import FittedClip, NewClip, fitted_clips, placed_clip
 from dyngs.human.fit.inputs import (
     NOTHING_ELSE,
     FitInputs,
@@ -34,15 +42,120 @@ from dyngs.human.fit.inputs import (
     with_lens,
 )
 from dyngs.human.fit.keypoints import read_keypoints
-from dyngs.human.fit.known_avatar import AvatarPoses, posed_by_avatar
-from dyngs.human.fit.known_person import known_shape, shape_of, with_shape
-from dyngs.human.fit.new_clip import NewClip, placed_clip
-from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
-from dyngs.human.fit.surface import surface_of
-from dyngs.human.fit.written import write_body, write_split
+from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.fit.surface import Surface, drawn_silhouettes, surface_of
+from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
+
+FRAME_RATE = 30.0
+"""Frames per second of a clip whose capture does not say."""
+
+
+def write_body(
+    path: Path,
+    clip: MotionClip,
+    betas: np.ndarray,
+    world_offset: np.ndarray,
+    frames: Sequence[int],
+    fps: float | None = None,
+) -> None:
+    """Write the body parameters of a clip, also readable as a motion: one row for each of the numbers ``frames``.
+
+    ``betas`` (B,) are of the free template's shape space; ``fps`` frames per second, None where nobody knows.
+    """
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            poses=clip.poses.reshape(len(clip), -1).cpu().numpy(),
+            trans=(clip.trans.double().cpu().numpy() + world_offset).astype(np.float32),
+            betas=betas.astype(np.float32),
+            scale=clip.scale.cpu().numpy(),
+            surface_model_type="anny",
+            gender="neutral",
+            up_axis="y",
+            frames=np.asarray(frames, dtype=np.int64),
+            mocap_frame_rate=np.float64(FRAME_RATE if fps is None else fps),
+        )
+
+
+def write_split(
+    out: Path,
+    split: Split,
+    shown: Iterator[tuple[View, Image]],
+    rows: Mapping[int, int],
+    world_offset: np.ndarray,
+) -> None:
+    """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
+
+    Args:
+        out: folder.
+        split: name.
+        shown: the views with their images.
+        rows: frame number to row of the body parameters.
+        world_offset: (3,) added to all positions: where the capture was recentred from.
+    """
+    frames: list[dict[str, object]] = []
+    for view, image in shown:
+        row = rows[-1 if view.frame is None else view.frame]
+        name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
+        write_image(out / name, _straight(image))
+        camera = image.cameras
+        intrinsics = camera.intrinsics[0].double().numpy()
+        pose = opengl_from_cam(view.cam_from_world).copy()
+        pose[:3, 3] += world_offset
+        entry: dict[str, object] = {"file_path": name, "frame": row, "camera": view.camera_id}
+        entry |= {} if view.time is None else {"time": view.time}
+        entry |= {"w": camera.width, "h": camera.height, "fl_x": intrinsics[0, 0], "fl_y": intrinsics[1, 1]}
+        frames.append(entry | {"cx": intrinsics[0, 2], "cy": intrinsics[1, 2], "transform_matrix": pose.tolist()})
+    write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
+
+
+def _straight(image: Image) -> np.ndarray:
+    """Return straight colours, with alpha if there is one, (H, W, 3 or 4) uint8."""
+    parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
+    return straight_uint8(torch.cat(parts, dim=-1)).numpy()
+
+
+GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)
+"""Colours of the outlines: red and green."""
+
+
+@torch.no_grad()
+def overlay(
+    image: Image, surface: Surface, bodies: Sequence[tuple[Tensor, BodyPose, tuple[float, float, float]]]
+) -> np.ndarray:
+    """Return the image (H, W, 3) in [0, 1] over white with the outlines of bodies.
+
+    Args:
+        image: of one view.
+        surface: of the template.
+        bodies: shape parameters, pose and colour of each, drawn one over the other.
+    """
+    sheet = image.composite(torch.ones_like(image.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
+    for betas, pose, colour in bodies:
+        discs = surface.in_pose(betas, torch.zeros_like(surface.weights[:, 0]), pose)
+        sheet[_outline(drawn_silhouettes(discs, image.cameras)[0] > 0.5)] = sheet.new_tensor(colour)
+    return sheet.cpu().numpy()
+
+
+def side_by_side(sheets: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Return one image of several, white where they are smaller than the largest."""
+    height, width = (max(sheet.shape[axis] for sheet in sheets) for axis in (0, 1))
+    rows = -(-len(sheets) // columns)
+    whole = np.ones((rows * height, min(columns, len(sheets)) * width, 3), np.float32)
+    for i, sheet in enumerate(sheets):
+        top, left = i // columns * height, i % columns * width
+        whole[top : top + sheet.shape[0], left : left + sheet.shape[1]] = sheet
+    return whole
+
+
+def _outline(inside: Tensor) -> Tensor:
+    """Return the pixels (H, W) inside whose neighbour is outside."""
+    grown = torch.nn.functional.max_pool2d((~inside).float()[None, None], 3, 1, 1)[0, 0] > 0
+    return inside & grown
+
 
 REPORT_NAME, OVERLAYS_NAME = "fit_report.json", "fit_overlays.png"
 _MASKS = ".masks"
@@ -194,3 +307,62 @@ def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: tuple[Avata
         "betas": [round(beta, 4) for beta in fit.betas.tolist()],
         "turns_degrees": {name: round(float(turn), 2) for name, turn in zip(JOINT_NAMES, turns, strict=True) if turn},
     }
+
+
+KEYPOINTS = "keypoints"
+"""Folder of a capture with key points of its images, as OpenPose writes them."""
+_LARGEST = 100_000_000
+"""Files of a capture larger than this many bytes, such as videos, are not what it says about bodies and cameras."""
+
+
+def with_fitted_body(
+    data: DataConfig,
+    *,
+    only_if_needed: bool = False,
+    say: Callable[[str], None] = print,
+    report: ReportProgress = report_nothing,
+) -> DataConfig:
+    """Return the options with a fit of the free template to the capture; the same capture is fitted once.
+
+    Nothing is fitted where ``data.body`` names a fit, where the capture itself holds one, or without silhouettes.
+
+    Args:
+        data: its ``root`` is a capture of a person.
+        only_if_needed: fit nothing where the capture has body parameters.
+        say: is told in a line what is done, and what came out.
+        report: is told how far the fit has come.
+
+    Raises:
+        DyngsError: neither body parameters nor silhouettes.
+    """
+    if data.body is not None:
+        return data
+    capture = read_capture(data)
+    if capture.body is not None and (only_if_needed or capture.body["train"].shape_space == "anny"):
+        return data
+    if not capture.has_alpha:
+        if capture.body is None:
+            raise DyngsError(
+                f"{data.root}: has neither silhouettes nor body parameters, so no person can be found; add masks of "
+                "the person (docs/person.md)"
+            )
+        say(f"{data.root}: no silhouettes, so the body parameters are taken as given")
+        return data
+    folder = cache_folder("bodies") / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}"
+    if folder.is_dir():
+        say(f"body:    the fit of before, in {folder}")
+    else:
+        say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder}")
+        points = data.root / KEYPOINTS
+        say(write_fit(data, folder, report, FitInputs(points if points.is_dir() else None)).summary())
+    return data.model_copy(update={"body": folder})
+
+
+def _digest(data: DataConfig) -> str:
+    """Return a digest of the capture's files (names, sizes, times of change) and of the options of reading it."""
+    root = data.root.resolve()
+    with reading(root):
+        files = sorted(path for path in root.rglob("*") if path.is_file() and path.stat().st_size < _LARGEST)
+    options = data.model_dump(mode="json", include={"format", "frames", "times", "frames_per_second", "test_every"})
+    chosen = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]
+    return f"{digest_of(root, files)}{chosen}"

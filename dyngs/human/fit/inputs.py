@@ -16,8 +16,7 @@ from dyngs.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.fit.joints3d import Joints3D, read_joints
 from dyngs.human.fit.lens_fit import LensFit
-from dyngs.human.template.body_reader import read_body
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template, read_body
 
 _LOOKED_AT, _PRESENT = 128, 0.2
 """Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""

@@ -9,8 +9,7 @@ import torch
 
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import PosePrior
-from dyngs.human.fit.solve import Observations, Stage, frame_error, run_stage, with_lens
+from dyngs.human.fit.solve import Observations, PosePrior, Stage, frame_error, run_stage, with_lens
 from dyngs.human.fit.surface import Surface
 from dyngs.human.motion.clip import MotionClip
 

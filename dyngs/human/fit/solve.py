@@ -8,20 +8,93 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import NUM_TURNED, PosePrior
 from dyngs.human.fit.surface import Surface, drawn_silhouettes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
-from dyngs.human.template.bone_shapes import NUM_BONE_SHAPES
+from dyngs.human.template.body import NUM_BONE_SHAPES
+from dyngs.human.template.joints import JOINT_NAMES
+
+NUM_TURNED = 22
+"""Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
+_GIVEN = 0.05
+"""Expected error of given poses, rad."""
+_LIMIT = 3.0
+"""Standard deviations of usual poses beyond which joints would be dislocated."""
+_LEAST = 8.0
+"""Least spread, degrees: a few clips do not show how far a joint can go."""
+_DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "hip": ((-11, 1, -6), (23, 14, 7)),
+    "knee": ((26, 0, 1), (22, 1, 0)),
+    "ankle": ((-1, 27, -12), (13, 8, 6)),
+    "spine1": ((7, 0, 0), (7, 2, 3)),
+    "spine2": ((5, 0, 0), (7, 6, 10)),
+    "spine3": ((-2, 0, 0), (3, 1, 2)),
+    "neck": ((-12, 0, 0), (4, 17, 10)),
+    "head": ((-1, 0, 0), (11, 5, 4)),
+    "collar": ((0, 1, -16), (0, 7, 10)),
+    "shoulder": ((16, -13, -49), (37, 20, 28)),
+    "elbow": ((-7, -40, 16), (5, 29, 13)),
+    "wrist": ((-4, -2, 10), (3, 11, 6)),
+}
+"""Axis-angle vectors of the left side, and their standard deviations; the right side is the mirror image."""
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Expected corrections of the poses of F frames, axis-angle, rad.
+
+    Attributes:
+        centre: (F, 22, 3) mean.
+        spread: (22, 3) standard deviation.
+        limit: of these from the centre, beyond which nobody is expected to turn a joint.
+    """
+
+    centre: Tensor
+    spread: Tensor
+    limit: float = math.inf
+
+
+def near_given(clip: MotionClip) -> PosePrior:
+    """Return the prior that poses are about those given."""
+    return PosePrior(torch.zeros_like(clip.poses[:, :NUM_TURNED]), torch.full_like(clip.poses[0, :NUM_TURNED], _GIVEN))
+
+
+def usual(clip: MotionClip) -> PosePrior:
+    """Return the prior that corrected poses are usual ones; rotations add as vectors, which holds for small ones."""
+    spread = usual_spread(NUM_TURNED).to(clip.poses)
+    return PosePrior(usual_pose(NUM_TURNED).to(clip.poses) - clip.poses[:, :NUM_TURNED], spread, _LIMIT)
+
+
+def usual_pose(joints: int) -> Tensor:
+    """Return the mean pose (joints, 3), axis-angle, rad; zero for joints that are not known."""
+    return _table(0, joints)
+
+
+def usual_spread(joints: int) -> Tensor:
+    """Return the standard deviations (joints, 3) about it, rad, at least 8 degrees."""
+    return _table(1, joints).abs().clamp_min(torch.deg2rad(torch.tensor(_LEAST, device="cpu")))
+
+
+def _table(which: int, joints: int) -> Tensor:
+    found = torch.zeros(joints, 3, device="cpu")
+    for row, name in enumerate(JOINT_NAMES[:joints]):
+        side, _, rest = name.partition("_")
+        degrees = _DEGREES.get(rest if side in ("left", "right") else name)
+        if degrees is not None:
+            mirrored = (1.0, -1.0, -1.0) if side == "right" else (1.0, 1.0, 1.0)
+            found[row] = torch.tensor([x * m for x, m in zip(degrees[which], mirrored, strict=True)], device="cpu")
+    return torch.deg2rad(found)
+
 
 LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
     "offset": 3e-3,
@@ -251,3 +324,51 @@ def _forget_others(learned: Parameters, names: Sequence[str]) -> None:
     for name in learned.values():
         if name not in names:
             learned[name].grad = None
+
+
+@dataclass(frozen=True)
+class BodyFit:
+    """A body fitted to a clip of F frames, as a correction of the poses that were given.
+
+    Attributes:
+        betas: (B,) shape parameters of the template.
+        shared: turns of the joints and factor on the size, the same in all frames.
+        offset: (3,) m, correction of the translation in the frame of the pelvis, the same in all frames.
+        shift: (3,) the same in the frame of the world, in its unit.
+        poses: (F, J, 3) axis-angle, rad, added to the turns per frame.
+        trans: (F, 3) added to the given translations.
+    """
+
+    betas: Tensor
+    shared: SharedCorrection
+    offset: Tensor
+    shift: Tensor
+    poses: Tensor
+    trans: Tensor
+
+    def fitted(self, clip: MotionClip) -> MotionClip:
+        """Return the clip that was fitted, with its corrections."""
+        return self._moved(corrected_clip(self.shared, clip, self.poses, self.trans))
+
+    def applied(self, clip: MotionClip) -> MotionClip:
+        """Return another clip whose poses were given by the same means, with what holds for all frames."""
+        return self._moved(corrected_clip(self.shared, clip))
+
+    def _moved(self, turned: MotionClip) -> MotionClip:
+        """Return the turned clip at its place."""
+        roots = axis_angle_to_matrix(turned.poses[:, 0])
+        away = self.shift + turned.scale[:, None] * (roots @ self.offset[:, None])[..., 0]
+        return replace(turned, trans=turned.trans + away)
+
+
+def body_fit(learned: Parameters, joints: int) -> BodyFit:
+    """Return what was learned (``new_fit``) as a fit of a body of so many joints."""
+    values = learned.values()
+
+    def padded(turns: Tensor) -> Tensor:
+        blank = turns.new_zeros(*turns.shape[:-2], joints - turns.shape[-2], 3)
+        return torch.cat([turns, blank], dim=-2)
+
+    shared = SharedCorrection(padded(values["turns"]), float(values["log_scale"][0]))
+    places = (values["offset"], values["shift"])
+    return BodyFit(values["betas"], shared, *places, padded(values["poses"]), values["trans"])

@@ -6,31 +6,82 @@ Local letters: F frames, V views, J joints.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.images.silhouettes import silhouette_box
-from dyngs.human.fit.headings import (
-    MOST_ANCHORS,
-    NUM_HEADINGS,
-    angle_between,
-    heading,
-    likely_path,
-    roots_between,
-)
 from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import NUM_TURNED, usual, usual_pose
-from dyngs.human.fit.solve import Observations, Stage, frame_error, new_fit, prior, run_stage
+from dyngs.human.fit.solve import (
+    NUM_TURNED,
+    Observations,
+    Stage,
+    frame_error,
+    new_fit,
+    prior,
+    run_stage,
+    usual,
+    usual_pose,
+)
 from dyngs.human.fit.surface import Surface
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
+
+NUM_HEADINGS = 8
+"""Directions that a person may face, all of which are tried in every anchor."""
+MOST_ANCHORS = 20
+"""Frames in which headings are tried."""
+CHANGE_WEIGHT = 0.01
+"""Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the square."""
+
+
+def likely_path(errors: Sequence[Sequence[float]], weight: float = CHANGE_WEIGHT) -> list[int]:
+    """Return the heading (A,) of each anchor for which errors (A, H) and changes of heading cost least in all.
+
+    Source: the algorithm of Viterbi, 1967.
+    """
+    costs = np.asarray(errors, dtype=np.float64)
+    count = costs.shape[1]
+    apart = np.abs(np.arange(count)[:, None] - np.arange(count))
+    change = weight * (np.minimum(apart, count - apart) * (8 / count)) ** 2
+    total, came_from = costs[0], []
+    for own in costs[1:]:
+        ways = total[:, None] + change
+        came_from.append(ways.argmin(0))
+        total = ways.min(0) + own
+    path = [int(total.argmin())]
+    for back in reversed(came_from):
+        path.append(int(back[path[-1]]))
+    return path[::-1]
+
+
+def roots_between(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
+    """Return rotations (count, 3) of the root, axis-angle, rad: those (A, 3) of the anchors, turned on between them.
+
+    Before the first anchor and after the last one they stay.
+    """
+    if len(anchors) == 1:
+        return roots.expand(count, 3).clone()
+    between = Slerp(np.asarray(anchors, dtype=np.float64), Rotation.from_rotvec(roots.numpy()))
+    rows = np.clip(np.arange(count, dtype=np.float64), anchors[0], anchors[-1])
+    return torch.from_numpy(between(rows).as_rotvec()).to(roots)
+
+
+def angle_between(a: Tensor, b: Tensor) -> float:
+    """Return the angle, rad, of the rotation from ``a`` (3,) to ``b`` (3,), both axis-angle."""
+    return float((Rotation.from_rotvec(a.numpy()).inv() * Rotation.from_rotvec(b.numpy())).magnitude())
+
+
+def heading(index: int) -> float:
+    """Return the angle about the vertical, rad, of the heading ``index``."""
+    return 2 * math.pi * index / NUM_HEADINGS
+
 
 STEPS = 40
 """Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of the one before."""
@@ -54,7 +105,7 @@ def first_poses(
     """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row) alone.
 
     In some frames, the anchors, every heading is tried; the likely path through them says which way the person faces
-    (``dyngs.human.fit.headings``). Each frame starts from the pose of the one before, and where that has left the path
+    (``dyngs.human.fit.start``). Each frame starts from the pose of the one before, and where that has left the path
     from the heading of the path: single frames would rather be explained by a twisted body. Without key points the
     path may be that of somebody who faces the other way: clips that start with the best headings of the first frame
     and never look at the path are compared with it.

@@ -15,13 +15,13 @@ from dyngs.data.capture import ShapeSpace
 from dyngs.errors import DyngsError, reading
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.write import atomic_file
-from dyngs.human.motion.floor import place_on_floor
 from dyngs.human.motion.motion import (
     Motion,
     UpAxis,
     require_frame_count,
     require_frame_rate,
 )
+from dyngs.human.motion.placement import place_on_floor
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import SMPLX_ROWS
 

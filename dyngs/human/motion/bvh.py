@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.limits import require_at_most
-from dyngs.human.motion.motion import frame_chunks, require_frame_count, require_frame_rate
-from dyngs.human.motion.skeleton_motion import SkeletonMotion
+from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, require_frame_rate
 
 _END_SITE = -1
 _MOST_JOINTS = 4096

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.errors import reading
 from dyngs.files.limits import require_at_most
 from dyngs.human.motion.gltf_file import MOST_JOINTS, Animation, GltfFile
-from dyngs.human.motion.motion import frame_chunks, require_frame_count, sample_times
-from dyngs.human.motion.skeleton_motion import SkeletonMotion
+from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, sample_times
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 

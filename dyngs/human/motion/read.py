@@ -13,7 +13,7 @@ from dyngs.human.motion.gltf import read_gltf, read_vrm_animation
 from dyngs.human.motion.motion import Motion, UpAxis
 from dyngs.human.motion.retarget import retarget
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.config import HumanModel
@@ -16,13 +18,12 @@ from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes
-from dyngs.human.avatar.subject import Subject
-from dyngs.human.motion.captured import captured_motion
-from dyngs.human.prediction.unseen import mirror_texels
+from dyngs.human.motion.clip import captured_motion
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import rest_shape
+from dyngs.human.template.body_reader import rest_shape
 from dyngs.human.template.mesh import vertex_normals
 
 
@@ -162,3 +163,46 @@ def _direction(person: CapturedPerson, view: View) -> Tensor:
     center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
     pelvis = pose.scale * person.subject.skeleton.joints[0] + pose.trans
     return torch.nn.functional.normalize(pose.rotations[0].T @ (center - pelvis), dim=0)
+
+
+_NEAREST = 16
+"""Seen texels that an unseen one takes its colour from."""
+_TURN = 0.1
+"""Metres that count as much as a turn of the normal by 60 degrees."""
+_SOFT = 0.01
+"""Distance added, m, so that the very nearest texel does not decide alone."""
+_UNKNOWN = 0.5
+
+
+def mirror_texels(texels: Texels) -> Tensor:
+    """Return the index (P,) of the texel nearest to the mirror image of each one, at rest."""
+    places = _places(texels)
+    found = KDTree(places).query(places * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
+    return torch.from_numpy(np.asarray(found, dtype=np.int64)).to(texels.index.device)
+
+
+def colours_nearby(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
+    """Return ``rgb`` (P, 3) where ``seen`` (P,) is positive, elsewhere the mean of seen texels that are near at rest.
+
+    Weights fall with the squared distance, and grow with the cosine at which a texel is seen; normals count, too, so
+    that the sole is not coloured like the instep. 0.5 if nothing is seen.
+    """
+    is_seen = (seen > 0).cpu().numpy()
+    if not is_seen.any():
+        return torch.full_like(rgb, _UNKNOWN)
+    if is_seen.all():
+        return rgb
+    places, known = _places(texels), np.flatnonzero(is_seen)
+    count = min(_NEAREST, len(known))
+    found = KDTree(places[known]).query(places[~is_seen], k=count)
+    distance, near = (np.asarray(x).reshape(-1, count) for x in found)  # one neighbour comes without its axis
+    rows = torch.from_numpy(known[near.astype(np.int64)]).to(rgb.device)
+    weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT).square()
+    filled = rgb.clone()
+    filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(1) / weight.sum(1)[:, None]
+    return filled
+
+
+def _places(texels: Texels) -> np.ndarray:
+    """Return the positions and scaled normals (P, 6) of the texels at rest, m."""
+    return torch.cat([texels.points, _TURN * texels.normals], dim=1).double().cpu().numpy()

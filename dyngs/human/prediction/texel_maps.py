@@ -21,8 +21,7 @@ from dyngs.data.loader import Image
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
-from dyngs.human.prediction.person import CapturedPerson
-from dyngs.human.prediction.unseen import colours_nearby
+from dyngs.human.prediction.person import CapturedPerson, colours_nearby
 from dyngs.human.template.atlas import Texels
 from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 

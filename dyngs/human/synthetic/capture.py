@@ -31,7 +31,7 @@ from dyngs.human.synthetic.clothes import (
     texture_coordinates,
 )
 from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 
 _RADIUS = 3.5

@@ -15,15 +15,14 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose, correction_penalties
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.subject import Subject
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.captured import CapturedMotion
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.state import part_of, tensors_of
 from dyngs.static.rates import Rates
 

@@ -15,10 +15,10 @@ from dyngs.errors import DyngsError
 from dyngs.human.fit import start
 from dyngs.human.fit.capture_fit import GAIN, CaptureFit, FitEffort, fit_capture, simplest_of_the_best, split_views
 from dyngs.human.fit.clips import fitted_clips
-from dyngs.human.motion.captured import captured_motion
+from dyngs.human.motion.clip import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.load import default_template, rest_shape
+from dyngs.human.template.body_reader import default_template, rest_shape
 
 OPTIONS = HumanOptions(size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5)
 

@@ -1,5 +1,7 @@
 """3D joints of other programs: each layout gives the joints that were written, and what is refused."""
 
+from __future__ import annotations
+
 import json
 import pickle
 from dataclasses import replace
@@ -11,12 +13,12 @@ import torch
 
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
-from dyngs.human.fit.joint_orders import ORDERS
 from dyngs.human.fit.joints3d import INNER, read_joints
+from dyngs.human.fit.keypoints import ORDERS
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 KNEE, SPINE = JOINT_NAMES.index("left_knee"), JOINT_NAMES.index("spine2")
 

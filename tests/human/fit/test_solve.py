@@ -1,5 +1,7 @@
 """Errors and stages of the fit: known values, and key points that lead a pose."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 
@@ -9,14 +11,15 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import PosePrior, near_given, usual
 from dyngs.human.fit.solve import (
     KEYPOINT,
     LIMIT_WEIGHT,
     PLACE,
+    PosePrior,
     Stage,
     drawn_frame,
     keypoint_error,
+    near_given,
     new_fit,
     place_error,
     posed_joints,
@@ -25,12 +28,13 @@ from dyngs.human.fit.solve import (
     run_stage,
     silhouette_error,
     spread_order,
+    usual,
     with_lens,
 )
 from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 SIZE = 32
 

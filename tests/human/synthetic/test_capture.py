@@ -36,8 +36,8 @@ from dyngs.human.synthetic.capture import (
 from dyngs.human.synthetic.clips import squat, walk
 from dyngs.human.synthetic.clothes import dress_body, paint_texture, random_outfit
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 TINY = HumanOptions(size=24, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1)
 LIGHT = np.array([0.35, 0.75, 0.56]) / np.linalg.norm([0.35, 0.75, 0.56])

@@ -12,8 +12,8 @@ import torch
 from dyngs.errors import DyngsError
 from dyngs.human.synthetic.clothes import Outfit, dress_body, paint_texture, random_outfit
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import vertex_normals
 
 

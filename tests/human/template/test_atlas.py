@@ -19,7 +19,7 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.human.template.atlas import Texels, atlas_texels, scaffold_points
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 
 NUM_JOINTS = 2
 
