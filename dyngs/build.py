@@ -251,7 +251,7 @@ def _restored(model: SceneModel, gaussians: Gaussians, own: dict[str, torch.Tens
         case DynamicModel():
             return DynamicScene.restored(model, gaussians, own)
         case HumanModel():
-            return HumanScene.restored(model, gaussians, own)
+            return HumanScene.restored(gaussians, own)
         case HumanPredictorModel():
             raise ValueError("the run of a network has no scene")
         case _:

@@ -31,7 +31,7 @@ from dyngs.static.scene import StaticScene
 KINDS = ("static", *FIELDS, "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])
 SEEN_AT = (0.0, 0.5, 1.0)
-PERSON = HumanModel(sh_degree=0, pose_offsets=True)
+PERSON = HumanModel(sh_degree=0)
 
 
 def scene_of_kind(kind: str) -> Scene:
@@ -58,7 +58,7 @@ def restored(kind: str, state: State) -> Scene:
     if kind == "static":
         return StaticScene.restored(gaussians, own)
     if kind == "human":
-        return HumanScene.restored(PERSON, gaussians, own)
+        return HumanScene.restored(gaussians, own)
     return DynamicScene.restored(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
 
 

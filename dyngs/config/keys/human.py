@@ -49,10 +49,6 @@ class HumanModel(_OnTemplate):
         default=0.25,
         description="fraction of the run after which poses of single frames are, too: what frames share comes first",
     )
-    pose_offsets: bool = Field(
-        default=False,
-        description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",
-    )
     light: bool = Field(
         default=True,
         description="learn light that is fixed in the world: colours depend on where the surface faces (with "

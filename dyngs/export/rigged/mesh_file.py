@@ -16,7 +16,7 @@ from dyngs.export.rigged.body import BodyMesh, anchor_normals, body_mesh, rest_v
 from dyngs.export.rigged.skeleton import Animation, Rig, add_animation, add_skeleton, add_weights, animation_of, rig_of
 from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
-from dyngs.files.glb import INDICES, VERTICES, GlbDocument
+from dyngs.files.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.files.write import atomic_file
 from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene, avatar_of
@@ -101,7 +101,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
             f"the surface is moved to the Gaussians: silhouettes agree at {surface.agreement:.3f} (intersection over "
             f"union), those of the template at {surface.plain:.3f}"
         )
-    if scene.shapes is not None or scene.pose_dirs is not None:
+    if scene.shapes is not None:
         notes.append("offsets that depend on the pose are left out: glTF's skins have none")
     if scene.light is not None:
         notes.append(LEFT_OUT)

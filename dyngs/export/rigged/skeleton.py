@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.files.glb import VERTICES, GlbDocument
+from dyngs.files.gltf import VERTICES, GlbDocument
 from dyngs.human.avatar.anchors import heaviest_joints
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
@@ -29,7 +28,6 @@ LR = {
     "joints": 2e-3,  # at rest, m
     "log_scale": 2e-4,
     "weights": 5e-3,  # logarithms
-    "pose_dirs": 1e-4,  # m per unit of a rotation matrix
     "light": 5e-3,  # fraction of the colour
     "normals": 1e-3,
 }
@@ -62,7 +60,7 @@ class SharedCorrection:
 
 
 def new_corrections(
-    options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
+    clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
 ) -> Parameters:
     """Return the corrections to learn, all zero, of a clip of F frames, a skeleton and skinning weights.
 
@@ -70,8 +68,7 @@ def new_corrections(
 
     Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
     ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
-    optionally ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``, ``light`` (8, 3) and
-    ``normals`` (N, 3), see ``dyngs.human.avatar.posing``.
+    optionally ``light`` (8, 3) and ``normals`` (N, 3), see ``dyngs.human.avatar.posing.Light``.
     """
     unit = float(clip.scale.mean())
     zeros = {
@@ -82,21 +79,17 @@ def new_corrections(
         "log_scale": skeleton.joints.new_zeros(1),
         "weights": torch.zeros_like(anchors.weights),
     }
-    if options.pose_offsets:
-        zeros["pose_dirs"] = anchors.weights.new_zeros(len(anchors), 27)
     if normals is not None:
         zeros |= {"light": normals.new_zeros(TERMS, 3), "normals": normals}
-    own = ("weights", "pose_dirs", "normals")
+    own = ("weights", "normals")
     roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
     return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
 
 
-def correction_penalties(learned: Parameters, options: HumanModel) -> dict[str, Tensor]:
+def correction_penalties(learned: Parameters) -> dict[str, Tensor]:
     """Return weighted mean squares that keep poses, joints and skinning weights near what was given."""
     turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
     terms = {"pose": POSE_WEIGHT * (turns + (100 * learned["joints"]).square().mean())}
-    if "pose_dirs" in learned and options.offset_weight > 0:
-        terms["pose offsets"] = options.offset_weight * (100 * learned["pose_dirs"]).square().sum(1).mean()
     if "light" in learned:
         terms["light"] = LIGHT_WEIGHT * learned["light"].square().sum()
     terms["skinning weights"] = WEIGHTS_WEIGHT * learned["weights"].square().mean()

@@ -136,7 +136,7 @@ def first_look(
     weights = skinning_weights(anchors, len(skeleton.joints))
 
     def offsets(posing: BodyPose) -> Tensor | None:
-        return rest_offsets(anchors, weights, posing, subject.shapes, None)
+        return rest_offsets(anchors, posing, subject.shapes)
 
     found = observe_points(SurfacePoints(anchors.points, normals, weights, offsets), skeleton, shown)
     sh = gaussians.sh.clone()

@@ -173,24 +173,9 @@ def pose_gaussians(
     )
 
 
-def rest_offsets(
-    anchors: Anchors, weights: Tensor, posing: BodyPose, shapes: PoseBlendShapes | None, pose_dirs: Tensor | None
-) -> Tensor | None:
-    """Return the pose-dependent offsets (N, 3) at rest, m: of the template plus learned; None without either."""
-    given = None if shapes is None else shapes.offsets(anchors, posing.rotations)
-    if pose_dirs is None:
-        return given
-    learned = learned_offsets(weights, posing, pose_dirs)
-    return learned if given is None else given + learned
-
-
-def learned_offsets(weights: Tensor, posing: BodyPose, pose_dirs: Tensor) -> Tensor:
-    """Return learned offsets (N, 3), m: P vec(sum_j w_j (R_j - I)), P = ``pose_dirs`` (N, 27) as 3 x 9; no root.
-
-    Like SMPL's pose blend shapes (Loper et al. 2015), but learned, and only for joints that a Gaussian follows.
-    """
-    features = weights[:, 1:] @ _pose_features(posing.rotations)[1:].flatten(1)
-    return (pose_dirs.unflatten(1, (3, 9)) * features[:, None]).sum(-1)
+def rest_offsets(anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None) -> Tensor | None:
+    """Return the pose-dependent offsets (N, 3) at rest, m; None where the template has none."""
+    return None if shapes is None else shapes.offsets(anchors, posing.rotations)
 
 
 def _pose_features(rotations: Tensor) -> Tensor:

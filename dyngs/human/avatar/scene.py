@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.parameters import Parameters
@@ -61,7 +60,7 @@ class HumanScene(Scene):
     played: MotionClip | None = None
 
     @staticmethod
-    def restored(options: HumanModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+    def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         """Return the scene of what ``state`` returned; it plays the clip of training.
 
         Raises:
@@ -77,7 +76,7 @@ class HumanScene(Scene):
         clip = MotionClip(*(tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
         own = part_of(tensors, "learned")
-        learned = new_corrections(options, clip, skeleton, anchors, own.get("normals")).restored(own)
+        learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
             anchors=anchors,
@@ -124,11 +123,6 @@ class HumanScene(Scene):
             return corrected_skeleton(self.learned, self.skeleton)
 
     @property
-    def pose_dirs(self) -> Tensor | None:
-        """(N, 27) learned offsets that depend on the pose, or None."""
-        return self.learned["pose_dirs"].detach() if "pose_dirs" in self.learned else None
-
-    @property
     def light(self) -> Light | None:
         """The learned light, or None."""
         found = learned_light(self.learned)
@@ -168,7 +162,7 @@ class HumanScene(Scene):
 
     def in_pose(self, posing: BodyPose, time: float) -> Moment:
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
-        offsets = rest_offsets(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
+        offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
         return Moment(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
 
@@ -179,14 +173,14 @@ class HumanScene(Scene):
             row: of the clip.
             given_weights: (N, J) of ``skinning_weights``; then nothing that was learned about the body is applied.
         """
-        skeleton, pose_dirs, light = self.skeleton, None, None
+        skeleton, light = self.skeleton, None
         if given_weights is None:
             posing, skeleton = corrected_pose(self.learned, self.clip, row), corrected_skeleton(self.learned, skeleton)
             weights = corrected_weights(self.learned, self.anchors, len(skeleton.joints))
-            pose_dirs, light = self.learned.get("pose_dirs"), learned_light(self.learned)
+            light = learned_light(self.learned)
         else:
             posing, weights = frame_pose(self.clip, row), given_weights
-        offsets = rest_offsets(self.anchors, weights, posing, self.shapes, pose_dirs)
+        offsets = rest_offsets(self.anchors, posing, self.shapes)
         return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light), posing
 
     def given_weights(self) -> Tensor:
@@ -275,8 +269,6 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     if bool((state["anchors.weights"] < 0).any()) or not bool((state["anchors.weights"].sum(1) > 0).all()):
         raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
     require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
-    if "learned.pose_dirs" in state:
-        require_tensor("learned.pose_dirs", state["learned.pose_dirs"], (n, 27))
     if "learned.light" in state:
         require_tensor("learned.light", state["learned.light"], (TERMS, 3))
         require_tensor("learned.normals", state["learned.normals"], (n, 3))

@@ -62,7 +62,7 @@ class HumanTraining:
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
         clip = subject.footage.clip
-        learned = new_corrections(self.options, clip, subject.skeleton, subject.anchors, normals)
+        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
             gaussians=gaussians,
             anchors=subject.anchors,
@@ -96,7 +96,7 @@ class HumanTraining:
         row = min(row, len(scene.clip) - 1)  # who never moves has one row
         gaussians, posing = self._in_frame(scene, row, step)
         if self._refines(step):
-            penalties |= correction_penalties(scene.learned, self.options)
+            penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
                 penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
@@ -155,7 +155,7 @@ class HumanTraining:
         self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> HumanScene:
-        scene = HumanScene.restored(self.options, gaussians, tensors)
+        scene = HumanScene.restored(gaussians, tensors)
         self._near, self._given_weights, self._images = tensors.get("near"), None, None
         return replace(scene, colour=like.colour, options=like.options, background=like.background)
 

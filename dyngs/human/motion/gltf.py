@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import reading
+from dyngs.files.gltf import MOST_JOINTS, Animation, GltfFile
 from dyngs.files.limits import require_at_most
-from dyngs.human.motion.gltf_file import MOST_JOINTS, Animation, GltfFile
 from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, sample_times
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
@@ -212,7 +212,7 @@ def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) 
         if file.document.nodes[node].matrix is not None:
             raise file.error(f"node {node} is animated but has a matrix; export it again")
         sampler = animation.samplers[channel.sampler]
-        times, values = file.numbers(sampler.input, "SCALAR")[:, 0], file.numbers(sampler.output, _KINDS[kind])
+        times, values = _finite(file, sampler.input, "SCALAR")[:, 0], _finite(file, sampler.output, _KINDS[kind])
         if len(values) != len(times) * (3 if sampler.interpolation == "CUBICSPLINE" else 1):
             raise file.error(f"a {kind} of node {node} has {len(times)} times but {len(values)} values")
         if (np.diff(times) < 0).any():
@@ -221,6 +221,14 @@ def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) 
     if not curves:
         raise file.error(f"the animation {animation.name[:30]!r} moves no joint; choose another")
     return curves
+
+
+def _finite(file: GltfFile, index: int, kind: str) -> np.ndarray:
+    """Return the finite numbers (K, D) of an accessor."""
+    values = file.numbers(index, kind)
+    if not (np.abs(values) < 1e9).all():
+        raise file.error(f"accessor {index} holds NaN or huge numbers; export it again")
+    return values
 
 
 def _world_transforms(
@@ -295,7 +303,7 @@ def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
 
 def _bind_pose(file: GltfFile, index: int, joints: int) -> tuple[np.ndarray, np.ndarray]:
     """Return joints (S, 3) and rotations rest_from_joint (S, 3, 3) of the bind pose."""
-    matrices = file.numbers(index, "MAT4").reshape(-1, 4, 4).swapaxes(1, 2)[:joints]
+    matrices = _finite(file, index, "MAT4").reshape(-1, 4, 4).swapaxes(1, 2)[:joints]
     if len(matrices) < joints:
         raise file.error(f"has {len(matrices)} inverse bind matrices for {joints} joints; export it again")
     joint_from_rest = _rotation_of(file, matrices[:, :3, :3])

@@ -25,7 +25,6 @@ from dyngs.human.avatar.posing import (
     Skeleton,
     difference_of_sides,
     harmonics,
-    learned_offsets,
     pose_blend_shapes,
     pose_gaussians,
     rest_normals,
@@ -224,21 +223,6 @@ def test_colours_turn_with_what_they_are_on() -> None:
     assert float((evaluate_harmonics(turned, eye, sh, radii, 1) - before).abs().max()) > 0.05
 
 
-def test_offsets_follow_the_bends_of_the_joints_that_count() -> None:
-    """At rest, and of the root alone, there are none; of one joint they are its weight times P vec(R - 1)."""
-    weights = torch.tensor([[0.25, 0.75, 0.0], [1.0, 0.0, 0.0]])
-    generator = torch.Generator().manual_seed(6)
-    directions = torch.randn(2, 27, generator=generator)
-    turns = torch.zeros(3, 3)
-    turns[0, 1], turns[1, 0], turns[2, 2] = 1.0, 0.7, -0.4
-    place = (torch.zeros(3), torch.tensor(1.0))
-    assert not learned_offsets(weights, BodyPose(axis_angle_to_matrix(torch.zeros(3, 3)), *place), directions).any()
-    found = learned_offsets(weights, BodyPose(axis_angle_to_matrix(turns), *place), directions)
-    bend = (axis_angle_to_matrix(turns[1]) - torch.eye(3)).flatten()
-    torch.testing.assert_close(found[0], 0.75 * directions[0].reshape(3, 9) @ bend)
-    assert not found[1].any()
-
-
 @cache
 def rigid_body() -> BodyTemplate:
     """A body of random triangles with SMPL's joints and pose blend shapes; each triangle follows one joint alone."""
@@ -269,7 +253,7 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
     weights, shapes = skinning_weights(anchors, 24), pose_blend_shapes(body)
     assert shapes is not None
-    offsets = rest_offsets(anchors, weights, posing, shapes, None)
+    offsets = rest_offsets(anchors, posing, shapes)
     found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets).means
     given = (poses[None], posing.trans[None], None, None, posing.scale[None])
     mesh, stiff = (posed_vertices(b, *given)[0] for b in (body, replace(body, pose_dirs=None)))
@@ -282,26 +266,21 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-6)
 
 
-def test_offsets_of_the_template_and_learned_ones_add_up_and_reach_the_pose() -> None:
+def test_offsets_of_the_template_reach_the_pose() -> None:
     body = rigid_body()
     _, anchors = texel_gaussians(atlas_texels(body, 16), (0.0, 0.02), 0)
-    weights, shapes = skinning_weights(anchors, 24), pose_blend_shapes(body)
-    assert shapes is not None
-    generator = torch.Generator().manual_seed(0)
-    dirs = 0.1 * torch.randn(len(anchors), 27, generator=generator)
+    shapes, generator = pose_blend_shapes(body), torch.Generator().manual_seed(0)
     poses = (0.5 * torch.randn(24, 3, generator=generator)).requires_grad_()
     posing = BodyPose(axis_angle_to_matrix(poses), torch.zeros(3), torch.tensor(1.0))
-    both = rest_offsets(anchors, weights, posing, shapes, dirs)
-    given, learned = shapes.offsets(anchors, posing.rotations), learned_offsets(weights, posing, dirs)
-    assert both is not None
-    torch.testing.assert_close(both, given + learned)
+    given = rest_offsets(anchors, posing, shapes)
+    assert given is not None
     half = len(anchors) // 2
     assert torch.equal(given[:half], given[half:]), "both scaffolds follow the skin beneath"
     given.sum().backward()
     assert poses.grad is not None
     assert not poses.grad[0].any(), "the root does not count"
     assert bool(poses.grad[1:].ne(0).any(1).all())
-    assert rest_offsets(anchors, weights, posing, None, None) is None
+    assert rest_offsets(anchors, posing, None) is None
     assert pose_blend_shapes(replace(body, pose_dirs=None)) is None
 
 

@@ -52,7 +52,7 @@ def stirred() -> HumanScene:
 
 def reloaded(scene: HumanScene) -> HumanScene:
     """The scene of what is stored of it."""
-    return HumanScene.restored(OPTIONS, scene.gaussians, part_of(tensors_of(scene.state()), "model"))
+    return HumanScene.restored(scene.gaussians, part_of(tensors_of(scene.state()), "model"))
 
 
 def seen(gaussians: Gaussians) -> Tensor:
@@ -122,7 +122,7 @@ def test_one_pose_is_posed_once_and_the_same_at_all_times() -> None:
 
 def test_penalties_pull_corrections_back() -> None:
     learned = stirred().learned
-    terms = correction_penalties(learned, OPTIONS)
+    terms = correction_penalties(learned)
     assert set(terms) == {"pose", "skinning weights"}
     torch.stack(list(terms.values())).sum().backward()
     for name in ("poses", "turns", "joints", "weights"):

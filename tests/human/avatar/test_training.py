@@ -73,9 +73,8 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-@pytest.mark.parametrize("pose_offsets", [False, True])
-def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path, pose_offsets: bool) -> None:
-    config = tiny(capture, pose_offsets=pose_offsets)
+def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path) -> None:
+    config = tiny(capture)
     straight = tensors_after(assemble(config), 10)
     assert same(straight, tensors_after(assemble(config), 10))
     first = assemble(config)
@@ -104,13 +103,10 @@ def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: P
         assert len(report.psnr_per_time) == (3 if split == "test" else 2)
 
 
-@pytest.mark.parametrize("pose_offsets", [False, True])
 @pytest.mark.parametrize("own_body", [False, True])
-def test_what_is_played_back_is_what_was_trained(
-    capture: Path, tmp_path: Path, pose_offsets: bool, own_body: bool
-) -> None:
+def test_what_is_played_back_is_what_was_trained(capture: Path, tmp_path: Path, own_body: bool) -> None:
     body = write_npz(tmp_path / "model.npz", model("smplx")) if own_body else None
-    trainer = assemble(tiny(capture, pose_offsets=pose_offsets, body=body))
+    trainer = assemble(tiny(capture, body=body))
     assert (human(trainer).shapes is not None) == own_body
     tensors_after(trainer, 8)
     image = trainer.images[4]

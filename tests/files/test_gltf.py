@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from dyngs.files.glb import INDICES, VERTICES, GlbDocument
+from dyngs.files.gltf import INDICES, VERTICES, GlbDocument
 
 
 def test_another_reader_finds_the_mesh(tmp_path: Path) -> None:
