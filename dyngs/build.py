@@ -53,7 +53,7 @@ from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, Networ
 from dyngs.gaussians.rendering import RenderOptions, Shader
 from dyngs.gaussians.scene import Scene, SceneTraining, render_options
 from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
-from dyngs.human.avatar.observations import Subject, first_look
+from dyngs.human.avatar.observations import Subject, in_colours_of
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
@@ -373,10 +373,10 @@ def human_start(config: Config, model: HumanModel, capture: Capture, images: Ima
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
     cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
     parts = surface_texels(body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0]))
-    gaussians, anchors, normals = surface_gaussians(parts, sorted(set(model.scaffold_heights)), sh_degree)
+    gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
     shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
-    return first_look(gaussians, normals, subject, shown, model.min_silhouette_fraction)
+    return in_colours_of(gaussians, normals, subject, shown), subject
 
 
 def _training_views(

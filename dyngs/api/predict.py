@@ -123,17 +123,7 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
     person = person_of(preset)
     if person is None:
         raise ValueError(f"the preset of one person is of model.kind={preset.model.kind}")
-    same = (
-        "body",
-        "uv",
-        "resolution",
-        "scaffold_heights",
-        "min_silhouette_fraction",
-        "near",
-        "eps2d",
-        "rasterize_mode",
-        "sh_degree",
-    )
+    same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
     given = human_options(model)
     human = person.model_copy(update={name: getattr(given, name) for name in same})
     config = preset.model_copy(

@@ -55,6 +55,7 @@ CONSTANTS: dict[str, dict[str, float]] = {
     "model.lr_log_scale": {"human": 2e-4},
     "model.lr_weights": {"human": 5e-3},
     "model.lr_decay": {"human": 0.1},
+    "model.lr_pose_offsets": {"human": 1e-4},
     "model.pose_weight": {"human": 1e-4},
     "model.weights_weight": {"human": 1e-3},
     "model.warm_up": {"human_predictor": 0.05},

@@ -268,8 +268,8 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
 
 
 def human_options(model: HumanPredictorModel) -> HumanModel:
-    """Return the section of one person with the same template, texels and scaffolds; nothing of it is learned."""
-    shared = ("body", "uv", "resolution", "scaffold_heights", "min_silhouette_fraction")
+    """Return the section of one person with the same template and texels; nothing of it is learned."""
+    shared = ("body", "uv", "resolution")
     drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
     return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn})
@@ -295,7 +295,7 @@ def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> 
         DyngsError: no capture there, or not one of a person.
     """
     capture = read_capture(data)
-    return Filmed(captured_person(capture, human_options(model), body), ImageLoader(capture.splits["train"], data), [])
+    return Filmed(captured_person(capture, model, body), ImageLoader(capture.splits["train"], data), [])
 
 
 def mean_colours(people: list[Filmed], resolution: int) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from moving_scene import camera
 from tiny_fields import KINDS, cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel, HumanModel
+from dyngs.config import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -104,9 +104,7 @@ def test_corrections_of_skinning_weights_are_applied() -> None:
     corrections = torch.tensor([[0.0, 3.0]]).log1p().repeat(2, 1)
     full = completed(drawable(person(weights, corrections)))
     torch.testing.assert_close(full["model.anchors.weights"], torch.tensor([[3 / 7, 4 / 7], [1.0, 0.0]]))
-    again = HumanScene.restored(
-        Gaussians(**part_of(full, "gaussians")), part_of(full, "model")
-    )
+    again = HumanScene.restored(Gaussians(**part_of(full, "gaussians")), part_of(full, "model"))
     assert not again.learned["weights"].any()
 
 

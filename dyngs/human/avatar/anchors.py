@@ -137,10 +137,7 @@ _LIMBS = ("wrist", "ankle", "foot", "index", "middle", "pinky", "ring", "thumb")
 def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> float:
     """Return the side of a pixel on the person, m of the template: the median over the cameras; infinite without any.
 
-    Args:
-        cameras: of the training views, as large as the images.
-        clip: where the person is; the mean place counts.
-        pelvis: (3,) at rest, m.
+    The mean position in ``clip`` counts; ``pelvis`` (3,) is at rest, m.
     """
     scale = float(clip.scale.mean())
     place = clip.trans.mean(0) + scale * pelvis
@@ -151,11 +148,7 @@ def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> 
 def surface_texels(body: BodyTemplate, resolution: int, vertices: Tensor, pixel: float) -> list[Texels]:
     """Return the texels of the atlas, and apart from them smaller ones of hands and feet where images show more.
 
-    Args:
-        body: a template with texture coordinates.
-        resolution: texels along a side of the atlas.
-        vertices: (M, 3) rest shape, m.
-        pixel: side of a pixel on the person, m.
+    ``vertices`` (M, 3) are the rest shape, m; ``pixel`` is the side of a pixel on the person, m.
     """
     texels = atlas_texels(body, resolution, vertices)
     named = [any(part in name for part in _LIMBS) for name in JOINT_NAMES[: len(body.parents)]]
@@ -167,12 +160,10 @@ def surface_texels(body: BodyTemplate, resolution: int, vertices: Tensor, pixel:
     return [texels.select(~on_limbs), fine.select(limbs[fine.weights.argmax(1)])]
 
 
-def surface_gaussians(
-    parts: Sequence[Texels], heights: Sequence[float], sh_degree: int
-) -> tuple[Gaussians, Anchors, Tensor]:
-    """Return the ``texel_gaussians`` of all parts, part by part, their anchors, and their normals (N, 3)."""
-    made = [texel_gaussians(texels, heights, sh_degree) for texels in parts]
-    normals = torch.cat([texels.normals.repeat(len(heights), 1) for texels in parts])
+def surface_gaussians(parts: Sequence[Texels], sh_degree: int) -> tuple[Gaussians, Anchors, Tensor]:
+    """Return the ``texel_gaussians`` on the skin of all parts, part by part, their anchors, and normals (N, 3)."""
+    made = [texel_gaussians(texels, (0.0,), sh_degree) for texels in parts]
+    normals = torch.cat([texels.normals for texels in parts])
     gaussians = {name: torch.cat([g.tensors()[name] for g, _ in made]) for name in made[0][0].tensors()}
     anchors = {name: torch.cat([a.tensors()[name] for _, a in made]) for name in made[0][1].tensors()}
     return Gaussians(**gaussians), Anchors(**anchors), normals

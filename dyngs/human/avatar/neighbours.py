@@ -86,13 +86,8 @@ def sightings(
 
     A view counts as 1 where the texel is in full view, and hardly at all where little of it shines through others: a
     hundred views that see a hundredth of it tell less than one that sees all. Independent of the size of the images.
-    Gaussians too faint to be drawn have infinity: the images made them so.
-
-    Args:
-        drawn: the N Gaussians in the pose of each view, and its camera.
-        sizes: (N,) sides of the texels, m.
-        scale: world units per metre.
-        options: how views are drawn.
+    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the N Gaussians in the pose of
+    each view, and its camera; ``sizes`` (N,) sides of the texels, m; ``scale`` world units per metre.
     """
     total = torch.zeros_like(sizes)
     for gaussians, camera in drawn:
@@ -114,14 +109,9 @@ def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: floa
     """Return new ``sh``, ``means`` and ``logit_opacities`` of N Gaussians at rest; the same where trust is 1.
 
     Offsets from the scaffold, opacities and colours are mixed with those of the mirror image. Base colours are also
-    made like those of the neighbours that follow the same joints: harmonic where there is no trust.
-
-    Args:
-        gaussians: at rest, m.
-        anchors: of these.
-        weights: (N, J) skinning weights of the template.
-        middle: x of the plane of symmetry at rest, m.
-        trust: (N,) in [0, 1] in what was learned.
+    made like those of the neighbours that follow the same joints: harmonic where there is no trust. ``weights`` (N, J)
+    are those of the template; ``middle`` is x of the plane of symmetry at rest, m; ``trust`` (N,) in what was learned
+    is in [0, 1].
     """
     other, is_image = mirror_images(anchors, middle)
     borrowed = (1 - trust) * trust[other] * is_image * MIRRORED

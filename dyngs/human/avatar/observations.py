@@ -1,4 +1,4 @@
-"""Observations of surface points of a posed body in images: inside the silhouette or not, and colour.
+"""The captured person, and the first Gaussians on its template, in the colours of images.
 
 Local letters: N points, J joints.
 """
@@ -6,7 +6,7 @@ Local letters: N points, J joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -46,28 +46,14 @@ class SurfacePoints:
         return self.points if offsets is None else self.points + offsets
 
 
-@dataclass(frozen=True)
-class PointObservations:
-    """Observations of N points.
-
-    Attributes:
-        inside: (N,) fraction of the images in whose silhouette a point lies, of those that have it in the frame; 1
-            where none has. Without alpha the whole frame is silhouette.
-        rgb: (N, 3) mean colour, weighted towards frontal views; grey for points that no image faces.
-    """
-
-    inside: Tensor
-    rgb: Tensor
-
-
 @torch.no_grad()
-def observe_points(
-    surface: SurfacePoints, skeleton: Skeleton, images: Iterable[tuple[Image, BodyPose]]
-) -> PointObservations:
-    """Return the observations of the points in the images, each with its body pose; occlusion is ignored."""
+def observed_colours(surface: SurfacePoints, skeleton: Skeleton, images: Iterable[tuple[Image, BodyPose]]) -> Tensor:
+    """Return the mean colours (N, 3) of the points in images with their body poses, weighted towards frontal views.
+
+    Grey for points that no image faces; occlusion is ignored. Without alpha the full frame is silhouette.
+    """
     count, device = len(surface.points), surface.points.device
-    inside, in_frames, weight = (torch.zeros(count, device=device) for _ in range(3))
-    colour = torch.zeros(count, 3, device=device)
+    colour, weight = torch.zeros(count, 3, device=device), torch.zeros(count, device=device)
     for image, pose in images:
         transforms = blend_transforms(
             surface.weights, joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
@@ -76,15 +62,12 @@ def observe_points(
         normals = (transforms[..., :3] * surface.normals[:, None]).sum(-1)
         column, row, in_frame = _nearest_pixels(world, image.cameras)
         covered = in_frame.float() if image.alpha is None else image.alpha[row, column] * in_frame
-        inside += (covered > 0.5).float()
-        in_frames += in_frame
         towards = torch.nn.functional.normalize(image.cameras.centers[0] - world, dim=1)
         facing = (towards * torch.nn.functional.normalize(normals, dim=1)).sum(1).clamp_min(0) ** FACING_EXPONENT
         colour += facing[:, None] * in_frame[:, None] * image.rgb_premultiplied[row, column]
         weight += facing * covered
     seen = weight > 1e-3
-    rgb = torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5)
-    return PointObservations(torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0), rgb.clamp(0, 1))
+    return torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5).clamp(0, 1)
 
 
 def project_points(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
@@ -117,18 +100,10 @@ class Subject:
     shapes: PoseBlendShapes | None = None
 
 
-def first_look(
-    gaussians: Gaussians, normals: Tensor, subject: Subject, images: Iterable[Image], carve: float
-) -> tuple[Gaussians, Subject]:
-    """Return the first Gaussians that lie inside the silhouettes, in the colours of the images.
+def in_colours_of(gaussians: Gaussians, normals: Tensor, subject: Subject, images: Iterable[Image]) -> Gaussians:
+    """Return the first Gaussians, on the texels of ``subject``, in the colours of some images.
 
-    Gaussians above the lowest scaffold are kept if they lie inside the silhouette of a share ``carve`` of the images.
-
-    Args:
-        gaussians: N, on the scaffolds.
-        normals: (N, 3) of the surface below them at rest.
-        subject: whose anchors are those of ``gaussians``.
-        images: some of those to train on.
+    ``normals`` (N, 3) are those of the surface at rest.
     """
     clip, anchors, skeleton = subject.footage.clip, subject.anchors, subject.skeleton
     rows = subject.footage.rows
@@ -138,9 +113,7 @@ def first_look(
     def offsets(posing: BodyPose) -> Tensor | None:
         return rest_offsets(anchors, posing, subject.shapes)
 
-    found = observe_points(SurfacePoints(anchors.points, normals, weights, offsets), skeleton, shown)
     sh = gaussians.sh.clone()
-    sh[:, 0] = (found.rgb - 0.5) / SH_C0
-    kept = (found.inside >= carve) | (anchors.height == anchors.height.amin())
-    gaussians = gaussians.replace(sh=sh).select(kept)
-    return gaussians, replace(subject, anchors=anchors.select(kept))
+    rgb = observed_colours(SurfacePoints(anchors.points, normals, weights, offsets), skeleton, shown)
+    sh[:, 0] = (rgb - 0.5) / SH_C0
+    return gaussians.replace(sh=sh)

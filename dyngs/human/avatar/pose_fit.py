@@ -132,16 +132,9 @@ def fitted_to_images(
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
-    All images of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with
-    that corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are.
-    No random numbers are drawn.
-
-    Args:
-        scene: playing the clip that is to be corrected.
-        images: of a split.
-        background: (3,) behind both.
-        options: as in training.
-        comparison: what of the images counts.
+    All images of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with that
+    corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are. No
+    random numbers are drawn. ``scene`` plays the clip to correct; ``background`` (3,) is behind both.
     """
     groups: dict[float, list[int]] = {}
     for index, time in enumerate(images.times):
@@ -199,8 +192,7 @@ class _Fit:
     def fitted(self, guess: Correction | None) -> tuple[Correction, int]:
         """Return the correction of the pose, and the number of updates it took.
 
-        Args:
-            guess: another correction to begin with than none.
+        ``guess`` is another correction to begin with than none.
         """
         joints = self.scene.skeleton.joints
         none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))

@@ -63,11 +63,7 @@ def difference_of_sides(gaussians: Gaussians, images: Tensor, is_image: Tensor) 
     """Return the mean squared difference () between base colours and those of the mirror images.
 
     Clothes are mostly the same on both sides and light is not: this tells one from the other where nobody turns.
-
-    Args:
-        gaussians: N.
-        images: (N,) rows of the mirror images, and ``is_image`` (N,) if there is one.
-        is_image: see ``images``.
+    ``images`` (N,) are rows of the mirror images, ``is_image`` (N,) says where there is one.
     """
     colours = gaussians.sh[:, 0] * SH_C0
     return ((colours - colours.index_select(0, images)).square().sum(1) * is_image).mean()
@@ -104,9 +100,7 @@ class PoseBlendShapes:
     def offsets(self, anchors: Anchors, rotations: Tensor) -> Tensor:
         """Return offsets (N, 3) at rest, m: interpolated between the vertices of each anchor's triangle.
 
-        Args:
-            anchors: of N Gaussians on this template.
-            rotations: (J, 3, 3) relative to the parent joints.
+        ``rotations`` (J, 3, 3) are relative to the parent joints.
         """
         at_vertices = (_pose_features(rotations)[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
         around = self.faces.index_select(0, anchors.face)
@@ -148,15 +142,8 @@ def pose_gaussians(
     """Return the N Gaussians in a pose, in the world; differentiable in all arguments.
 
     x' = s T x + t with T = sum_j w_j A_j (Loper et al. 2015); covariances under the same linear map, exactly. Harmonics
-    of degree 1 are rotated by the nearest rotation of T, so that colours turn with the body.
-
-    Args:
-        gaussians: at rest, m; SH degree 0 or 1.
-        weights: (N, J) skinning weights.
-        skeleton: of J joints.
-        posing: the pose.
-        offsets: (N, 3) m, added to the means at rest; None: no offsets.
-        light: that falls on them; None: even light.
+    of degree 1 are rotated by the nearest rotation of T, so that colours turn with the body. Gaussians are at rest, m,
+    of SH degree 0 or 1; ``weights`` (N, J) skin them; ``offsets`` (N, 3), m, are added to the means at rest.
     """
     moves = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
     world = torch.cat([posing.scale * moves[..., :3], posing.scale * moves[..., 3:] + posing.trans[:, None]], dim=-1)

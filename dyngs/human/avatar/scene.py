@@ -169,9 +169,7 @@ class HumanScene(Scene):
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.
 
-        Args:
-            row: of the clip.
-            given_weights: (N, J) of ``skinning_weights``; then nothing that was learned about the body is applied.
+        With ``given_weights`` (N, J) nothing that was learned about the body is applied.
         """
         skeleton, light = self.skeleton, None
         if given_weights is None:

@@ -23,9 +23,9 @@ from dyngs.human.fit.keypoints import Keypoints
 from dyngs.human.fit.lens_fit import LensFit, fit_lens
 from dyngs.human.fit.lens_fit import num_ticks as num_lens_ticks
 from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
-from dyngs.human.fit.solve import BodyFit, Stage, body_fit, drawn_frame, near_given, new_fit, run_stage, usual
+from dyngs.human.fit.solve import FRAMES, BodyFit, Fitting, body_fit, drawn_frame, near_given, new_fit, usual
 from dyngs.human.fit.start import first_poses, num_ticks
-from dyngs.human.fit.surface import Surface, surface_of
+from dyngs.human.fit.surface import surface_of
 from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 
@@ -41,8 +41,6 @@ GAIN, GAIN_OF_SHAPE = 0.01, 0.03
 Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another shape explains thick
 clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
-FRAMES = 3
-"""Frames drawn in each step."""
 SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
 """What is the same in all frames."""
 
@@ -165,15 +163,6 @@ def fit_capture(
     With given poses: first the shape; then rotations that are the same in all frames, and then those of every frame,
     each where it explains views clearly better that were left out. Without: poses are found first (``first_poses``).
 
-    Args:
-        capture: with alpha.
-        options: how its images are read.
-        body: with a shape space.
-        report: of progress.
-        keypoints: of the training views, see ``dyngs.human.fit.keypoints``; None without.
-        effort: how much it may cost.
-        known: what else is known.
-
     Raises:
         DyngsError: no silhouettes, or nobody in them.
     """
@@ -191,16 +180,21 @@ def fit_capture(
     joints = known.joints
     seen = seen if joints is None else seen.with_places({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
     if given:
-        tried = _from_given(motion.clip, surface, seen, known.learned, report, effort)
+        fitting = Fitting(motion.clip, surface, near_given(motion.clip))
+        tried = _from_given(fitting, seen, known.learned, report, effort)
     else:
         tick = ticker("first poses", report, num_ticks(len(motion.clip), marked=bool(keypoints)))
         clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
         motion = CapturedMotion(clip, motion.frames)
-        tried = _from_silhouettes(clip, surface, seen, known.learned, report, effort)
+        fitting = Fitting(clip, surface, usual(clip))
+        tried = _from_silhouettes(fitting, seen, known.learned, report, effort)
     lens = None
     if known.guessed_lens:
-        candidate, lens = _with_lens(tried[-1], motion.clip, surface, seen, known.learned, report, effort)
-        tried = (*tried, candidate) if lens.taken else tried
+        fitting, steps = replace(fitting, expected=usual(motion.clip)), effort.steps_for(motion.clip)
+        tick = ticker("focal length", report, num_lens_ticks(steps))
+        refined, lens = fit_lens(fitting, tried[-1].learned, known.learned, seen.used.__getitem__, steps, tick)
+        if lens.taken:
+            tried = (*tried, measured("the focal length refined", refined, fitting, seen))
     first_gain = 0.0 if not given else GAIN if known.shape else GAIN_OF_SHAPE
     chosen = tried[-1] if lens is not None and lens.taken else simplest_of_the_best(tried, first_gain)
     return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given, lens)
@@ -289,68 +283,36 @@ def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], po
 
 
 def _from_given(
-    clip: MotionClip,
-    surface: Surface,
-    seen: Seen,
-    shared: tuple[str, ...],
-    report: ReportProgress,
-    effort: FitEffort,
+    fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[Candidate, ...]:
     """Return the poses as given, with a fitted shape, and with fitted poses."""
-    start, expected = new_fit(clip, surface), near_given(clip)
-    tick = ticker("shape", report, 4 * effort.steps)
-    stage = Stage(effort.steps, FRAMES, ("padding",))  # clothes and hair are no sign of wrong poses
-    dressed = run_stage(start, stage, clip, surface, seen.halved, expected, tick)
-    tried = [measured("the poses as given", dressed, clip, surface, seen)]
+    start = new_fit(fitting.clip, fitting.surface)
+    tick, full = ticker("shape", report, 4 * effort.steps), seen.used.__getitem__
+    # Clothes and hair are no sign of wrong poses.
+    dressed = fitting.run(start, ("padding",), effort.steps, seen.halved, tick)
+    tried = [measured("the poses as given", dressed, fitting, seen)]
     shape = start
-    for look in (seen.halved, seen.used.__getitem__):
-        shape = run_stage(shape, Stage(effort.steps, FRAMES, shared), clip, surface, look, expected, tick)
-    tried.append(measured("one shape", shape, clip, surface, seen))
-    stage = Stage(effort.steps, FRAMES, (*shared, "turns"))
-    turns = run_stage(shape, stage, clip, surface, seen.used.__getitem__, expected, tick)
-    tried.append(measured("turns that are the same in all frames as well", turns, clip, surface, seen))
-    stage = Stage(effort.steps_for(clip), FRAMES, (*shared, "turns", "poses", "trans"))
-    tick = ticker("poses", report, stage.steps)
-    poses = run_stage(turns, stage, clip, surface, seen.used.__getitem__, expected, tick)
-    tried.append(measured("turns of every frame as well", poses, clip, surface, seen))
-    return tuple(tried)
+    for look in (seen.halved, full):
+        shape = fitting.run(shape, shared, effort.steps, look, tick)
+    tried.append(measured("one shape", shape, fitting, seen))
+    turns = fitting.run(shape, (*shared, "turns"), effort.steps, full, tick)
+    tried.append(measured("turns that are the same in all frames as well", turns, fitting, seen))
+    steps = effort.steps_for(fitting.clip)
+    tick = ticker("poses", report, steps)
+    poses = fitting.run(turns, (*shared, "turns", "poses", "trans"), steps, full, tick)
+    return (*tried, measured("turns of every frame as well", poses, fitting, seen))
 
 
 def _from_silhouettes(
-    clip: MotionClip,
-    surface: Surface,
-    seen: Seen,
-    shape: tuple[str, ...],
-    report: ReportProgress,
-    effort: FitEffort,
+    fitting: Fitting, seen: Seen, shape: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[Candidate, ...]:
     """Return the poses as they were found first, and shape and poses fitted together."""
-    start, expected = new_fit(clip, surface), usual(clip)
-    tried = [measured("poses found frame by frame", start, clip, surface, seen)]
-    stage = Stage(effort.steps_for(clip), FRAMES, (*shape, "poses", "trans"))
-    tick = ticker("shape", report, 2 * stage.steps)
-    found = start
+    start, steps = new_fit(fitting.clip, fitting.surface), effort.steps_for(fitting.clip)
+    tick, found = ticker("shape", report, 2 * steps), start
+    first = measured("poses found frame by frame", start, fitting, seen)
     for look in (seen.halved, seen.used.__getitem__):
-        found = run_stage(found, stage, clip, surface, look, expected, tick)
-    tried.append(measured("one shape, and poses of every frame", found, clip, surface, seen))
-    return tuple(tried)
-
-
-def _with_lens(
-    start: Candidate,
-    clip: MotionClip,
-    surface: Surface,
-    seen: Seen,
-    shape: tuple[str, ...],
-    report: ReportProgress,
-    effort: FitEffort,
-) -> tuple[Candidate, LensFit]:
-    """Return the fit with the focal length of one camera refined, where that pays, and what was found about it."""
-    steps, look = effort.steps_for(clip), seen.used.__getitem__
-    tick = ticker("focal length", report, num_lens_ticks(steps))
-    args = (start.learned, shape, clip, surface, look, usual(clip), steps, tick)
-    found, lens = fit_lens(*args)
-    return measured("the focal length refined", found, clip, surface, seen), lens
+        found = fitting.run(found, (*shape, "poses", "trans"), steps, look, tick)
+    return first, measured("one shape, and poses of every frame", found, fitting, seen)
 
 
 def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
@@ -366,12 +328,12 @@ def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
 
 
 @torch.no_grad()
-def measured(name: str, learned: Parameters, clip: MotionClip, surface: Surface, seen: Seen) -> Candidate:
+def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> Candidate:
     """Return the candidate with its IoU in the frames that judge."""
     found = []
     for row, frame in seen.judged.items():
         if frame is not None:
-            drawn = drawn_frame(learned, clip, surface, row, frame.cameras)
+            drawn = drawn_frame(learned, fitting.clip, fitting.surface, row, frame.cameras)
             found.append(_iou(drawn, frame))
         else:
             found.append(torch.zeros(0, device="cpu"))

@@ -13,8 +13,8 @@ from torch import Tensor
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, Split
-from dyngs.human.fit.capture_fit import FRAMES, RESOLUTION, CaptureFit, FitEffort, look_at, measured, ticker
-from dyngs.human.fit.solve import Stage, near_given, new_fit, run_stage
+from dyngs.human.fit.capture_fit import RESOLUTION, CaptureFit, FitEffort, look_at, measured, ticker
+from dyngs.human.fit.solve import Fitting, near_given, new_fit
 from dyngs.human.fit.surface import surface_of
 from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
@@ -59,13 +59,7 @@ def placed_clip(
 ) -> NewClip | None:
     """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without such a clip.
 
-    Args:
-        capture: all views with frame numbers.
-        options: how its images are read.
-        body: the template.
-        found: the fit of the views of training.
-        report: of progress.
-        effort: how much it may cost.
+    All views of ``capture`` have frame numbers; ``found`` is the fit of those of training.
     """
     views = capture.splits.get("pose", ())
     if not views or capture.body is None:
@@ -81,9 +75,9 @@ def placed_clip(
             if name not in ("poses", "trans"):
                 start[name].copy_(value)
     name, tick = "place of new poses", ticker("place of new poses", report, effort.steps)
-    stage = Stage(effort.steps, FRAMES, ("shift",))
-    moved = run_stage(start, stage, motion.clip, surface, seen.used.__getitem__, near_given(motion.clip), tick)
-    before, after = (measured(name, x, motion.clip, surface, seen) for x in (start, moved))
+    fitting = Fitting(motion.clip, surface, near_given(motion.clip))
+    moved = fitting.run(start, ("shift",), effort.steps, seen.used.__getitem__, tick)
+    before, after = (measured(name, x, fitting, seen) for x in (start, moved))
     better = after.iou > before.iou + _CLEARLY
     shift = (moved if better else start)["shift"].detach()
     return NewClip(motion, shift, before.iou, after.iou if better else None)
@@ -108,13 +102,7 @@ def fitted_clips(
     """Return the clip of training, with the frames of val and test, and that of ``pose``, if the capture has one.
 
     Frames that were not fitted have what holds for all frames applied to their given poses; without given poses they
-    lie between their neighbours.
-
-    Args:
-        capture: all views with frame numbers.
-        body: the template.
-        found: the fit of the views of training.
-        new_poses: the clip of ``pose``, None without.
+    lie between their neighbours. All views of ``capture`` have frame numbers; ``new_poses`` is the clip of ``pose``.
     """
     clips: dict[Split, FittedClip] = {"train": _of_training(capture, body, found)}
     if new_poses is not None:

@@ -89,12 +89,7 @@ def write_split(
 ) -> None:
     """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
 
-    Args:
-        out: folder.
-        split: name.
-        shown: the views with their images.
-        rows: frame number to row of the body parameters.
-        world_offset: (3,) added to all positions: where the capture was recentred from.
+    ``rows`` maps frame numbers to rows of the body parameters; ``world_offset`` (3,) is added to all positions.
     """
     frames: list[dict[str, object]] = []
     for view, image in shown:
@@ -128,10 +123,7 @@ def overlay(
 ) -> np.ndarray:
     """Return the image (H, W, 3) in [0, 1] over white with the outlines of bodies.
 
-    Args:
-        image: of one view.
-        surface: of the template.
-        bodies: shape parameters, pose and colour of each, drawn one over the other.
+    ``bodies`` are shape parameters, pose and colour of each, drawn one over the other.
     """
     sheet = image.composite(torch.ones_like(image.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
     for betas, pose, colour in bodies:
@@ -325,12 +317,7 @@ def with_fitted_body(
     """Return the options with a fit of the free template to the capture; the same capture is fitted once.
 
     Nothing is fitted where ``data.body`` names a fit, where the capture itself holds one, or without silhouettes.
-
-    Args:
-        data: its ``root`` is a capture of a person.
-        only_if_needed: fit nothing where the capture has body parameters.
-        say: is told in a line what is done, and what came out.
-        report: is told how far the fit has come.
+    ``only_if_needed``: nothing is fitted where the capture has body parameters.
 
     Raises:
         DyngsError: neither body parameters nor silhouettes.

@@ -65,11 +65,9 @@ def has_guessed_lens(capture: Capture) -> bool:
 def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = print) -> Capture:
     """Return a capture of a person with silhouettes.
 
-    Args:
-        options: ``root`` is a capture, or a video or a folder of images of one fixed camera.
-        given: masks are taken in place of those of the capture; without any the person is told from the background.
-        work: masks that are made are written to this folder.
-        say: is told in lines what was taken, and how good masks are.
+    ``root`` of the options is a capture, or a video or a folder of images of one fixed camera. Masks of ``given`` take
+    the place of those of the capture; without any the person is told from the background. Masks that are made are
+    written to the folder ``work``.
 
     Raises:
         DyngsError: neither capture nor clip; no masks, and none that can be made.

@@ -102,12 +102,7 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
     numbers, else 0, 1, ...; ``order`` and ``space`` as text. ``.json``: an object of ``order``, ``space`` and
     ``joints``, which maps images or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body,
     ``IMAGE.npz`` with ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck
-    et al. (2018), whose vertices are those of SMPL.
-
-    Args:
-        path: file or folder.
-        capture: with frame numbers.
-        body: the template, for vertices.
+    et al. (2018), whose vertices are those of SMPL. ``body`` is the template, for vertices.
 
     Raises:
         DyngsError: another layout, no frame of the capture, or no numbers; names the file.

@@ -31,8 +31,7 @@ _BODY, _CONFIG = "body_train.npz", "config.yaml"
 def known_shape(path: Path) -> BodyFrames:
     """Return the body parameters of a person, of whom only the shape counts.
 
-    Args:
-        path: a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one.
+    ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one.
 
     Raises:
         DyngsError: none of these, or a shape that is not of the free template.
@@ -107,13 +106,7 @@ def posed_by_avatar(avatar: KnownAvatar, views: Sequence[View], options: DataCon
     """Return the poses of a clip in which the avatar has the silhouettes of its images, where that is better.
 
     The size is that of ``start``, or that of the clip of training where the silhouettes show that the world has the
-    same unit.
-
-    Args:
-        avatar: of the person; plays ``start`` as it plays the clip of training.
-        views: the images of the clip, with silhouettes.
-        options: how images are read.
-        start: poses of the frames to begin with; frames without an image keep them.
+    same unit. Frames of ``start`` without an image keep their poses.
     """
     times = start.clip.times.tolist()
     shown = [replace(x, time=times[start.rows[-1 if x.frame is None else x.frame]]) for x in views]

@@ -66,11 +66,8 @@ def observed_frame(
 ) -> ObservedFrame | None:
     """Return the squares around the person in the images of one frame; None if no image shows anybody.
 
-    Args:
-        images: with alpha.
-        box_side: ``longest_box_side`` of all images of the capture, so that all squares show the same scale.
-        size: S.
-        marked: name of an image to key points (55, 3) in its pixels, see ``dyngs.human.fit.keypoints``; None without.
+    ``box_side`` is the ``longest_box_side`` of all images, so that all squares have the same scale; ``size`` is S;
+    ``marked`` are key points (55, 3) in pixels, by image.
     """
     side = max(round(_MARGIN * box_side), 1)
     squares = [square for image in images if (square := _square(image, side, size, marked or {})) is not None]

@@ -122,23 +122,11 @@ PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
 
 
+FRAMES = 3
+"""Frames drawn in each step."""
+
 Observations = Callable[[int], ObservedFrame | None]
 """Returns what is seen in a row of the clip."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage of a fit.
-
-    Attributes:
-        steps: of Adam.
-        frames: drawn in each step.
-        learned: names of what is learned.
-    """
-
-    steps: int
-    frames: int
-    learned: tuple[str, ...]
 
 
 def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
@@ -255,42 +243,43 @@ def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     return total + PADDING_WEIGHT * (learned["padding"] / PADDING).square().mean()
 
 
-def run_stage(
-    start: Parameters,
-    stage: Stage,
-    clip: MotionClip,
-    surface: Surface,
-    observed: Observations,
-    expected: PosePrior,
-    tick: Callable[[], None] = lambda: None,
-) -> Parameters:
-    """Return the fit after ``stage``; frames are taken in a fixed order that covers the clip evenly.
+@dataclass(frozen=True)
+class Fitting:
+    """Given poses of F frames, the template's surface, and the poses that are expected."""
 
-    Args:
-        start: of ``new_fit`` or of the stage before.
-        stage: what to learn.
-        clip: the given poses, F frames.
-        surface: of the template.
-        observed: observations of a row of the clip.
-        expected: of the poses.
-        tick: called after every step.
-    """
-    # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
-    learned = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
-    order = spread_order(len(clip))
-    for step in range(1, stage.steps + 1):
-        first = (step - 1) * stage.frames
-        rows = {order[(first + i) % len(order)] for i in range(stage.frames)}
-        loss = prior(learned, expected)
-        for row in sorted(rows):
-            seen = observed(row)
-            if seen is not None:
-                loss = loss + frame_error(learned, clip, surface, row, seen) / len(rows)
-        loss.backward()
-        _forget_others(learned, stage.learned)
-        learned.step(step, step / stage.steps)
-        tick()
-    return learned
+    clip: MotionClip
+    surface: Surface
+    expected: PosePrior
+
+    def run(
+        self,
+        start: Parameters,
+        learned: Sequence[str],
+        steps: int,
+        observed: Observations,
+        tick: Callable[[], None] = lambda: None,
+    ) -> Parameters:
+        """Return the fit ``start`` after ``steps`` of Adam on what is named; ``tick`` is called after each.
+
+        Frames are taken in a fixed order that covers the clip evenly.
+        """
+        # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
+        found = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
+        order = spread_order(len(self.clip))
+        for step in range(1, steps + 1):
+            rows = {order[((step - 1) * FRAMES + i) % len(order)] for i in range(FRAMES)}
+            loss = prior(found, self.expected)
+            for row in sorted(rows):
+                seen = observed(row)
+                if seen is not None:
+                    loss = loss + frame_error(found, self.clip, self.surface, row, seen) / len(rows)
+            loss.backward()
+            for name in found.values():
+                if name not in learned:
+                    found[name].grad = None
+            found.step(step, step / steps)
+            tick()
+        return found
 
 
 def frame_error(learned: Parameters, clip: MotionClip, surface: Surface, row: int, seen: ObservedFrame) -> Tensor:
@@ -317,13 +306,6 @@ def spread_order(count: int) -> list[int]:
     while count > 1 and math.gcd(stride, count) != 1:
         stride += 1
     return [(i * stride) % count for i in range(count)]
-
-
-def _forget_others(learned: Parameters, names: Sequence[str]) -> None:
-    """Drop the gradients of everything but ``names``."""
-    for name in learned.values():
-        if name not in names:
-            learned[name].grad = None
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,11 @@ from dyngs.data.images.silhouettes import silhouette_box
 from dyngs.human.fit.observed import ObservedFrame
 from dyngs.human.fit.solve import (
     NUM_TURNED,
+    Fitting,
     Observations,
-    Stage,
     frame_error,
     new_fit,
     prior,
-    run_stage,
     usual,
     usual_pose,
 )
@@ -288,13 +287,12 @@ def _found_from(
     ``levels`` are the factors by which what is seen is made smaller, one after the other.
     """
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
-    learned = new_fit(one, surface)
+    learned, fitting = new_fit(one, surface), Fitting(one, surface, usual(one))
     for level in levels:
         shown = seen.shrunk(level)
-        stage = Stage(STEPS, 1, ("poses", "trans"))
-        learned = run_stage(learned, stage, one, surface, lambda _, at=shown: at, usual(one))
+        learned = fitting.run(learned, ("poses", "trans"), STEPS, lambda _, at=shown: at)
     with torch.no_grad():
-        error = float(frame_error(learned, one, surface, 0, seen) + prior(learned, usual(one)))
+        error = float(frame_error(learned, one, surface, 0, seen) + prior(learned, fitting.expected))
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
     given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
     found = pose.clone()

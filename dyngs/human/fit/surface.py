@@ -57,10 +57,7 @@ class Surface:
     def in_pose(self, betas: Tensor, padding: Tensor, pose: BodyPose) -> Gaussians:
         """Return the discs in a pose, in the world; differentiable.
 
-        Args:
-            betas: (B,) shape parameters.
-            padding: (P,) m, by how much clothes and hair lie outside the skin.
-            pose: of the body.
+        ``betas`` (B,) are shape parameters; ``padding`` (P,) m, by how much clothes and hair lie outside the skin.
         """
         means = self.discs.means + self.shape_dirs @ betas + padding[:, None] * self.normals
         return pose_gaussians(self.discs.replace(means=means), self.weights, self.skeleton(betas), pose)

@@ -104,12 +104,6 @@ def captured_motion(where: Path, given: BodyFrames, views: Sequence[View], joint
 
     Joints that the body of ``given`` lacks do not rotate. Views without times are spread over [0, 1] by frame number.
 
-    Args:
-        where: path of the capture, for messages.
-        given: body parameters of the capture.
-        views: at least one.
-        joints: of the template in the person's shape, m.
-
     Raises:
         DyngsError: a view without parameters.
     """

@@ -60,12 +60,8 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
     The joints are those of the largest skin, and the rest pose is the bind pose, inverse(inverseBindMatrices), or
     without these the nodes without animation. A file without a skin, as Mixamo exports "without skin", has the nodes
     that are animated for joints, and must show a T-pose or an A-pose without animation. The world is that of the scene,
-    y up. The rotation of a joint is the product of those of its nodes: scale is left out.
-
-    Args:
-        path: of the file.
-        fps: frames per second.
-        clip: name of the animation; needed if several move the joints.
+    y up. The rotation of a joint is the product of those of its nodes: scale is left out. ``clip`` names the animation,
+    where several move the joints.
 
     Raises:
         DyngsError: no such animation, anything broken or not supported (sparse accessors, meshopt compression, mirrored

@@ -25,13 +25,7 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
     """Return a clip of any person, y up and in metres, at the size and place of the person of ``like``.
 
     Its up axis becomes ``up_direction(like)``; the lowest joints of both clips are equally high, and their mean pelvis
-    positions lie on one vertical line.
-
-    Args:
-        clip: the clip to move.
-        like: the clip of training.
-        joints: (J, 3) at rest, m, to which both clips apply.
-        parents: (J,) of the joints.
+    positions lie on one vertical line. ``like`` is the clip of training; both apply to ``joints`` (J, 3) at rest, m.
     """
     up = up_direction(like)
     unit = like.scale.mean()
@@ -49,10 +43,7 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
 def upright(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
     """Return a clip in the world of the person of ``like`` turned about the origin so that y is up there.
 
-    Args:
-        clip: the clip to turn.
-        like: the clip of training, whose ``up_direction`` becomes y.
-        joints: (J, 3) at rest, m, to which the clip applies.
+    ``like`` is the clip of training, whose ``up_direction`` becomes y; ``joints`` (J, 3) are at rest, m.
     """
     rotation = _least_rotation(up_direction(like), joints.new_tensor([0.0, 1.0, 0.0]))
     roots = rotation @ axis_angle_to_matrix(clip.poses[:, 0])

@@ -129,10 +129,7 @@ def num_input_channels(scaffolds: int) -> int:
 def network_inputs(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
     """Return the input (D, S, S): per scaffold colour, cosine, silhouettes; then offsets, points, guesses of colours.
 
-    Args:
-        person: the captured person.
-        maps: of the images.
-        mean: (3, S, S) mean colours of the training people.
+    ``mean`` (3, S, S) are mean colours of the training people.
     """
     measured = torch.stack([maps.seen, maps.inside, maps.hull / HULL_LIMIT], dim=-1)
     scaffolds = torch.cat([maps.rgb, measured], dim=-1)
@@ -154,17 +151,11 @@ def predict_gaussians(
 ) -> PredictedAvatar:
     """Return the avatar that ``network`` predicts, differentiable in its weights; None: discs in observed colours.
 
-    All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they lie inside at
-    least the share ``min_silhouette_fraction`` of the silhouettes. Rotations are relative to the tangent frame, scales
-    to the initial Gaussian, means move along the normal. Colours are a weighted mean of those of the images and those
-    of the network, which mixes and corrects the ``guessed_colours``; without a network those of the images.
-
-    Args:
-        person: the captured person.
-        maps: of the images.
-        mean: (3, S, S) as in ``network_inputs``.
-        network: or None.
-        min_silhouette_fraction: in [0, 1].
+    All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they lie inside at least
+    the share ``min_silhouette_fraction`` of the silhouettes. Rotations are relative to the tangent frame, scales to the
+    initial Gaussian, means move along the normal. Colours are a weighted mean of those of the images and those of the
+    network, which mixes and corrects the ``guessed_colours``; without a network those of the images. ``mean`` is as in
+    ``network_inputs``.
     """
     kept = (maps.inside >= min_silhouette_fraction) & (maps.seen > 0)
     kept[0] = True

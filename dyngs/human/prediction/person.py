@@ -13,7 +13,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.config import HumanModel
+from dyngs.config import HumanPredictorModel
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -59,7 +59,7 @@ class CapturedPerson:
         return frame_pose(footage.clip, footage.rows[-1 if view.frame is None else view.frame])
 
 
-def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> CapturedPerson:
+def captured_person(capture: Capture, model: HumanPredictorModel, body: BodyTemplate) -> CapturedPerson:
     """Return the person of a capture, on the template ``body``.
 
     Raises:
@@ -96,12 +96,8 @@ def spread_views(person: CapturedPerson, count: int, first: int | None = None) -
 
     The views are of one frame, the first with the most views, if it has enough; else of all frames. They maximize the
     mean over texels of the best view's cosine between normal and view direction, in the rest pose and without
-    occlusion; found greedily, then by exchanging one view after the other.
-
-    Args:
-        person: the captured person.
-        count: at least 1; all views if there are fewer.
-        first: a view that must be among them; its frame is then chosen.
+    occlusion; found greedily, then by exchanging one view after the other. All views if there are fewer than ``count``;
+    the view ``first`` must be among them, and its frame is chosen.
     """
     views = person.views
     frames = [view.frame for view in views]

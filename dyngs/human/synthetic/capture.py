@@ -180,14 +180,8 @@ def render_mesh(
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
     Lambertian: the texture's value times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1; no shadows.
-    Alpha is the fraction of samples that hit the mesh, whose colours are averaged.
-
-    Args:
-        mesh: visible from both sides.
-        world_from_cam: (4, 4) OpenGL pose; square pixels, centred, ``CAMERA_ANGLE_X`` across.
-        size: width and height in pixels.
-        samples: per side of a pixel.
-        light: on the mesh.
+    Alpha is the fraction of samples that hit the mesh, whose colours are averaged. ``world_from_cam`` (4, 4) is an
+    OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X`` across.
 
     Raises:
         ValueError: the mesh reaches behind the camera.

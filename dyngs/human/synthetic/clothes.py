@@ -96,12 +96,8 @@ def dress_body(body: BodyTemplate, outfit: Outfit) -> BodyTemplate:
 def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
     """Return the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64; left and right, front and back differ.
 
-    Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is correct.
-
-    Args:
-        body: a template in T-pose with texture coordinates and the 55 joints of SMPL-X.
-        outfit: clothes and hair.
-        resolution: S, texels per side.
+    Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is correct. The
+    template is in T-pose, with texture coordinates and the 55 joints of SMPL-X; ``resolution`` is S.
 
     Raises:
         DyngsError: the template has no texture coordinates.

@@ -85,12 +85,8 @@ class ScaffoldPoints:
 def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = None) -> Texels:
     """Return the texels whose centres the atlas of ``body`` covers; of overlapping triangles the first one wins.
 
-    Triangles that are degenerate in the atlas or on the surface cover nothing. Not differentiable.
-
-    Args:
-        body: a template with texture coordinates.
-        resolution: S, texels per side, at least 1.
-        vertices: (M, 3) rest shape, m; None: that of the template.
+    Triangles that are degenerate in the atlas or on the surface cover nothing. Not differentiable. ``resolution`` is S,
+    texels per side; ``vertices`` (M, 3) the rest shape, m, None for that of the template.
 
     Raises:
         DyngsError: no texture coordinates, a resolution below 1, or ``vertices`` of a wrong shape or not finite.
@@ -142,12 +138,8 @@ def scaffold_points(texels: Texels, heights: Sequence[float]) -> ScaffoldPoints:
 def _rasterized(corners_uv: Tensor, usable: Tensor, resolution: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return the covered texels (P,), ascending, their triangles (P,) and barycentric coordinates (P, 3).
 
-    Exact along shared edges: both triangles compute an edge's sign from its ends in the same order.
-
-    Args:
-        corners_uv: (T, 3, 2 or 3) corners of the triangles in the atlas.
-        usable: (T,) which triangles may cover texels.
-        resolution: S, texels per side.
+    Exact along shared edges: both triangles compute an edge's sign from its ends in the same order. ``corners_uv`` are
+    (T, 3, 2 or 3), ``usable`` (T,) says which triangles may cover texels.
     """
     corners, triangles = corners_uv.cpu().numpy(), np.flatnonzero(usable.cpu().numpy())
     x, y = corners[triangles, :, 0] * resolution - 0.5, (1 - corners[triangles, :, 1]) * resolution - 0.5

@@ -95,12 +95,8 @@ class BodyTemplate:
 def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape and expression parameters; differentiable.
 
-    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula.
-
-    Args:
-        body: the template.
-        betas: (..., B) shape parameters; missing ones are 0. None: the mean shape.
-        expression: (..., E) expression parameters, in the same way.
+    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula. Of ``betas`` (...,
+    B) and ``expression`` (..., E) missing ones are 0; None: the mean.
 
     Raises:
         DyngsError: a non-zero parameter that the template does not have.
@@ -136,14 +132,8 @@ def posed_vertices(
     """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et al. 2015).
 
     v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. The root rotates about the pelvis joint.
-
-    Args:
-        body: the template, in the same floating-point type as the other arguments.
-        poses: (F, J, 3) axis-angle relative to the parent joint, rad.
-        trans: (F, 3) m, added last.
-        betas: (B,) or (F, B) shape parameters, see ``shaped``.
-        expression: (E,) or (F, E) expression parameters.
-        scale: (F,) uniform scale of the template; None: 1.
+    ``poses`` (F, J, 3) are axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m, added last; ``betas`` (B,)
+    or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,) of the template.
 
     Raises:
         DyngsError: poses for another number of joints, or parameters that the template does not have.
@@ -190,12 +180,7 @@ def bone_shapes(
 
     Each moves one joint, or the same joint of both sides, in the frame of the rest pose, together with everything below
     it. Vertices between two joints are stretched evenly; those beyond the last joint of a chain keep their shape.
-
-    Args:
-        vertices: (M, 3) at rest, +x to the person's left.
-        joints: (J, 3) at rest, of the 55 joints of SMPL-X.
-        parents: (J,) parent of each joint.
-        weights: (M, J) skinning weights.
+    ``vertices`` (M, 3) and the 55 ``joints`` (J, 3) of SMPL-X are at rest, +x to the left; ``weights`` are (M, J).
     """
     joint_dirs = _joint_directions(parents)
     follow = _following(vertices, joints, parents, weights)

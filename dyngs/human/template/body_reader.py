@@ -45,10 +45,8 @@ def require_unit_square(path: Path, uv: np.ndarray) -> np.ndarray:
 def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> TextureCoordinates:
     """Read the texture coordinates of an ``.obj``, indexed by the corners of the triangles ``faces`` (T, 3).
 
-    Args:
-        path: of the file; its triangles may come in any order, as ``f v/vt v/vt v/vt``.
-        faces: (T, 3) vertices of the body's triangles.
-        num_vertices: M of the body.
+    Its triangles may come in any order, as ``f v/vt v/vt v/vt``; ``faces`` (T, 3) are those of the body with
+    ``num_vertices``.
 
     Raises:
         DyngsError: the file cannot be read, or belongs to another body.
@@ -133,11 +131,8 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
 
     The number of joints (24, 52 or 55) tells SMPL, SMPL-H and SMPL-X apart. SMPL-X keeps shape and expression in one
     array: 300 and the rest, or 10 and 10. Only the keys that are needed are read. A file cannot run code: arrays of
-    Python objects are refused, and only numbers, text and arrays are read from a pickle.
-
-    Args:
-        path: of the file.
-        uv: an ``.obj`` with the triangles of the body, see ``dyngs.human.template.body_reader``.
+    Python objects are refused, and only numbers, text and arrays are read from a pickle. ``uv`` is an ``.obj`` with the
+    triangles of the body.
 
     Raises:
         DyngsError: names the file and what is missing or wrong.

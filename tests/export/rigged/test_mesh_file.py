@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from bare_person import bands, bare_run, bare_scene, playing, random_clip, template
 from gltf_skins import SkinnedGlb
@@ -14,6 +16,7 @@ from moving_scene import write_moving_run
 from dyngs.errors import DyngsError
 from dyngs.export.rigged.body import body_mesh
 from dyngs.export.rigged.mesh_file import Played, write_mesh
+from dyngs.human.avatar.posing import PoseBlendShapes
 from dyngs.runs.checkpoint import load_run
 
 

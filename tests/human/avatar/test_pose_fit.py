@@ -101,7 +101,7 @@ def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
     """A person of a few hundred Gaussians, which was not trained, and three cameras."""
     config = Config(
         data=DataConfig(root=person),
-        model=HumanModel(resolution=24, scaffold_heights=(0.0,), min_silhouette_fraction=0.0, sh_degree=0),
+        model=HumanModel(resolution=24, sh_degree=0),
         optim=OptimConfig(),
         train=TrainConfig(steps=10),
         run=RunConfig(threads=1),

@@ -72,7 +72,7 @@ def avatar(person: Path) -> HumanScene:
 
 
 def new_trainer(person: Path) -> Trainer:
-    model = HumanModel(resolution=24, scaffold_heights=(0.0,), min_silhouette_fraction=0.0, sh_degree=0)
+    model = HumanModel(resolution=24, sh_degree=0)
     train, run = TrainConfig(steps=10), RunConfig(threads=1)
     return assemble(Config(data=DataConfig(root=person), model=model, optim=OptimConfig(), train=train, run=run))
 

@@ -15,8 +15,8 @@ from dyngs.human.fit.solve import (
     KEYPOINT,
     LIMIT_WEIGHT,
     PLACE,
+    Fitting,
     PosePrior,
-    Stage,
     drawn_frame,
     keypoint_error,
     near_given,
@@ -25,7 +25,6 @@ from dyngs.human.fit.solve import (
     posed_joints,
     prior,
     refined,
-    run_stage,
     silhouette_error,
     spread_order,
     usual,
@@ -94,8 +93,8 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> No
     errors = []
     for joints in (None, marked):
         seen = ObservedFrame(view, alpha, torch.ones_like(alpha), joints)
-        stage = Stage(120, 1, ("poses",))
-        found = run_stage(new_fit(given, surface), stage, given, surface, lambda _, seen=seen: seen, near_given(given))
+        fitting = Fitting(given, surface, near_given(given))
+        found = fitting.run(new_fit(given, surface), ("poses",), 120, lambda _, seen=seen: seen)
         errors.append(float((posed_joints(found, given, surface, 0) - truth)[wrist].detach().norm()))
     assert errors[1] < 0.2, "the prior of given poses still pulls"
     assert errors[1] < 0.5 * errors[0]
@@ -112,7 +111,7 @@ def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     given, view = clip(), camera()
     alpha = torch.ones(1, SIZE, SIZE)
     seen, start = ObservedFrame(view, alpha, alpha), new_fit(given, surface)
-    found = run_stage(start, Stage(2, 1, ("betas",)), given, surface, lambda _: seen, near_given(given))
+    found = Fitting(given, surface, near_given(given)).run(start, ("betas",), 2, lambda _: seen)
     assert not any(value.any() for value in start.values().values()), "what was learned before stays as it is"
     changed = {name for name, value in found.values().items() if value.any()}
     assert changed == {"betas"}

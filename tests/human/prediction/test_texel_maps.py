@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import HumanModel
+from dyngs.config import HumanPredictorModel
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry.poses import cam_from_opengl
 from dyngs.data.loader import Image
@@ -87,7 +87,7 @@ def sitter(poses: Tensor) -> CapturedPerson:
     view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
     frames = BodyFrames((0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1))
     capture = Capture(Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames})
-    return captured_person(capture, HumanModel(resolution=64, scaffold_heights=(0.0, 0.04)), body())
+    return captured_person(capture, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)), body())
 
 
 def arms_before_the_chest() -> Tensor:
