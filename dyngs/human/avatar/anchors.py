@@ -23,39 +23,24 @@ from dyngs.state import fields_moved_to
 
 MAX_JOINTS = 8
 """Limit on the joints that one Gaussian follows; vertices of the free template follow no more."""
-
-
 _WIDTH, _THICKNESS = 0.5, 0.25
 """Standard deviations of an initial Gaussian in the tangent plane and along the normal, in sides of its texel."""
-
-
 _LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1
 """Initial opacities: on the lowest scaffold, and on those above it."""
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """Constant attributes that tie N Gaussians to the template, row by row.
+    """Constant attributes that tie N Gaussians to the template, row by row."""
 
-    Attributes:
-        points: (N, 3) at rest on the scaffold, m.
-        size: (N,) side of the texel, m.
-        joints: (N, K) int64 joints that the Gaussian follows, heaviest first.
-        weights: (N, K) skinning weights of these joints, rows sum to 1.
-        face: (N,) int64 triangle of the template that holds the texel's centre.
-        barycentric: (N, 3) of the texel's centre in that triangle.
-        uv: (N, 2) of the texel's centre in the atlas.
-        height: (N,) of the scaffold above the skin, m.
-    """
-
-    points: Tensor
-    size: Tensor
-    joints: Tensor
-    weights: Tensor
-    face: Tensor
-    barycentric: Tensor
-    uv: Tensor
-    height: Tensor
+    points: Tensor  # (N, 3) at rest on the scaffold, m
+    size: Tensor  # (N,) side of the texel, m
+    joints: Tensor  # (N, K) int64 joints that the Gaussian follows, heaviest first
+    weights: Tensor  # (N, K) skinning weights of these joints, rows sum to 1
+    face: Tensor  # (N,) int64 triangle of the template that holds the texel's centre
+    barycentric: Tensor  # (N, 3) of the texel's centre in that triangle
+    uv: Tensor  # (N, 2) of the texel's centre in the atlas
+    height: Tensor  # (N,) of the scaffold above the skin, m
 
     def __len__(self) -> int:
         return len(self.points)

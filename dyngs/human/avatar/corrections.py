@@ -44,15 +44,10 @@ POSE_CM = 0.05
 
 @dataclass(frozen=True)
 class SharedCorrection:
-    """The correction of all poses of a person.
+    """The correction of all poses of a person."""
 
-    Attributes:
-        turns: (J, 3) axis-angle, rad: rotations of the joints applied before those of a pose.
-        log_scale: natural logarithm of the factor on the template's size.
-    """
-
-    turns: Tensor
-    log_scale: float
+    turns: Tensor  # (J, 3) axis-angle, rad: rotations of the joints applied before those of a pose
+    log_scale: float  # natural logarithm of the factor on the template's size
 
     def to(self, *, device: torch.device | str) -> SharedCorrection:
         """Return the correction on ``device``."""

@@ -26,18 +26,12 @@ FACING_EXPONENT = 4
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """N points on a body at rest.
+    """N points on a body at rest."""
 
-    Attributes:
-        points: (N, 3) m.
-        normals: (N, 3) outward unit normals.
-        weights: (N, J) skinning weights.
-        offsets: returns the pose-dependent offsets (N, 3) at rest, m, or None; None: no offsets in any pose.
-    """
-
-    points: Tensor
-    normals: Tensor
-    weights: Tensor
+    points: Tensor  # (N, 3) m
+    normals: Tensor  # (N, 3) outward unit normals
+    weights: Tensor  # (N, J) skinning weights
+    # returns the pose-dependent offsets (N, 3) at rest, m, or None; None: no offsets in any pose
     offsets: Callable[[BodyPose], Tensor | None] | None = None
 
     def at_rest(self, pose: BodyPose) -> Tensor:

@@ -32,19 +32,13 @@ SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
 
 @dataclass(frozen=True)
 class Comparison:
-    """How renders of a person are compared with images, and what keeps the pose near that given.
+    """How renders of a person are compared with images, and what keeps the pose near that given."""
 
-    Attributes:
-        difference: the loss () between a rendering and an image on a background (3,), with sides divided by a factor.
-        turn_weight: of the mean squared rotation that is added to the joints, 1 / rad^2.
-        shift_weight: of the mean squared translation that is added, 1 / m^2.
-        views_to_turn: fewest images of one moment from which rotations are fitted; from fewer the translation is.
-    """
-
+    # the loss () between a rendering and an image on a background (3,), with sides divided by a factor
     difference: Callable[[Rendering, Image, Tensor, int], Tensor]
-    turn_weight: float
-    shift_weight: float = 0.0
-    views_to_turn: int = 1
+    turn_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
+    shift_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
+    views_to_turn: int = 1  # fewest images of one moment from which rotations are fitted; from fewer the translation is
 
 
 def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
@@ -112,15 +106,10 @@ class Correction:
 
 @dataclass(frozen=True)
 class FittedPoses:
-    """Poses fitted to images.
+    """Poses fitted to images."""
 
-    Attributes:
-        scene: the same person, playing them.
-        updates: number of updates at each of the F moments.
-    """
-
-    scene: HumanScene
-    updates: tuple[int, ...]
+    scene: HumanScene  # the same person, playing them
+    updates: tuple[int, ...]  # number of updates at each of the F moments
 
 
 def fitted_to_images(
@@ -170,24 +159,15 @@ def _playing_exactly(scene: HumanScene, clip: MotionClip) -> HumanScene:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The fit of one pose.
+    """The fit of one pose."""
 
-    Attributes:
-        scene: the person.
-        start: the pose to begin with, a clip of one frame.
-        time: of the images.
-        background, options: to draw with.
-        images: V.
-        comparison: what of these counts.
-    """
-
-    scene: HumanScene
-    start: MotionClip
-    time: float
-    background: Tensor
+    scene: HumanScene  # the person
+    start: MotionClip  # the pose to begin with, a clip of one frame
+    time: float  # of the images
+    background: Tensor  # and options: to draw with
     options: RenderOptions
-    images: tuple[Image, ...]
-    comparison: Comparison
+    images: tuple[Image, ...]  # V
+    comparison: Comparison  # what of these counts
 
     def fitted(self, guess: Correction | None) -> tuple[Correction, int]:
         """Return the correction of the pose, and the number of updates it took.

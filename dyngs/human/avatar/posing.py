@@ -30,15 +30,10 @@ TERMS = 8
 
 @dataclass(frozen=True)
 class Light:
-    """Light that falls on N Gaussians.
+    """Light that falls on N Gaussians."""
 
-    Attributes:
-        normals: (N, 3) outward at rest, of any length.
-        factors: (8, 3) A, red, green and blue.
-    """
-
-    normals: Tensor
-    factors: Tensor
+    normals: Tensor  # (N, 3) outward at rest, of any length
+    factors: Tensor  # (8, 3) A, red, green and blue
 
     def on(self, sh: Tensor, linear: Tensor) -> Tensor:
         """Return harmonics (N, K, 3) with their colours times the light, of Gaussians moved by (N, 3, 3)."""
@@ -83,15 +78,10 @@ class Skeleton:
 
 @dataclass(frozen=True)
 class PoseBlendShapes:
-    """SMPL's pose blend shapes: offsets of a template's vertices at rest that depend on the pose (Loper et al. 2015).
+    """SMPL's pose blend shapes: offsets of a template's vertices at rest that depend on the pose (Loper et al. 2015)."""
 
-    Attributes:
-        directions: (9 (J - 1), 3 M) m per unit of the rotations minus the identity, without the root.
-        faces: (T, 3) int64 vertices of the triangles.
-    """
-
-    directions: Tensor
-    faces: Tensor
+    directions: Tensor  # m per unit of the rotations minus the identity, without the root: (9 (J - 1), 3 M)
+    faces: Tensor  # (T, 3) int64 vertices of the triangles
 
     def to(self, *, device: torch.device | str) -> PoseBlendShapes:
         """Return the blend shapes on ``device``."""
@@ -118,17 +108,11 @@ def pose_blend_shapes(body: BodyTemplate) -> PoseBlendShapes | None:
 
 @dataclass(frozen=True)
 class BodyPose:
-    """One pose of a body; differentiable.
+    """One pose of a body; differentiable."""
 
-    Attributes:
-        rotations: (J, 3, 3) relative to the parent joints.
-        trans: (3,) world units, added last.
-        scale: () world units per metre.
-    """
-
-    rotations: Tensor
-    trans: Tensor
-    scale: Tensor
+    rotations: Tensor  # (J, 3, 3) relative to the parent joints
+    trans: Tensor  # (3,) world units, added last
+    scale: Tensor  # () world units per metre
 
 
 def pose_gaussians(

@@ -41,22 +41,14 @@ from dyngs.tensor_checks import require_indices, require_moments, require_positi
 
 @dataclass(frozen=True, kw_only=True)
 class HumanScene(Scene):
-    """N Gaussians at rest, m, and a person who moves as a clip says.
+    """N Gaussians at rest, m, and a person who moves as a clip says."""
 
-    Attributes:
-        anchors: of the Gaussians, with the template's weights.
-        skeleton: of the template in the person's shape; clips are given for it.
-        clip: that of training, as it was given.
-        learned: corrections to all of these, see ``new_corrections``.
-        shapes: the template's pose blend shapes, or None.
-        played: another clip to play, given as that of training was; None: that of training, corrected frame by frame.
-    """
-
-    anchors: Anchors
-    skeleton: Skeleton
-    clip: MotionClip
-    learned: Parameters
-    shapes: PoseBlendShapes | None = None
+    anchors: Anchors  # of the Gaussians, with the template's weights
+    skeleton: Skeleton  # of the template in the person's shape; clips are given for it
+    clip: MotionClip  # that of training, as it was given
+    learned: Parameters  # corrections to all of these, see ``new_corrections``
+    shapes: PoseBlendShapes | None = None  # the template's pose blend shapes, or None
+    # another clip to play, given as that of training was; None: that of training, corrected frame by frame
     played: MotionClip | None = None
 
     @staticmethod

@@ -47,17 +47,11 @@ SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
 
 @dataclass(frozen=True)
 class FitEffort:
-    """How much a fit may cost.
+    """How much a fit may cost."""
 
-    Attributes:
-        side: of the squares around the person that are looked at, px.
-        steps: least number of steps of Adam of a stage.
-        visits: how often a frame is drawn where its pose is learned.
-    """
-
-    side: int = 128
-    steps: int = 120
-    visits: int = 18
+    side: int = 128  # of the squares around the person that are looked at, px
+    steps: int = 120  # least number of steps of Adam of a stage
+    visits: int = 18  # how often a frame is drawn where its pose is learned
 
     def steps_for(self, clip: MotionClip) -> int:
         """Return the number of steps that draws every frame often enough."""
@@ -66,17 +60,12 @@ class FitEffort:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known beside images and given poses.
+    """What is known beside images and given poses."""
 
-    Attributes:
-        joints: in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without.
-        guessed_lens: the capture is one camera that stands at the origin, with a guessed focal length to be refined.
-        shape: the body has the shape of the person already.
-    """
-
-    joints: Joints3D | None = None
+    joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without
+    # the capture is one camera that stands at the origin, with a guessed focal length to be refined
     guessed_lens: bool = False
-    shape: bool = False
+    shape: bool = False  # the body has the shape of the person already
 
     @property
     def learned(self) -> tuple[str, ...]:
@@ -90,42 +79,25 @@ NOTHING_KNOWN = Known()
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to fit.
+    """One way to fit."""
 
-    Attributes:
-        name: for people.
-        learned: of the clip.
-        iou: mean IoU of drawn and seen silhouettes.
-        per_frame: (F,) the same, per frame.
-    """
-
-    name: str
-    learned: Parameters
-    iou: float
-    per_frame: tuple[float, ...]
+    name: str  # for people
+    learned: Parameters  # of the clip
+    iou: float  # mean IoU of drawn and seen silhouettes
+    per_frame: tuple[float, ...]  # (F,) the same, per frame
 
 
 @dataclass(frozen=True)
 class CaptureFit:
-    """A fit of a capture's clip of training.
+    """A fit of a capture's clip of training."""
 
-    Attributes:
-        fit: of the clip.
-        motion: the given clip, F frames.
-        chosen: the candidate that was taken.
-        tried: all candidates; the first one has the poses as given.
-        held_out: views left out of the fit, on which the candidates were measured; 0: measured on those fitted to.
-        from_silhouettes: no poses were given.
-        lens: the focal length of one fixed camera that was guessed; None where cameras are known.
-    """
-
-    fit: BodyFit
-    motion: CapturedMotion
-    chosen: Candidate
-    tried: tuple[Candidate, ...]
-    held_out: int
-    from_silhouettes: bool
-    lens: LensFit | None = None
+    fit: BodyFit  # of the clip
+    motion: CapturedMotion  # the given clip, F frames
+    chosen: Candidate  # the candidate that was taken
+    tried: tuple[Candidate, ...]  # all candidates; the first one has the poses as given
+    held_out: int  # views left out of the fit, on which the candidates were measured; 0: measured on those fitted to
+    from_silhouettes: bool  # no poses were given
+    lens: LensFit | None = None  # the focal length of one fixed camera that was guessed; None where cameras are known
 
 
 @dataclass(frozen=True)

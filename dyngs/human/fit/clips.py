@@ -21,26 +21,17 @@ from dyngs.human.template.body import BodyTemplate
 
 _CLEARLY = 0.001
 """Gain of IoU for which the clip is moved."""
-
-
 _EFFORT = FitEffort()
 
 
 @dataclass(frozen=True)
 class NewClip:
-    """Another clip of a fitted person.
+    """Another clip of a fitted person."""
 
-    Attributes:
-        motion: its poses as given.
-        shift: (3,) to add to its translations, in the unit of the world, in place of that of the fit.
-        iou: with the shift of the fit.
-        iou_moved: with that of the clip itself; None where that was not taken.
-    """
-
-    motion: CapturedMotion
-    shift: Tensor
-    iou: float
-    iou_moved: float | None
+    motion: CapturedMotion  # its poses as given
+    shift: Tensor  # (3,) to add to its translations, in the unit of the world, in place of that of the fit
+    iou: float  # with the shift of the fit
+    iou_moved: float | None  # with that of the clip itself; None where that was not taken
 
     def summary(self) -> str:
         """Return a line for people."""

@@ -32,24 +32,15 @@ class KnownAvatar:
 
 @dataclass(frozen=True)
 class FitInputs:
-    """What is given beside the capture; everything may be None.
+    """What is given beside the capture; everything may be None."""
 
-    Attributes:
-        keypoints: folder or file of 2D key points.
-        masks: folder of masks, white = the person.
-        background: image of the place without the person, or a folder of one for each camera.
-        joints: file or folder of 3D joints or posed vertices, see ``read_joints``.
-        body: body file whose vertices these are; None: the free template.
-        person: capture or run of the same person, whose shape is kept.
-        avatar: of the same person, if that run has one: its silhouette decides the poses in the end.
-    """
-
-    keypoints: Path | None = None
-    masks: Path | None = None
-    background: Path | None = None
-    joints: Path | None = None
-    body: Path | None = None
-    person: Path | None = None
+    keypoints: Path | None = None  # folder or file of 2D key points
+    masks: Path | None = None  # folder of masks, white = the person
+    background: Path | None = None  # image of the place without the person, or a folder of one for each camera
+    joints: Path | None = None  # file or folder of 3D joints or posed vertices, see ``read_joints``
+    body: Path | None = None  # body file whose vertices these are; None: the free template
+    person: Path | None = None  # capture or run of the same person, whose shape is kept
+    # of the same person, if that run has one: its silhouette decides the poses in the end
     avatar: KnownAvatar | None = None
 
 

@@ -75,24 +75,18 @@ _MHR, _MHR_JOINTS = "mhr70", 70
 _MOST_FRAMES, _FARTHEST = 100_000, 1e6
 _TURNED = (1.0, -1.0, -1.0)
 """From the axes of a camera of OpenGL, y up and looking along -z, to those of OpenCV."""
-
 Joints3D = dict[int, Tensor]
 """Frame number to (55, 4): place in the world of the cameras and confidence, 0 where a joint is not known."""
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Joints as a file has them.
+    """Joints as a file has them."""
 
-    Attributes:
-        joints: key of a frame (its number, or the name of an image) to (K, 4), with confidence.
-        order: name of their order, in ``ORDERS``.
-        space: of their axes: the capture's world, or OpenCV's camera of the image.
-    """
-
+    # key of a frame (its number, or the name of an image) to (K, 4), with confidence
     joints: Mapping[int | str, np.ndarray]
-    order: str
-    space: Space
+    order: str  # name of their order, in ``ORDERS``
+    space: Space  # of their axes: the capture's world, or OpenCV's camera of the image
 
 
 def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:

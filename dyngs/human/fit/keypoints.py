@@ -49,7 +49,6 @@ _GOLIATH = (
 )
 _MHR = list(_marked(_GOLIATH, 70))
 _MHR[41], _MHR[62] = "right_wrist", "left_wrist"
-
 ORDERS: dict[str, tuple[str, ...]] = {
     "coco17": _marked(COCO, 17),
     "openpose25": _marked(BODY_25, 25),
@@ -60,8 +59,6 @@ ORDERS: dict[str, tuple[str, ...]] = {
 }
 """Orders of 3D joints by name; the number of joints tells them apart. Empty: a joint that is not used. ``mhr70`` is
 that of SAM 3D Body."""
-
-
 _SEEN = ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 """Joints that detectors mark where they are, on both sides. Nose and ears are no joints; necks and toes are marked
 elsewhere."""
@@ -73,7 +70,6 @@ _FARTHEST = 1e6
 """Key points further away, px, are taken for mistakes."""
 _ORDERS = {17: COCO, 133: COCO, 25: BODY_25, 18: COCO_18}
 """Number of key points of a format to the names of the first ones, as published."""
-
 Keypoints = dict[str, Tensor]
 """Name of a view to (55, 3): column, row and confidence of joints in its stored image, undistorted; confidence 0
 where a joint is not marked."""

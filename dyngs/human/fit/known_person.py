@@ -74,18 +74,12 @@ _FEWEST_VIEWS = 3
 
 @dataclass(frozen=True)
 class AvatarPoses:
-    """Poses that an avatar found.
+    """Poses that an avatar found."""
 
-    Attributes:
-        clip: of all frames; as it was where ``taken`` is false.
-        before, after: overlap of silhouettes (IoU) at some moments, of the avatar in both.
-        left_out: number of views, which were left out of the fit, that this was measured on; 0: on those fitted to.
-    """
-
-    clip: FittedClip
-    before: float
+    clip: FittedClip  # of all frames; as it was where ``taken`` is false
+    before: float  # and after: overlap of silhouettes (IoU) at some moments, of the avatar in both
     after: float
-    left_out: int
+    left_out: int  # number of views, which were left out of the fit, that this was measured on; 0: on those fitted to
 
     @property
     def taken(self) -> bool:

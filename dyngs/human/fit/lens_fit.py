@@ -18,19 +18,12 @@ GAIN = 0.01
 
 @dataclass(frozen=True)
 class LensFit:
-    """A focal length that was tried.
+    """A focal length that was tried."""
 
-    Attributes:
-        factor: on the guessed focal length.
-        distance: from the camera at which the size in the images is kept, in units of the world.
-        error: on the frames left out, with the focal length as guessed and as refined.
-        taken: the refined one is better.
-    """
-
-    factor: float
-    distance: float
-    error: tuple[float, float]
-    taken: bool
+    factor: float  # on the guessed focal length
+    distance: float  # from the camera at which the size in the images is kept, in units of the world
+    error: tuple[float, float]  # on the frames left out, with the focal length as guessed and as refined
+    taken: bool  # the refined one is better
 
     def summary(self) -> str:
         """Return a line for people."""

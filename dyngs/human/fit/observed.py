@@ -23,21 +23,16 @@ _MARGIN = 1.25
 
 @dataclass(frozen=True)
 class ObservedFrame:
-    """The views of one frame in which the person is seen.
+    """The views of one frame in which the person is seen."""
 
-    Attributes:
-        cameras: V, of squares of S px.
-        alpha: (V, S, S) float32 in [0, 1]: coverage by the person.
-        known: (V, S, S) float32, 1 inside the image that the square was cut out of and where its mask counts, else 0.
-        joints: (V, 55, 3) column and row in the square, as fractions of its side, and confidence of joints that were
-            marked as key points; None without any.
-        places: (55, 4) places in the world and confidence of joints that are given in 3D; None without any.
-    """
-
-    cameras: Cameras
-    alpha: Tensor
+    cameras: Cameras  # V, of squares of S px
+    alpha: Tensor  # (V, S, S) float32 in [0, 1]: coverage by the person
+    # (V, S, S) float32, 1 inside the image that the square was cut out of and where its mask counts, else 0
     known: Tensor
+    # (V, 55, 3) column and row in the square, as fractions of its side, and confidence of joints that were marked as
+    # key points; None without any
     joints: Tensor | None = None
+    # (55, 4) places in the world and confidence of joints that are given in 3D; None without any
     places: Tensor | None = None
 
     def __len__(self) -> int:

@@ -51,17 +51,11 @@ _DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Expected corrections of the poses of F frames, axis-angle, rad.
+    """Expected corrections of the poses of F frames, axis-angle, rad."""
 
-    Attributes:
-        centre: (F, 22, 3) mean.
-        spread: (22, 3) standard deviation.
-        limit: of these from the centre, beyond which nobody is expected to turn a joint.
-    """
-
-    centre: Tensor
-    spread: Tensor
-    limit: float = math.inf
+    centre: Tensor  # (F, 22, 3) mean
+    spread: Tensor  # (22, 3) standard deviation
+    limit: float = math.inf  # of these from the centre, beyond which nobody is expected to turn a joint
 
 
 def near_given(clip: MotionClip) -> PosePrior:
@@ -120,11 +114,8 @@ FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
 """Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
-
-
 FRAMES = 3
 """Frames drawn in each step."""
-
 Observations = Callable[[int], ObservedFrame | None]
 """Returns what is seen in a row of the clip."""
 
@@ -310,23 +301,14 @@ def spread_order(count: int) -> list[int]:
 
 @dataclass(frozen=True)
 class BodyFit:
-    """A body fitted to a clip of F frames, as a correction of the poses that were given.
+    """A body fitted to a clip of F frames, as a correction of the poses that were given."""
 
-    Attributes:
-        betas: (B,) shape parameters of the template.
-        shared: turns of the joints and factor on the size, the same in all frames.
-        offset: (3,) m, correction of the translation in the frame of the pelvis, the same in all frames.
-        shift: (3,) the same in the frame of the world, in its unit.
-        poses: (F, J, 3) axis-angle, rad, added to the turns per frame.
-        trans: (F, 3) added to the given translations.
-    """
-
-    betas: Tensor
-    shared: SharedCorrection
-    offset: Tensor
-    shift: Tensor
-    poses: Tensor
-    trans: Tensor
+    betas: Tensor  # (B,) shape parameters of the template
+    shared: SharedCorrection  # turns of the joints and factor on the size, the same in all frames
+    offset: Tensor  # (3,) m, correction of the translation in the frame of the pelvis, the same in all frames
+    shift: Tensor  # (3,) the same in the frame of the world, in its unit
+    poses: Tensor  # (F, J, 3) axis-angle, rad, added to the turns per frame
+    trans: Tensor  # (F, 3) added to the given translations
 
     def fitted(self, clip: MotionClip) -> MotionClip:
         """Return the clip that was fitted, with its corrections."""

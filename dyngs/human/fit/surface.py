@@ -29,21 +29,13 @@ _OPTIONS = RenderOptions(nonfinite="trust", eps2d=0.1, mode=RasterizeMode.ANTIAL
 
 @dataclass(frozen=True)
 class Surface:
-    """Discs on the texels of a template, and how they follow its shape.
+    """Discs on the texels of a template, and how they follow its shape."""
 
-    Attributes:
-        discs: P at rest in the mean shape, m.
-        normals: (P, 3) outward.
-        weights: (P, J) skinning weights.
-        shape_dirs: (P, 3, B) m per unit of the shape parameters.
-        body: the template.
-    """
-
-    discs: Gaussians
-    normals: Tensor
-    weights: Tensor
-    shape_dirs: Tensor
-    body: BodyTemplate
+    discs: Gaussians  # P at rest in the mean shape, m
+    normals: Tensor  # (P, 3) outward
+    weights: Tensor  # (P, J) skinning weights
+    shape_dirs: Tensor  # (P, 3, B) m per unit of the shape parameters
+    body: BodyTemplate  # the template
 
     def __len__(self) -> int:
         return len(self.weights)

@@ -23,19 +23,12 @@ _SAME_TIME = 1e-9
 
 @dataclass(frozen=True)
 class MotionClip:
-    """Body parameters at F >= 1 times.
+    """Body parameters at F >= 1 times."""
 
-    Attributes:
-        times: (F,) float64 in [0, 1], strictly ascending; always on the CPU, as they are read one by one.
-        poses: (F, J, 3) axis-angle relative to the parent joint, rad.
-        trans: (F, 3) world units, added last.
-        scale: (F,) world units per metre of the template.
-    """
-
-    times: Tensor
-    poses: Tensor
-    trans: Tensor
-    scale: Tensor
+    times: Tensor  # (F,) float64 in [0, 1], strictly ascending; always on the CPU, as they are read one by one
+    poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
+    trans: Tensor  # (F, 3) world units, added last
+    scale: Tensor  # (F,) world units per metre of the template
 
     def __len__(self) -> int:
         return len(self.times)
@@ -79,15 +72,10 @@ def motion_clip(motion: Motion) -> MotionClip:
 
 @dataclass(frozen=True)
 class CapturedMotion:
-    """A clip of the frames that have images.
+    """A clip of the frames that have images."""
 
-    Attributes:
-        clip: of F frames, or of one where the person keeps one pose in one place: nothing moves.
-        frames: (F,) frame numbers, as views name them.
-    """
-
-    clip: MotionClip
-    frames: tuple[int, ...]
+    clip: MotionClip  # of F frames, or of one where the person keeps one pose in one place: nothing moves
+    frames: tuple[int, ...]  # (F,) frame numbers, as views name them
 
     @property
     def rows(self) -> dict[int, int]:

@@ -17,8 +17,6 @@ from dyngs.files.limits import require_at_most
 from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, sample_times
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
-
-
 _VRM_THUMBS = {
     f"{side}Thumb{new}": f"{side}Thumb{old}"
     for side in ("left", "right")

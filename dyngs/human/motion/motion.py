@@ -21,7 +21,6 @@ from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.state import fields_moved_to
 
 UpAxis = Literal["auto", "y", "z"]
-
 MAX_JOINT_POSES = 5_000_000
 """Limit on joints (at least 55) times frames of a motion: 90,909 frames, or 50 minutes at 30 frames per second."""
 _RATES = (1e-3, 1e5)
@@ -32,21 +31,13 @@ _CHUNK = 1024
 
 @dataclass(frozen=True)
 class Motion:
-    """Body parameters per frame; y up.
+    """Body parameters per frame; y up."""
 
-    Attributes:
-        poses: (F, J, 3) axis-angle relative to the parent joint, rad.
-        trans: (F, 3) m, added after skinning.
-        betas: (B,) shape parameters.
-        fps: frames per second.
-        scale: (F,) uniform scale of the template.
-    """
-
-    poses: Tensor
-    trans: Tensor
-    betas: Tensor
-    fps: float
-    scale: Tensor
+    poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
+    trans: Tensor  # (F, 3) m, added after skinning
+    betas: Tensor  # (B,) shape parameters
+    fps: float  # frames per second
+    scale: Tensor  # (F,) uniform scale of the template
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -173,22 +164,12 @@ def interpolate_rotations(before: Tensor, after: Tensor, fraction: np.ndarray) -
 
 @dataclass(frozen=True)
 class SkeletonMotion:
-    """The motion of S joints of another skeleton than ours; float64, in any unit of length.
+    """The motion of S joints of another skeleton than ours; float64, in any unit of length."""
 
-    Attributes:
-        path: of the file, for messages.
-        names: (S,) of the joints.
-        rest: (S, 3) joints in the rest pose, in its own axes.
-        rotations: (F, S, 3, 3) world_from_rest of each joint.
-        positions: (F, S, 3) of the joints in the world.
-        fps: frames per second.
-        world_is_y_up: whether the world is known to be y up; otherwise it has the axes of the rest pose.
-    """
-
-    path: Path
-    names: tuple[str, ...]
-    rest: np.ndarray
-    rotations: np.ndarray
-    positions: np.ndarray
-    fps: float
-    world_is_y_up: bool
+    path: Path  # of the file, for messages
+    names: tuple[str, ...]  # (S,) of the joints
+    rest: np.ndarray  # (S, 3) joints in the rest pose, in its own axes
+    rotations: np.ndarray  # (F, S, 3, 3) world_from_rest of each joint
+    positions: np.ndarray  # (F, S, 3) of the joints in the world
+    fps: float  # frames per second
+    world_is_y_up: bool  # whether the world is known to be y up; otherwise it has the axes of the rest pose

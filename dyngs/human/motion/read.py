@@ -29,19 +29,12 @@ class _Request:
 
 @dataclass(frozen=True)
 class _Format:
-    """A format of motion files, by suffix.
+    """A format of motion files, by suffix."""
 
-    Attributes:
-        name: in messages.
-        read: returns the motion on the body of a request.
-        has_up_axis: whether ``up`` may be chosen.
-        has_clips: whether a file may hold several named motions.
-    """
-
-    name: str
-    read: Callable[[_Request], Motion]
-    has_up_axis: bool = False
-    has_clips: bool = False
+    name: str  # in messages
+    read: Callable[[_Request], Motion]  # returns the motion on the body of a request
+    has_up_axis: bool = False  # whether ``up`` may be chosen
+    has_clips: bool = False  # whether a file may hold several named motions
 
 
 def _read_gltf(request: _Request) -> Motion:

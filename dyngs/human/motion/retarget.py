@@ -30,19 +30,12 @@ _OURS = (
 
 @dataclass(frozen=True)
 class Rig:
-    """The joint names of one kind of skeleton, in lower case and without punctuation.
+    """The joint names of one kind of skeleton, in lower case and without punctuation."""
 
-    Attributes:
-        name: of the program or data set.
-        sides: text for ``*``: left and right.
-        words: a name for each word of ``_OURS``; ``a|b`` is a or b, ``-`` none. Words at the end may be missing.
-        segments: text for ``#``.
-    """
-
-    name: str
-    sides: tuple[str, str]
-    words: str
-    segments: tuple[str, str, str] = ("1", "2", "3")
+    name: str  # of the program or data set
+    sides: tuple[str, str]  # text for ``*``: left and right
+    words: str  # a name for each word of ``_OURS``; ``a|b`` is a or b, ``-`` none. Words at the end may be missing.
+    segments: tuple[str, str, str] = ("1", "2", "3")  # text for ``#``
 
     def joints(self) -> Iterator[tuple[str, tuple[str, ...]]]:
         """Yield each joint of SMPL-X with the names that it may have here."""
@@ -126,7 +119,6 @@ RIGS = (
     ),
 )
 """Rocketbox avatars use Biped, VALID avatars Mixamo, the cgspeed conversions of CMU either CMU or DAZ."""
-
 _NEEDED = (
     "pelvis",
     *(f"{side}_{x}" for x in ("hip", "knee", "ankle", "shoulder", "elbow") for side in ("left", "right")),

@@ -22,7 +22,6 @@ from dyngs.ops.quaternions import unit_quats
 
 HEADS = {"rotation": 4, "scale": 3, "opacity": 1, "height": 1, "colour": 3, "image_weight": 1, "guess": 3}
 """Outputs per texel of a scaffold and their number of channels; see ``dyngs.human.prediction.network``."""
-
 _GROUPS = 8
 
 
@@ -102,13 +101,10 @@ def _upsampled(features: Tensor) -> Tensor:
 
 _MAX_LOG_SCALE = 1.5
 """Limit on the difference of log scales from those of the initial Gaussian."""
-
 _IMAGE_LOGIT = 4.0
 """Logit of the weight of the images' colours in an untrained network, against predicted colours."""
-
 _GUESS_LOGITS = (0.0, 2.0, 0.0)
 """Logits of the fractions of the three ``guessed_colours`` in an untrained network."""
-
 _MAX_HEIGHT = 0.01
 """Limit on the offset along the normal with a single scaffold, m; with several: half their distance."""
 

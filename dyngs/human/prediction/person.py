@@ -29,29 +29,17 @@ from dyngs.human.template.mesh import vertex_normals
 
 @dataclass(frozen=True)
 class CapturedPerson:
-    """A person with images, as input of a prediction.
+    """A person with images, as input of a prediction."""
 
-    Attributes:
-        name: of the capture, for messages.
-        body: the template in the person's shape, without a shape space.
-        normals: (M, 3) unit normals of its vertices.
-        texels: P, of that shape.
-        mirror: (P,) index of the texel at the mirror image of each.
-        heights: (K,) of the scaffolds, m, ascending.
-        gaussians: K P grey discs, ordered by scaffold.
-        subject: skeleton, poses, and the anchors of ``gaussians``.
-        views: with images, in the order of the split ``train``.
-    """
-
-    name: str
-    body: BodyTemplate
-    normals: Tensor
-    texels: Texels
-    mirror: Tensor
-    heights: tuple[float, ...]
-    gaussians: Gaussians
-    subject: Subject
-    views: tuple[View, ...]
+    name: str  # of the capture, for messages
+    body: BodyTemplate  # the template in the person's shape, without a shape space
+    normals: Tensor  # (M, 3) unit normals of its vertices
+    texels: Texels  # P, of that shape
+    mirror: Tensor  # (P,) index of the texel at the mirror image of each
+    heights: tuple[float, ...]  # (K,) of the scaffolds, m, ascending
+    gaussians: Gaussians  # K P grey discs, ordered by scaffold
+    subject: Subject  # skeleton, poses, and the anchors of ``gaussians``
+    views: tuple[View, ...]  # with images, in the order of the split ``train``
 
     def pose_in(self, view: View) -> BodyPose:
         """Return the pose of the person in ``view``."""

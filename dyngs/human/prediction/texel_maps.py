@@ -27,36 +27,26 @@ from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 
 _GRAZING = 0.15
 """Cosine below which a texel does not count as seen."""
-
 HULL_LIMIT = 0.06
 """Largest distance from the edge of a silhouette that is told apart, m."""
-
 _TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
 """Depth tolerance of the visibility test: in m, and in pixels along the surface."""
 
 
 @dataclass(frozen=True)
 class TexelMaps:
-    """Observations in a few images, per texel.
+    """Observations in a few images, per texel."""
 
-    Attributes:
-        rgb: (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel.
-        seen: (K, P) largest cosine between normal and view direction, 0 where a texel is hidden.
-        inside: (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the frame.
-        hull: (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m in the
-            body's size, at most ``HULL_LIMIT`` and at least its negative.
-        offsets: (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the pelvis.
-        nearby: (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby.
-        count: of the views.
-    """
-
-    rgb: Tensor
-    seen: Tensor
-    inside: Tensor
+    rgb: Tensor  # (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel
+    seen: Tensor  # (K, P) largest cosine between normal and view direction, 0 where a texel is hidden
+    inside: Tensor  # (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the frame
+    # (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m in the body's size,
+    # at most ``HULL_LIMIT`` and at least its negative
     hull: Tensor
+    # (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the pelvis
     offsets: Tensor
-    nearby: Tensor
-    count: int
+    nearby: Tensor  # (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby
+    count: int  # of the views
 
 
 @torch.no_grad()

@@ -42,46 +42,31 @@ _TARGET = np.array([0.0, 0.95, 0.0])
 
 @dataclass(frozen=True)
 class Light:
-    """A distant lamp and light from all sides.
+    """A distant lamp and light from all sides."""
 
-    Attributes:
-        towards: (3,) direction to the lamp, of any length.
-        ambient, diffuse: sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp.
-    """
-
-    towards: tuple[float, float, float] = (0.35, 0.75, 0.56)
+    towards: tuple[float, float, float] = (0.35, 0.75, 0.56)  # (3,) direction to the lamp, of any length
+    # and diffuse: sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp
     ambient: tuple[float, ...] = (0.6,)
     diffuse: tuple[float, ...] = (0.45,)
 
 
 @dataclass(frozen=True)
 class HumanOptions:
-    """Options of a synthetic capture of a person.
+    """Options of a synthetic capture of a person."""
 
-    Attributes:
-        size: width and height in pixels.
-        num_frames: frames of the walk, for the splits train and test.
-        num_new: frames of another motion, the split ``pose``; 0: no such split.
-        num_cameras: training cameras, on a ring around the person.
-        num_test: test cameras, each midway between two training cameras; 0: neither test nor ``pose``.
-        seed: of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes.
-        samples: per side of a pixel.
-        body_seed: of the person's body shape; None: the template's own.
-        light_seed: of the direction, strength and tint of the light; None: always the same.
-        clip_seed: of the clips, see ``dyngs.human.synthetic.clips.random_clip``; None: a walk, then a squat.
-        usual_clothes: left mostly as right, back as front and bare hands, instead of clothes that differ everywhere.
-    """
-
-    size: int = 128
-    num_frames: int = 12
-    num_new: int = 6
-    num_cameras: int = 8
-    num_test: int = 2
+    size: int = 128  # width and height in pixels
+    num_frames: int = 12  # frames of the walk, for the splits train and test
+    num_new: int = 6  # frames of another motion, the split ``pose``; 0: no such split
+    num_cameras: int = 8  # training cameras, on a ring around the person
+    num_test: int = 2  # test cameras, each midway between two training cameras; 0: neither test nor ``pose``
+    # of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes
     seed: int = 0
-    samples: int = 2
-    body_seed: int | None = None
-    light_seed: int | None = None
+    samples: int = 2  # per side of a pixel
+    body_seed: int | None = None  # of the person's body shape; None: the template's own
+    light_seed: int | None = None  # of the direction, strength and tint of the light; None: always the same
+    # of the clips, see ``dyngs.human.synthetic.clips.random_clip``; None: a walk, then a squat
     clip_seed: int | None = None
+    # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
     usual_clothes: bool = False
 
 
@@ -92,21 +77,13 @@ def varied(options: HumanOptions, seed: int) -> HumanOptions:
 
 @dataclass(frozen=True)
 class PosedMesh:
-    """A textured mesh in the world; float64, m.
+    """A textured mesh in the world; float64, m."""
 
-    Attributes:
-        vertices: (M, 3) in the world.
-        faces: (T, 3) int64, counter-clockwise from outside.
-        uv: (U, 2) in [0, 1]; row of the texture = (1 - v) * S.
-        uv_faces: (T, 3) int64 into ``uv``.
-        texture: (S, S, 3) sRGB values in [0, 1].
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray
-    uv_faces: np.ndarray
-    texture: np.ndarray
+    vertices: np.ndarray  # (M, 3) in the world
+    faces: np.ndarray  # (T, 3) int64, counter-clockwise from outside
+    uv: np.ndarray  # (U, 2) in [0, 1]; row of the texture = (1 - v) * S
+    uv_faces: np.ndarray  # (T, 3) int64 into ``uv``
+    texture: np.ndarray  # (S, S, 3) sRGB values in [0, 1]
 
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:

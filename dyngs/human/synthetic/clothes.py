@@ -28,35 +28,24 @@ _PARTS = {
     "shoe": ("ankle", "foot"),
 }
 """The joints of each part of the body, without side and number."""
-
 _BELOW_KNEE = -0.36
 """Height at which shorts end in T-pose, m."""
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """Clothes and hair of a person in T-pose, and the person's size.
+    """Clothes and hair of a person in T-pose, and the person's size."""
 
-    Attributes:
-        palette: sRGB values (3,) by name of cloth or part of the body.
-        pitch: width of stripes and checks, relative to 0.05 m.
-        upright: whether the stripes on the front are vertical.
-        long_sleeves, long_legs: whether they reach the hands and shoes.
-        shirt, trousers, hair: largest offset from the skin, m.
-        folds: spatial frequency, radians per metre.
-        size: of the person, relative to the template.
-    """
-
-    palette: dict[str, np.ndarray]
-    pitch: float = 1.0
-    upright: bool = False
-    long_sleeves: bool = False
+    palette: dict[str, np.ndarray]  # sRGB values (3,) by name of cloth or part of the body
+    pitch: float = 1.0  # width of stripes and checks, relative to 0.05 m
+    upright: bool = False  # whether the stripes on the front are vertical
+    long_sleeves: bool = False  # and long_legs: whether they reach the hands and shoes
     long_legs: bool = True
-    shirt: float = 0.0
+    shirt: float = 0.0  # and trousers and hair: largest offset from the skin, m
     trousers: float = 0.0
     hair: float = 0.0
-    folds: float = 20.0
-    size: float = 1.0
+    folds: float = 20.0  # spatial frequency, radians per metre
+    size: float = 1.0  # of the person, relative to the template
 
 
 def random_outfit(seed: int, is_usual: bool = False) -> Outfit:

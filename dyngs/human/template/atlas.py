@@ -21,28 +21,19 @@ _THINNEST = 1e-9
 
 @dataclass(frozen=True)
 class Texels:
-    """Surface attributes at rest of the P covered texels of an atlas, in row-major order of the atlas.
+    """Surface attributes at rest of the P covered texels of an atlas, in row-major order of the atlas."""
 
-    Attributes:
-        resolution: S, texels per side. The centre of row r, column c lies at u = (c + 0.5) / S, v = 1 - (r + 0.5) / S.
-        index: (P,) int64, r * S + c, ascending.
-        faces: (P,) int64 triangle of the template that covers the texel's centre.
-        barycentric: (P, 3) coordinates of the centre in that triangle, in [0, 1], rows sum to 1.
-        points: (P, 3) on the surface at rest, m.
-        frames: (P, 3, 3) rotations; columns are the tangent (along increasing u), the bitangent and the outward normal,
-            smooth over edges. In mirrored parts of an atlas the bitangent points along decreasing v.
-        weights: (P, J) skinning weights, rows sum to 1.
-        size: (P,) side of the texel on the surface, m: sqrt(area of the triangle / its area in the atlas) / S.
-    """
-
+    # S, texels per side. The centre of row r, column c lies at u = (c + 0.5) / S, v = 1 - (r + 0.5) / S.
     resolution: int
-    index: Tensor
-    faces: Tensor
-    barycentric: Tensor
-    points: Tensor
+    index: Tensor  # (P,) int64, r * S + c, ascending
+    faces: Tensor  # (P,) int64 triangle of the template that covers the texel's centre
+    barycentric: Tensor  # (P, 3) coordinates of the centre in that triangle, in [0, 1], rows sum to 1
+    points: Tensor  # (P, 3) on the surface at rest, m
+    # (P, 3, 3) rotations; columns are the tangent (along increasing u), the bitangent and the outward normal, smooth
+    # over edges. In mirrored parts of an atlas the bitangent points along decreasing v.
     frames: Tensor
-    weights: Tensor
-    size: Tensor
+    weights: Tensor  # (P, J) skinning weights, rows sum to 1
+    size: Tensor  # (P,) side of the texel on the surface, m: sqrt(area of the triangle / its area in the atlas) / S
 
     def __len__(self) -> int:
         return len(self.index)
@@ -60,15 +51,10 @@ class Texels:
 
 @dataclass(frozen=True)
 class ScaffoldPoints:
-    """Points above the texels of an atlas, in any order and number: scaffolds for clothing and hair (GHG).
+    """Points above the texels of an atlas, in any order and number: scaffolds for clothing and hair (GHG)."""
 
-    Attributes:
-        texel: (Q,) int64 rows of a ``Texels``.
-        height: (Q,) along the normal, m.
-    """
-
-    texel: Tensor
-    height: Tensor
+    texel: Tensor  # (Q,) int64 rows of a ``Texels``
+    height: Tensor  # (Q,) along the normal, m
 
     def __len__(self) -> int:
         return len(self.texel)

@@ -28,35 +28,22 @@ class BodyTemplate:
     """A body template: rest mesh, shape space, joints and skinning weights.
 
     Metres, y up, facing +z, +x to the person's left; float32 unless converted.
-
-    Attributes:
-        name: the family of the joints: "anny", "smpl", "smplh" or "smplx".
-        vertices: (M, 3) at rest.
-        faces: (T, 3) long, counter-clockwise from outside.
-        uv: (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None.
-        uv_faces: (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with ``uv``.
-        weights: (M, J) skinning weights, rows sum to 1.
-        parents: (J,) parent of each joint, -1 for the root; parents come before their children.
-        joints: (J, 3) at rest, mean shape.
-        shape_dirs: (M, 3, B) metres per unit of the shape parameters, or None.
-        expression_dirs: (M, 3, E) metres per unit of the expression parameters, or None.
-        joint_shape_dirs: (J, 3, B) the same for the joints; None with ``shape_dirs``.
-        joint_expression_dirs: (J, 3, E) the same for the joints; None with ``expression_dirs``.
-        pose_dirs: (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or None.
     """
 
-    name: str
-    vertices: Tensor
-    faces: Tensor
-    uv: Tensor | None
+    name: str  # the family of the joints: "anny", "smpl", "smplh" or "smplx"
+    vertices: Tensor  # (M, 3) at rest
+    faces: Tensor  # (T, 3) long, counter-clockwise from outside
+    uv: Tensor | None  # (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None
+    # (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with ``uv``
     uv_faces: Tensor | None
-    weights: Tensor
-    parents: tuple[int, ...]
-    joints: Tensor
-    shape_dirs: Tensor | None = None
-    expression_dirs: Tensor | None = None
-    joint_shape_dirs: Tensor | None = None
-    joint_expression_dirs: Tensor | None = None
+    weights: Tensor  # (M, J) skinning weights, rows sum to 1
+    parents: tuple[int, ...]  # (J,) parent of each joint, -1 for the root; parents come before their children
+    joints: Tensor  # (J, 3) at rest, mean shape
+    shape_dirs: Tensor | None = None  # (M, 3, B) metres per unit of the shape parameters, or None
+    expression_dirs: Tensor | None = None  # (M, 3, E) metres per unit of the expression parameters, or None
+    joint_shape_dirs: Tensor | None = None  # (J, 3, B) the same for the joints; None with ``shape_dirs``
+    joint_expression_dirs: Tensor | None = None  # (J, 3, E) the same for the joints; None with ``expression_dirs``
+    # (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or None
     pose_dirs: Tensor | None = None
 
     def __post_init__(self) -> None:

@@ -13,17 +13,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Fragments:
-    """The visible triangle of H covered grid points, each point at most once.
+    """The visible triangle of H covered grid points, each point at most once."""
 
-    Attributes:
-        index: (H,) row * width + column.
-        faces: (H,) int64 triangle.
-        barycentric: (H, 3) coordinates on the triangle in space (perspective-correct), rows sum to 1.
-    """
-
-    index: np.ndarray
-    faces: np.ndarray
-    barycentric: np.ndarray
+    index: np.ndarray  # (H,) row * width + column
+    faces: np.ndarray  # (H,) int64 triangle
+    barycentric: np.ndarray  # (H, 3) coordinates on the triangle in space (perspective-correct), rows sum to 1
 
 
 def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
