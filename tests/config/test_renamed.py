@@ -90,7 +90,6 @@ def test_keys_that_are_constants_are_gone(key: str) -> None:
 @pytest.mark.parametrize(
     ("name", "line", "key", "value"),
     [
-        ("human", "lr_poses: 0.001", "model.lr_poses", "0.002"),
         ("dynamic", "lr_decay: 0.2", "model.deform.lr_decay", "0.01"),
         ("static", "eps: 1.0e-15", "optim.eps", "1.0e-8"),
         ("static", "eps: 1.0e-15", "optim.eps", "true"),

@@ -13,7 +13,15 @@ import torch
 from dyngs.config.kinds import person_of
 from dyngs.errors import DyngsError
 from dyngs.export.rigged.body import BodyMesh, anchor_normals, body_mesh, rest_vertices
-from dyngs.export.rigged.skeleton import Animation, Rig, add_animation, add_skeleton, add_weights, animation_of, rig_of
+from dyngs.export.rigged.skeleton import (
+    JointAnimation,
+    Rig,
+    add_animation,
+    add_skeleton,
+    add_weights,
+    animation_of,
+    rig_of,
+)
 from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
 from dyngs.files.gltf import INDICES, VERTICES, GlbDocument
@@ -128,7 +136,7 @@ def texture_size(scene: HumanScene) -> int:
     return min(_FINER * max(round(1 / finest), 1), _LARGEST)
 
 
-def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: Animation | None) -> GlbDocument:
+def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointAnimation | None) -> GlbDocument:
     """Return a mesh with its skeleton, texture and animation as a glTF document."""
     document, nodes = GlbDocument(), list[dict[str, Any]]()
     armature, first = add_skeleton(document, rig, nodes)

@@ -13,10 +13,11 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.nearest_rotation import quats_of
-from dyngs.human.template.atlas import Texels, atlas_texels, scaffold_points
+from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.state import fields_moved_to
@@ -62,31 +63,37 @@ def texel_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) ->
     """Return grey discs on every texel, at all ``heights`` (m) above the surface at rest; nearly opaque at the lowest.
 
     A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by texel.
+
+    Raises:
+        DyngsError: no height, or one that is not finite.
     """
-    scaffolds = scaffold_points(texels, heights)
-    rows = scaffolds.texel
+    levels = texels.points.new_tensor(heights)
+    if levels.numel() == 0 or not bool(levels.isfinite().all()):
+        raise DyngsError(f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}")
+    rows = torch.arange(len(texels), device=levels.device).repeat(len(levels))
+    height = levels.repeat_interleave(len(texels))
     size = texels.size[rows]
     joints, weights = heaviest_joints(texels.weights)
     row, column = (texels.index // texels.resolution, texels.index % texels.resolution)
     uv = torch.stack([column + 0.5, texels.resolution - 0.5 - row], dim=1).to(size) / texels.resolution
     anchors = Anchors(
-        points=scaffolds.points(texels),
+        points=texels.points[rows] + height[:, None] * texels.normals[rows],
         size=size,
         joints=joints[rows],
         weights=weights[rows],
         face=texels.faces[rows],
         barycentric=texels.barycentric[rows],
         uv=uv[rows],
-        height=scaffolds.height,
+        height=height,
     )
     ratios = size.new_tensor([_WIDTH, _WIDTH, _THICKNESS]).log()
-    opacity = torch.where(scaffolds.height == min(heights), _LOWEST_OPACITY, _UPPER_OPACITY)
+    opacity = torch.where(height == min(heights), _LOWEST_OPACITY, _UPPER_OPACITY)
     gaussians = Gaussians(
         means=anchors.points.clone(),
         quats=quats_of(texels.frames)[rows],
         log_scales=size.log()[:, None] + ratios,
         logit_opacities=(opacity / (1 - opacity)).log().to(size),
-        sh=size.new_zeros(len(scaffolds), num_sh_terms(sh_degree), 3),
+        sh=size.new_zeros(len(rows), num_sh_terms(sh_degree), 3),
     )
     return gaussians, anchors
 

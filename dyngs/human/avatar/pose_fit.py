@@ -113,11 +113,7 @@ class FittedPoses:
 
 
 def fitted_to_images(
-    scene: HumanScene,
-    images: ImageLoader,
-    background: Tensor,
-    options: RenderOptions,
-    comparison: Comparison = IMAGES,
+    scene: HumanScene, images: ImageLoader, background: Tensor, options: RenderOptions, comparison: Comparison = IMAGES
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
@@ -145,7 +141,6 @@ def fitted_to_images(
 
 
 def _moments(clip: MotionClip, times: Sequence[float]) -> MotionClip:
-    """Return the clip at ``times``, ascending."""
     parts = [clip.at(time) for time in times]
     poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
     return MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
@@ -164,7 +159,7 @@ class _Fit:
     scene: HumanScene  # the person
     start: MotionClip  # the pose to begin with, a clip of one frame
     time: float  # of the images
-    background: Tensor  # and options: to draw with
+    background: Tensor
     options: RenderOptions
     images: tuple[Image, ...]  # V
     comparison: Comparison  # what of these counts
@@ -229,7 +224,6 @@ class _Fit:
         return torch.stack(losses).mean() + size
 
     def _drawn(self, image: Image, moment: Moment) -> Rendering:
-        """Return the person at ``moment`` as the camera of an image sees it."""
         return self.scene.render(image.cameras, moment, options=self.options, background=self.background)
 
 

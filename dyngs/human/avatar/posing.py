@@ -78,9 +78,10 @@ class Skeleton:
 
 @dataclass(frozen=True)
 class PoseBlendShapes:
-    """SMPL's pose blend shapes: offsets of a template's vertices at rest that depend on the pose (Loper et al. 2015)."""
+    """SMPL's pose blend shapes: pose-dependent offsets of a template's vertices at rest (Loper et al. 2015)."""
 
-    directions: Tensor  # m per unit of the rotations minus the identity, without the root: (9 (J - 1), 3 M)
+    # m per unit of the rotations minus the identity, without the root, as 9 (J - 1) rows of 3 M numbers
+    directions: Tensor
     faces: Tensor  # (T, 3) int64 vertices of the triangles
 
     def to(self, *, device: torch.device | str) -> PoseBlendShapes:

@@ -171,7 +171,6 @@ class HumanTraining:
         return scene.in_frame(row, self._given_weights)
 
     def _images_in(self, scene: HumanScene) -> tuple[Tensor, Tensor]:
-        """Return the mirror images of the Gaussians, see ``mirror_images``."""
         if self._images is None:
             self._images = mirror_images(scene.anchors, float(scene.skeleton.joints[0, 0]))
         return self._images

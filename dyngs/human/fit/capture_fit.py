@@ -78,7 +78,7 @@ NOTHING_KNOWN = Known()
 
 
 @dataclass(frozen=True)
-class Candidate:
+class TriedFit:
     """One way to fit."""
 
     name: str  # for people
@@ -93,10 +93,9 @@ class CaptureFit:
 
     fit: BodyFit  # of the clip
     motion: CapturedMotion  # the given clip, F frames
-    chosen: Candidate  # the candidate that was taken
-    tried: tuple[Candidate, ...]  # all candidates; the first one has the poses as given
+    chosen: TriedFit  # the candidate that was taken
+    tried: tuple[TriedFit, ...]  # all candidates; the first one has the poses as given
     held_out: int  # views left out of the fit, on which the candidates were measured; 0: measured on those fitted to
-    from_silhouettes: bool  # no poses were given
     lens: LensFit | None = None  # the focal length of one fixed camera that was guessed; None where cameras are known
 
 
@@ -169,10 +168,10 @@ def fit_capture(
             tried = (*tried, measured("the focal length refined", refined, fitting, seen))
     first_gain = 0.0 if not given else GAIN if known.shape else GAIN_OF_SHAPE
     chosen = tried[-1] if lens is not None and lens.taken else simplest_of_the_best(tried, first_gain)
-    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given, lens)
+    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, lens)
 
 
-def simplest_of_the_best(tried: Sequence[Candidate], first_gain: float = GAIN_OF_SHAPE) -> Candidate:
+def simplest_of_the_best(tried: Sequence[TriedFit], first_gain: float = GAIN_OF_SHAPE) -> TriedFit:
     """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to complex.
 
     ``first_gain`` is the gain of IoU for which the first one is left: given poses are touched for much only.
@@ -256,7 +255,7 @@ def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], po
 
 def _from_given(
     fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
-) -> tuple[Candidate, ...]:
+) -> tuple[TriedFit, ...]:
     """Return the poses as given, with a fitted shape, and with fitted poses."""
     start = new_fit(fitting.clip, fitting.surface)
     tick, full = ticker("shape", report, 4 * effort.steps), seen.used.__getitem__
@@ -277,7 +276,7 @@ def _from_given(
 
 def _from_silhouettes(
     fitting: Fitting, seen: Seen, shape: tuple[str, ...], report: ReportProgress, effort: FitEffort
-) -> tuple[Candidate, ...]:
+) -> tuple[TriedFit, ...]:
     """Return the poses as they were found first, and shape and poses fitted together."""
     start, steps = new_fit(fitting.clip, fitting.surface), effort.steps_for(fitting.clip)
     tick, found = ticker("shape", report, 2 * steps), start
@@ -300,7 +299,7 @@ def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
 
 
 @torch.no_grad()
-def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> Candidate:
+def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> TriedFit:
     """Return the candidate with its IoU in the frames that judge."""
     found = []
     for row, frame in seen.judged.items():
@@ -310,7 +309,7 @@ def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> Ca
         else:
             found.append(torch.zeros(0, device="cpu"))
     per_frame = tuple(float(x.mean()) if len(x) else float("nan") for x in found)
-    return Candidate(name, learned, float(torch.cat(found).mean()), per_frame)
+    return TriedFit(name, learned, float(torch.cat(found).mean()), per_frame)
 
 
 def _iou(drawn: Tensor, seen: ObservedFrame) -> Tensor:

@@ -35,7 +35,6 @@ from dyngs.human.fit.clips import FittedClip, NewClip, fitted_clips, placed_clip
 from dyngs.human.fit.inputs import (
     NOTHING_ELSE,
     FitInputs,
-    KnownAvatar,
     has_guessed_lens,
     joints_of,
     read_person,
@@ -44,7 +43,6 @@ from dyngs.human.fit.inputs import (
 from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
 from dyngs.human.fit.surface import Surface, drawn_silhouettes, surface_of
-from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
@@ -54,17 +52,13 @@ FRAME_RATE = 30.0
 
 
 def write_body(
-    path: Path,
-    clip: MotionClip,
-    betas: np.ndarray,
-    world_offset: np.ndarray,
-    frames: Sequence[int],
-    fps: float | None = None,
+    path: Path, found: FittedClip, betas: np.ndarray, world_offset: np.ndarray, fps: float | None = None
 ) -> None:
-    """Write the body parameters of a clip, also readable as a motion: one row for each of the numbers ``frames``.
+    """Write the body parameters of a clip, also readable as a motion: rows are named by their frame numbers.
 
     ``betas`` (B,) are of the free template's shape space; ``fps`` frames per second, None where nobody knows.
     """
+    clip = found.clip
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
@@ -75,17 +69,13 @@ def write_body(
             surface_model_type="anny",
             gender="neutral",
             up_axis="y",
-            frames=np.asarray(frames, dtype=np.int64),
+            frames=np.asarray(found.frames, dtype=np.int64),
             mocap_frame_rate=np.float64(FRAME_RATE if fps is None else fps),
         )
 
 
 def write_split(
-    out: Path,
-    split: Split,
-    shown: Iterator[tuple[View, Image]],
-    rows: Mapping[int, int],
-    world_offset: np.ndarray,
+    out: Path, split: Split, shown: Iterator[tuple[View, Image]], rows: Mapping[int, int], world_offset: np.ndarray
 ) -> None:
     """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
 
@@ -108,7 +98,6 @@ def write_split(
 
 
 def _straight(image: Image) -> np.ndarray:
-    """Return straight colours, with alpha if there is one, (H, W, 3 or 4) uint8."""
     parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
     return straight_uint8(torch.cat(parts, dim=-1)).numpy()
 
@@ -181,28 +170,22 @@ class FittedCapture:
 
 
 def write_fitted_capture(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE
+    options: DataConfig,
+    out: Path,
+    report: ReportProgress,
+    given: FitInputs = NOTHING_ELSE,
+    *,
+    with_images: bool = True,
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
-    Files: ``transforms_SPLIT.json``, ``images/``, ``body_train.npz``, ``body_pose.npz`` for another clip whose poses
-    were given by the same means, ``fit_report.json``, and ``fit_overlays.png`` to look at. ``given`` is what is
-    known beside the capture, which may be a plain clip as well: see ``read_person``.
+    Files: ``transforms_SPLIT.json`` and ``images/`` (without both it is for ``data.body``), ``body_train.npz``,
+    ``body_pose.npz`` for another clip whose poses were given by the same means, ``fit_report.json``, and
+    ``fit_overlays.png`` to look at. ``given`` is what is known beside the capture, see ``read_person``.
 
     Raises:
         DyngsError: see ``fit_capture``; ``out`` is not empty.
     """
-    return _fitted(options, out, report, given, with_images=True)
-
-
-def write_fit(options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE) -> FittedCapture:
-    """As ``write_fitted_capture``, but without images and cameras: for ``data.body``."""
-    return _fitted(options, out, report, given, with_images=False)
-
-
-def _fitted(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs, *, with_images: bool
-) -> FittedCapture:
     require_new_folder(out)
     person = None if given.person is None else known_shape(given.person)
     body, folder = default_template(), temporary_folder_beside(out)
@@ -219,41 +202,26 @@ def _fitted(
         capture = with_lens(capture, found.lens)
         new_poses = placed_clip(capture, options, shaped, found, report)
         clips = fitted_clips(capture, shaped, found, new_poses)
-        by_avatar = () if given.avatar is None else _posed(given.avatar, capture, options, clips)
+        by_avatar: list[AvatarPoses] = []
+        for split, clip in clips.items() if given.avatar is not None else ():
+            by_avatar.append(posed_by_avatar(given.avatar, capture.splits[split], options, clip))
+            clips[split] = by_avatar[-1].clip
         if with_images:
             _write_images(folder, capture, options, clips)
             for split, clip in clips.items():
                 clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
-        _write_bodies(folder, capture, clips, found.fit.betas)
+        for split, clip in clips.items():
+            write_body(folder / f"body_{split}.npz", clip, found.fit.betas.numpy(), capture.world_offset, capture.fps)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
         write_text(folder / REPORT_NAME, json.dumps(_report(found, new_poses, by_avatar), indent=1) + "\n")
         shutil.rmtree(masks, ignore_errors=True)
         folder.replace(out)  # also where ``out`` is an empty folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return FittedCapture(out, found, new_poses, by_avatar)
-
-
-def _posed(
-    avatar: KnownAvatar, capture: Capture, options: DataConfig, clips: dict[Split, FittedClip]
-) -> tuple[AvatarPoses, ...]:
-    """Give the clips the poses in which the avatar has their silhouettes; return what came out, clip by clip."""
-    found: list[AvatarPoses] = []
-    for split, clip in clips.items():
-        found.append(posed_by_avatar(avatar, capture.splits[split], options, clip))
-        clips[split] = found[-1].clip
-    return tuple(found)
-
-
-def _write_bodies(out: Path, capture: Capture, clips: Mapping[Split, FittedClip], betas: Tensor) -> None:
-    """Write the clips, rows named by their frame numbers."""
-    for split, found in clips.items():
-        path = out / f"body_{split}.npz"
-        write_body(path, found.clip, betas.numpy(), capture.world_offset, found.frames, capture.fps)
+    return FittedCapture(out, found, new_poses, tuple(by_avatar))
 
 
 def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, FittedClip]) -> None:
-    """Write the images and cameras of all splits."""
     full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
     for split, views in capture.splits.items():
         if views:
@@ -276,8 +244,7 @@ def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: 
     return side_by_side(sheets, _COLUMNS)
 
 
-def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: tuple[AvatarPoses, ...]) -> dict[str, object]:
-    """Return the report as JSON values."""
+def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[AvatarPoses]) -> dict[str, object]:
     fit, chosen = found.fit, found.chosen
     turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
     lens: dict[str, object] = {} if found.lens is None else {"lens": {**vars(found.lens)}}
@@ -341,7 +308,8 @@ def with_fitted_body(
     else:
         say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder}")
         points = data.root / KEYPOINTS
-        say(write_fit(data, folder, report, FitInputs(points if points.is_dir() else None)).summary())
+        given = FitInputs(points if points.is_dir() else None)
+        say(write_fitted_capture(data, folder, report, given, with_images=False).summary())
     return data.model_copy(update={"body": folder})
 
 

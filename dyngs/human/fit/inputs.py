@@ -101,11 +101,7 @@ def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
 
 
 def _with_masks(capture: Capture, masks: Path) -> Capture:
-    """Return the capture with the masks of a folder as silhouettes.
-
-    Raises:
-        DyngsError: an image without one.
-    """
+    """Return the capture with the masks of a folder as silhouettes."""
     splits = {}
     for split, views in capture.splits.items():
         found = silhouettes_of(masks, [f"{view.name}{view.image_path.suffix}" for view in views])
@@ -114,11 +110,7 @@ def _with_masks(capture: Capture, masks: Path) -> Capture:
 
 
 def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[str], None]) -> Capture:
-    """Return the clip without the frames in which nobody is seen.
-
-    Raises:
-        DyngsError: nobody is seen in any.
-    """
+    """Return the clip without the frames in which nobody is seen."""
     views = capture.splits["train"]
     small = ImageLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
     areas = []
@@ -136,6 +128,5 @@ def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[
 
 
 def _first(views: tuple[View, ...], kept: tuple[View, ...]) -> str:
-    """Return the name of the first view that was left out."""
     names = {view.name for view in kept}
     return next(view.name for view in views if view.name not in names)

@@ -192,11 +192,7 @@ def _key(name: str) -> int | str:
 
 
 def _joints_of(where: str, value: object) -> np.ndarray:
-    """Return (K, 4) joints with confidence; where a joint holds what is not finite, 0.
-
-    Raises:
-        DyngsError: no numbers, or another shape.
-    """
+    """Return (K, 4) joints with confidence; where a joint holds what is not finite, 0."""
     array = float_array(value)
     if array is None or array.ndim != 2 or array.shape[1] not in (3, 4):
         raise DyngsError(f"{where}: joints must be lists of 3 or 4 numbers; export it again")
@@ -208,11 +204,7 @@ def _joints_of(where: str, value: object) -> np.ndarray:
 
 
 def _checked(path: Path, joints: Mapping[int | str, np.ndarray], order: object, space: object) -> _Found:
-    """Return what was found.
-
-    Raises:
-        DyngsError: an unknown order or space, or another number of joints than the order has.
-    """
+    """Return what was found."""
     count = len(next(iter(joints.values())))
     by_count = {len(names): name for name, names in ORDERS.items()}
     wanted = by_count.get(count, "") if order is None else str(order)
@@ -234,11 +226,7 @@ def _checked(path: Path, joints: Mapping[int | str, np.ndarray], order: object, 
 
 
 def _by_frame(path: Path, found: _Found, views: Sequence[View]) -> dict[int, tuple[np.ndarray, View]]:
-    """Return frame number to joints and the view that they are for.
-
-    Raises:
-        DyngsError: joints of a camera that cannot be told.
-    """
+    """Return frame number to joints and the view that they are for."""
     stems, named = by_stem(views), {view.name: view for view in views}
     first: dict[int, View] = {}
     for view in views:

@@ -157,11 +157,7 @@ def _coco(file: Path, stems: Mapping[str, str]) -> dict[str, np.ndarray]:
 
 
 def _points(file: Path, key: str, value: object) -> np.ndarray:
-    """Return (K, 3) numbers of a list of column, row, confidence.
-
-    Raises:
-        DyngsError: another number of points than a known format has.
-    """
+    """Return (K, 3) numbers of a list of column, row, confidence."""
     points = numbers_of(f"{file}: '{key}'", value, None).reshape(-1)
     if len(points) % 3 or len(points) // 3 not in _ORDERS:
         known = ", ".join(map(str, sorted(_ORDERS)))

@@ -77,7 +77,7 @@ class AvatarPoses:
     """Poses that an avatar found."""
 
     clip: FittedClip  # of all frames; as it was where ``taken`` is false
-    before: float  # and after: overlap of silhouettes (IoU) at some moments, of the avatar in both
+    before: float  # overlap of silhouettes (IoU) at some time steps, of the avatar
     after: float
     left_out: int  # number of views, which were left out of the fit, that this was measured on; 0: on those fitted to
 
@@ -126,7 +126,6 @@ def _in_size(avatar: HumanScene, clip: MotionClip) -> MotionClip:
 
 
 def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:
-    """Return the person in the poses that have the silhouettes of ``images``."""
     nothing = player.gaussians.means.new_zeros(3)
     return fitted_to_images(player, images, nothing, player.options, SILHOUETTES).scene
 

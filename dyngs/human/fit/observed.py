@@ -91,7 +91,6 @@ def _square(
 
 
 def _cut(values: Tensor, top: int, left: int, side: int) -> Tensor:
-    """Return the square (side, side) of values (H, W), 0 outside."""
     height, width = values.shape
     square = values.new_zeros(side, side)
     rows = slice(max(top, 0), min(top + side, height))

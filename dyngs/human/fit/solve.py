@@ -319,7 +319,6 @@ class BodyFit:
         return self._moved(corrected_clip(self.shared, clip))
 
     def _moved(self, turned: MotionClip) -> MotionClip:
-        """Return the turned clip at its place."""
         roots = axis_angle_to_matrix(turned.poses[:, 0])
         away = self.shift + turned.scale[:, None] * (roots @ self.offset[:, None])[..., 0]
         return replace(turned, trans=turned.trans + away)

@@ -15,12 +15,7 @@ from dyngs.data.capture import ShapeSpace
 from dyngs.errors import DyngsError, reading
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.write import atomic_file
-from dyngs.human.motion.motion import (
-    Motion,
-    UpAxis,
-    require_frame_count,
-    require_frame_rate,
-)
+from dyngs.human.motion.motion import Motion, UpAxis, require_frame_count, require_frame_rate
 from dyngs.human.motion.placement import place_on_floor
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import SMPLX_ROWS
@@ -89,7 +84,6 @@ def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") ->
 
 
 def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis) -> Motion:
-    """Return the motion of the arrays, y up, fitted to ``body``."""
     poses, width = _poses(path, arrays)
     frames = len(poses)
     trans = _numbers(path, arrays, "trans")
@@ -165,7 +159,6 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
 
 
 def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Return poses (F, 165) joined from the parts of the body."""
     missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
     if missing:
         raise DyngsError(
@@ -196,7 +189,6 @@ def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
-    """Return the frames per second."""
     key = next((key for key in _RATES if key in arrays), "fps" if _ANY_AXES in arrays else _RATES[1])
     rate = _numbers(path, arrays, key)
     if rate.size != 1 or not rate.item() > 0:
@@ -255,5 +247,4 @@ def _pelvis(body: BodyTemplate, betas: np.ndarray) -> np.ndarray:
 
 
 def _got(value: np.ndarray) -> str:
-    """Return the shape in words."""
     return f"has {' x '.join(map(str, value.shape)) or 'one number'}"

@@ -136,7 +136,6 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
 
 
 def _offset(path: Path, name: str, words: list[str]) -> np.ndarray:
-    """Return the offset (3,) of a joint."""
     offset = _numbers(path, words)
     if len(offset) != 3:
         raise DyngsError(f"{path}: the OFFSET of '{name}' must be three numbers; export it again")

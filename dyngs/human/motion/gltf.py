@@ -106,7 +106,6 @@ def _skin(file: GltfFile) -> _Rig | None:
 
 
 def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
-    """Return the nodes that an animation turns or moves, and all below them."""
     nodes = file.document.nodes
     channels = _chosen(file, dict.fromkeys(range(len(nodes))), clip).channels
     moved = {c.target.node for c in channels if c.target.path in _KINDS and c.target.node is not None}
@@ -190,12 +189,10 @@ def _chosen(file: GltfFile, chain: dict[int, int | None], clip: str | None) -> A
 
 
 def _moving(file: GltfFile, chain: dict[int, int | None]) -> list[Animation]:
-    """Return the animations that move a node of the chain."""
     return [a for a in file.document.animations if any(c.target.node in chain for c in a.channels)]
 
 
 def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) -> dict[tuple[int, str], _Curve]:
-    """Return the animation curves of the nodes of the chain, by node and property."""
     curves: dict[tuple[int, str], _Curve] = {}
     for channel in animation.channels:
         node, kind = channel.target.node, channel.target.path
@@ -218,7 +215,6 @@ def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) 
 
 
 def _finite(file: GltfFile, index: int, kind: str) -> np.ndarray:
-    """Return the finite numbers (K, D) of an accessor."""
     values = file.numbers(index, kind)
     if not (np.abs(values) < 1e9).all():
         raise file.error(f"accessor {index} holds NaN or huge numbers; export it again")
@@ -284,11 +280,7 @@ def _sampled(file: GltfFile, curve: _Curve, times: np.ndarray) -> np.ndarray:
 
 
 def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
-    """Return the rotations of quaternions (F, 4) xyzw of any length.
-
-    Raises:
-        DyngsError: one of them is zero.
-    """
+    """Return the rotations of quaternions (F, 4) xyzw of any length."""
     largest = np.abs(quats).max(axis=1, keepdims=True)
     if (largest == 0).any():
         raise file.error("a rotation is a quaternion of zeros; export it again")

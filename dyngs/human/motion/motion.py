@@ -70,7 +70,6 @@ class Motion:
         return concatenated([self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))])
 
     def _interpolated(self, times: np.ndarray, fps: float) -> Motion:
-        """Return the motion at ``times`` (F,), in units of its frames."""
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
         after = np.minimum(before + 1, len(self) - 1)
         fraction = torch.from_numpy(times - before).to(self.trans)

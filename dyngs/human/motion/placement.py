@@ -86,7 +86,6 @@ def _least_rotation(start: Tensor, end: Tensor) -> Tensor:
 
 
 def _axis_angle(rotations: Tensor) -> Tensor:
-    """Return the axis-angle vectors (F, 3) of rotations (F, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     return torch.from_numpy(Rotation.from_matrix(rotations.double().cpu().numpy()).as_rotvec()).to(rotations)

@@ -29,7 +29,7 @@ _OURS = (
 
 
 @dataclass(frozen=True)
-class Rig:
+class RigNames:
     """The joint names of one kind of skeleton, in lower case and without punctuation."""
 
     name: str  # of the program or data set
@@ -48,69 +48,69 @@ class Rig:
 
 _MIXAMO_LIMBS = "*shoulder *arm *forearm *hand *upleg *leg *foot *toebase|*toe"
 RIGS = (
-    Rig(
+    RigNames(
         "SMPL-X",
         ("left", "right"),
         "pelvis spine1 spine2 spine3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle *foot "
         "*index# *middle# *pinky# *ring# *thumb# jaw *eye|*eyesmplhf",
     ),
-    Rig(
+    RigNames(
         "SMPL",
         ("l", "r"),
         "pelvis spine1 spine2 spine3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle *foot|*toe",
     ),
-    Rig(
+    RigNames(
         "Mixamo",
         ("left", "right"),
         f"hips spine spine1 spine4|spine3|spine2 neck head {_MIXAMO_LIMBS} "
         "*handindex# *handmiddle# *handpinky# *handring# *handthumb#",
     ),
-    Rig(
+    RigNames(
         "VRM",
         ("left", "right"),
         "hips spine chest upperchest neck head *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot *toes "
         "*index# *middle# *little# *ring# *thumb# jaw *eye",
         ("proximal", "intermediate", "distal"),
     ),
-    Rig(
+    RigNames(
         "VRoid",
         ("l", "r"),
         "chips cspine cchest cupperchest cneck chead *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot "
         "*toebase *index# *middle# *little# *ring# *thumb#",
     ),
-    Rig("CMU", ("left", "right"), f"hips lowerback spine spine1 neck head {_MIXAMO_LIMBS}"),
-    Rig(
+    RigNames("CMU", ("left", "right"), f"hips lowerback spine spine1 neck head {_MIXAMO_LIMBS}"),
+    RigNames(
         "Poser",
         ("left", "right"),
         "hips chest chest2 chest4|chest3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle *toe",
     ),
-    Rig(
+    RigNames(
         "DAZ",
         ("l", "r"),
         "hip abdomen chest - neck head *collar *shldr *forearm *hand *thigh *shin *foot *toe "
         "*index# *mid# *pinky# *ring# *thumb#",
     ),
-    Rig(
+    RigNames(
         "Biped",
         ("l", "r"),
         "pelvis spine spine1 spine2 neck head *clavicle *upperarm *forearm *hand *thigh *calf *foot *toe0 "
         "*finger1# *finger2# *finger4# *finger3# *finger0#",
         ("", "1", "2"),
     ),
-    Rig(
+    RigNames(
         "Unreal",
         ("l", "r"),
         "pelvis spine01 spine02 spine05|spine04|spine03 neck01 head "
         "clavicle* upperarm* lowerarm* hand* thigh* calf* foot* ball* index#* middle#* pinky#* ring#* thumb#*",
         ("01", "02", "03"),
     ),
-    Rig(
+    RigNames(
         "MakeHuman",
         ("l", "r"),
         "hips spine1 spine2 spine3 neck head clavicle* uparm* loarm* hand* upleg* loleg* foot* toe* "
         "index#* middle#* pinky#* ring#* thumb#*",
     ),
-    Rig(
+    RigNames(
         "Anny",
         ("l", "r"),
         "root spine04 spine03 spine02 neck01 head "

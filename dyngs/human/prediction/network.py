@@ -56,7 +56,6 @@ class AtlasNetwork(nn.Module):
         nn.init.zeros_(self.heads.weight)
 
     def _make_layers(self, channels: int, scaffolds: int, widths: Sequence[int]) -> None:
-        """Make the layers of the way down and up, and of the heads."""
         self.down = nn.ModuleList(
             nn.Sequential(nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1), _Block(width))
             for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
@@ -95,7 +94,6 @@ class _Block(nn.Module):
 
 
 def _upsampled(features: Tensor) -> Tensor:
-    """Return the features at twice the resolution, bilinear."""
     return nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
 
 

@@ -41,11 +41,11 @@ _TARGET = np.array([0.0, 0.95, 0.0])
 
 
 @dataclass(frozen=True)
-class Light:
+class Lamp:
     """A distant lamp and light from all sides."""
 
     towards: tuple[float, float, float] = (0.35, 0.75, 0.56)  # (3,) direction to the lamp, of any length
-    # and diffuse: sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp
+    # sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp
     ambient: tuple[float, ...] = (0.6,)
     diffuse: tuple[float, ...] = (0.45,)
 
@@ -130,18 +130,18 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
     return replace(body, vertices=vertices, joints=joints), betas
 
 
-def random_light(seed: int | None) -> Light:
+def random_light(seed: int | None) -> Lamp:
     """Return the light of ``seed``, from any side and above, of which three quarters to all reach a white surface that
-    faces it; None: ``Light()``."""
+    faces it; None: ``Lamp()``."""
     if seed is None:
-        return Light()
+        return Lamp()
     make = np.random.default_rng([seed, 3])
     azimuth, height = make.uniform(-np.pi, np.pi), make.uniform(0.0, 1.2)
     diffuse = make.uniform(0.2, 0.6)
     ambient = make.uniform(0.75, 1.05) - diffuse
     tint = 1.0 + make.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
     red, green, blue = (float(diffuse * part) for part in tint)
-    return Light((float(np.sin(azimuth)), float(height), float(np.cos(azimuth))), (float(ambient),), (red, green, blue))
+    return Lamp((float(np.sin(azimuth)), float(height), float(np.cos(azimuth))), (float(ambient),), (red, green, blue))
 
 
 def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> Motion:
@@ -152,7 +152,7 @@ def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> 
 
 
 def render_mesh(
-    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Light = Light()
+    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Lamp = Lamp()
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
@@ -230,12 +230,10 @@ def _look_at_target(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
 
 
 def _focal(size: int) -> float:
-    """Return the focal length in pixels."""
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments, light: Light) -> np.ndarray:
-    """Return the sRGB values (H, 3) of the fragments."""
+def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments, light: Lamp) -> np.ndarray:
     uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
     normal = normalized(interpolate(fragments.barycentric, normals[mesh.faces[fragments.faces]]))
     facing = np.maximum(normal @ normalized(np.array(light.towards)), 0.0)

@@ -68,7 +68,6 @@ def _walk(time: np.ndarray, extent: float, heading: float) -> _Rotations:
 
 
 def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
-    """Return the rotations of a squat, as ``_walk``."""
     depth = extent * (0.5 - 0.5 * np.cos(np.pi * time))
     rotations = {"spine1": _axis_angle(x=0.35 * depth), "head": _axis_angle(x=-0.3 * depth, z=0.2 * depth)}
     if heading:
@@ -85,7 +84,6 @@ def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
 
 
 def _dance(time: np.ndarray, make: np.random.Generator, heading: float) -> _Rotations:
-    """Return the rotations of a clip through random poses, as ``_walk``."""
 
     def between(low: float, high: float) -> np.ndarray:
         knots = make.uniform(low, high, _KEY_POSES)

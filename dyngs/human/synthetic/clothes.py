@@ -39,9 +39,9 @@ class Outfit:
     palette: dict[str, np.ndarray]  # sRGB values (3,) by name of cloth or part of the body
     pitch: float = 1.0  # width of stripes and checks, relative to 0.05 m
     upright: bool = False  # whether the stripes on the front are vertical
-    long_sleeves: bool = False  # and long_legs: whether they reach the hands and shoes
+    long_sleeves: bool = False  # whether sleeves and legs reach the hands and shoes
     long_legs: bool = True
-    shirt: float = 0.0  # and trousers and hair: largest offset from the skin, m
+    shirt: float = 0.0  # of these the largest offset from the skin, m
     trousers: float = 0.0
     hair: float = 0.0
     folds: float = 20.0  # spatial frequency, radians per metre
@@ -123,7 +123,6 @@ def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.n
 
 
 def _left_eye(body: BodyTemplate) -> np.ndarray:
-    """Return the left eye (3,), m."""
     return body.joints[JOINT_NAMES.index("left_eye")].double().cpu().numpy()
 
 
@@ -149,7 +148,6 @@ def _cloth_offsets(vertices: np.ndarray, part_weights: np.ndarray, eye: np.ndarr
 
 
 def _smoothstep(x: np.ndarray) -> np.ndarray:
-    """Return the smoothstep of x: from 0 at 0 to 1 at 1."""
     x = x.clip(0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 

@@ -1,11 +1,10 @@
-"""Texels of a body template's texture atlas as points of its surface, and scaffolds of points above it.
+"""Texels of a body template's texture atlas as points of its surface.
 
-Local letters: T triangles, U vertices of the atlas, P texels, Q points of scaffolds.
+Local letters: T triangles, U vertices of the atlas, P texels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -49,25 +48,6 @@ class Texels:
         return self.frames[..., 2]
 
 
-@dataclass(frozen=True)
-class ScaffoldPoints:
-    """Points above the texels of an atlas, in any order and number: scaffolds for clothing and hair (GHG)."""
-
-    texel: Tensor  # (Q,) int64 rows of a ``Texels``
-    height: Tensor  # (Q,) along the normal, m
-
-    def __len__(self) -> int:
-        return len(self.texel)
-
-    def select(self, index: Tensor) -> ScaffoldPoints:
-        """Return the points at ``index`` (long or bool)."""
-        return ScaffoldPoints(self.texel[index], self.height[index])
-
-    def points(self, texels: Texels) -> Tensor:
-        """Return the points (Q, 3) at rest, m: x + height * normal for the surface points x of ``texels``."""
-        return texels.points[self.texel] + self.height[:, None] * texels.normals[self.texel]
-
-
 def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = None) -> Texels:
     """Return the texels whose centres the atlas of ``body`` covers; of overlapping triangles the first one wins.
 
@@ -106,19 +86,6 @@ def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = 
         weights=_interpolated(barycentric.to(body.weights), around, body.weights.detach()),
         size=((area / area_uv)[faces].sqrt() / resolution).to(dtype),
     )
-
-
-def scaffold_points(texels: Texels, heights: Sequence[float]) -> ScaffoldPoints:
-    """Return points at all ``heights`` (m, along the normal) above all texels, one height after the other.
-
-    Raises:
-        DyngsError: no height, or one that is not finite.
-    """
-    levels = texels.points.new_tensor(heights)
-    if levels.numel() == 0 or not bool(levels.isfinite().all()):
-        raise DyngsError(f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}")
-    rows = torch.arange(len(texels), device=levels.device)
-    return ScaffoldPoints(rows.repeat(len(levels)), levels.repeat_interleave(len(texels)))
 
 
 def _rasterized(corners_uv: Tensor, usable: Tensor, resolution: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -223,7 +223,6 @@ def _smpl_skin(arrays: _Arrays, vertices: np.ndarray, joints: int) -> tuple[np.n
 
 
 def _with_blend_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
-    """Return the template with the blend shapes of shape, expression and pose."""
     m, j = body.weights.shape
     directions = arrays.floats("shapedirs", (m, 3, None))
     pose_dirs = arrays.floats("posedirs", (m, 3, 9 * (j - 1)))
@@ -260,7 +259,6 @@ def _num_shapes(joints: int, directions: int) -> int:
 
 
 def _float(values: np.ndarray) -> Tensor:
-    """Return the values as a float32 tensor."""
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
@@ -307,7 +305,6 @@ def _parents(arrays: _Arrays) -> tuple[int, ...]:
 
 
 def _own_uv(arrays: _Arrays, triangles: int) -> TextureCoordinates | None:
-    """Return the texture coordinates of the body file itself; None without."""
     given = [key for key in _UV if key in arrays.values]
     if not given:
         return None
@@ -319,7 +316,6 @@ def _own_uv(arrays: _Arrays, triangles: int) -> TextureCoordinates | None:
 
 
 def _wanted(path: Path, present: Collection[object]) -> list[str]:
-    """Return the keys to read, of those ``present``."""
     needed = _TEMPLATE if "weights_idx" in present else _SMPL
     missing = [f"'{key}'" for key in needed if key not in present]
     if missing:
@@ -329,7 +325,6 @@ def _wanted(path: Path, present: Collection[object]) -> list[str]:
 
 
 def _read_pickle(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a pickle under the keys that are needed."""
     loaded = read_pickle(path)
     if not isinstance(loaded, dict):
         raise DyngsError(f"{path}: does not hold a dictionary; give a body file of SMPL, SMPL-H or SMPL-X")

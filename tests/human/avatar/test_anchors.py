@@ -5,6 +5,7 @@ N Gaussians, J joints.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import pytest
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import (
     FINER,
@@ -127,3 +129,21 @@ def test_a_pixel_is_as_large_on_the_person_as_the_camera_is_far() -> None:
     camera = Cameras(pose[None], torch.tensor([[[400.0, 0, 50], [0, 400.0, 50], [0, 0, 1]]]), 100, 100)
     assert pixel_size([camera], clip, torch.zeros(3)) == pytest.approx(8.0 / 400 / 2)
     assert pixel_size([], clip, torch.zeros(3)) == torch.inf
+
+
+def test_scaffolds_are_displaced_by_exactly_their_height() -> None:
+    body, heights = default_template(), (0.0, 0.01, 0.04)
+    texels = atlas_texels(body, 64, body.vertices)
+    _, anchors = texel_gaussians(texels, heights, 0)
+    for k, height in enumerate(heights):
+        rows = slice(k * len(texels), (k + 1) * len(texels))
+        assert anchors.height[rows].tolist() == pytest.approx([height] * len(texels))
+        apart = (anchors.points[rows] - texels.points).double()
+        torch.testing.assert_close(apart, height * texels.normals.double(), rtol=0, atol=2e-7)
+    assert torch.equal(anchors.points[: len(texels)], texels.points)
+
+
+@pytest.mark.parametrize("heights", [(), (0.0, math.nan), (math.inf,)])
+def test_heights_are_numbers(heights: tuple[float, ...]) -> None:
+    with pytest.raises(DyngsError, match="one or more finite numbers"):
+        texel_gaussians(atlas_texels(default_template(), 8), heights, 0)

@@ -115,7 +115,7 @@ def test_without_given_poses_every_frame_has_its_own(
     monkeypatch.setattr(start, "ARMS", ())
     capture, effort = wrong[1].replace(body=None), FitEffort(side=32, steps=1, visits=0)
     fit = fit_capture(capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort)
-    assert fit.from_silhouettes
+    assert fit.tried[0].name == "poses found frame by frame"
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.fit.fitted(fit.motion.clip).poses
     assert len({tuple(pose.flatten().tolist()) for pose in poses}) == 4

@@ -12,7 +12,7 @@ import torch
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.human.fit.capture_fit import RESOLUTION, Candidate, CaptureFit, FitEffort
+from dyngs.human.fit.capture_fit import RESOLUTION, CaptureFit, FitEffort, TriedFit
 from dyngs.human.fit.clips import fitted_clips, placed_clip
 from dyngs.human.fit.solve import body_fit, new_fit
 from dyngs.human.fit.surface import surface_of
@@ -36,8 +36,8 @@ def as_given(capture: Capture) -> CaptureFit:
     assert capture.body is not None
     motion = captured_motion(capture.root, capture.body["train"], capture.splits["train"], body.joints)
     learned = new_fit(motion.clip, surface_of(body, RESOLUTION))
-    candidate = Candidate("the poses as given", learned, 0.9, (0.9, 0.9))
-    return CaptureFit(body_fit(learned, 55), motion, candidate, (candidate,), 0, from_silhouettes=False)
+    candidate = TriedFit("the poses as given", learned, 0.9, (0.9, 0.9))
+    return CaptureFit(body_fit(learned, 55), motion, candidate, (candidate,), 0)
 
 
 def moved(capture: Capture, away: np.ndarray) -> Capture:
