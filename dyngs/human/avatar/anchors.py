@@ -62,10 +62,8 @@ class Anchors:
 def texel_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) -> tuple[Gaussians, Anchors]:
     """Return grey discs on every texel, at all ``heights`` (m) above the surface at rest; nearly opaque at the lowest.
 
-    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by texel.
-
-    Raises:
-        DyngsError: no height, or one that is not finite.
+    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by texel. Raises
+    DyngsError: no height, or one that is not finite.
     """
     levels = texels.points.new_tensor(heights)
     if levels.numel() == 0 or not bool(levels.isfinite().all()):

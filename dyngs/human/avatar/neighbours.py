@@ -23,10 +23,8 @@ _LOOKED_AT = 4
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     """Return the rows (Q, count) int64 of the nearest other points of each of ``points`` (Q, 3), nearest first.
 
-    Points may coincide; none is its own neighbour. There are at most Q - 1 columns.
-
-    Raises:
-        DyngsError: a point that is not finite.
+    Points may coincide; none is its own neighbour. There are at most Q - 1 columns. Raises DyngsError: a point that is
+    not finite.
     """
     from scipy.spatial import KDTree
 

@@ -56,8 +56,7 @@ def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shr
 def difference_of_silhouettes(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
     """Return the squared error of alpha, over the area of the silhouette (); nothing else of the image is looked at.
 
-    Raises:
-        ValueError: an image without alpha.
+    Raises ValueError: an image without alpha.
     """
     if image.alpha is None:
         raise ValueError(f"{image.name}: has no silhouette")

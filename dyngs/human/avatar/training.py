@@ -86,8 +86,7 @@ class HumanTraining:
     def moment(self, scene: HumanScene, image: Image, step: int) -> Moment:
         """Return the Gaussians in the pose of ``image``, and the regularizers.
 
-        Raises:
-            DyngsError: the image's frame has no pose.
+        Raises DyngsError: the image's frame has no pose.
         """
         row = self._rows.get(-1 if image.frame is None else image.frame)
         if row is None:

@@ -133,9 +133,7 @@ def fit_capture(
 
     With given poses: first the shape; then rotations that are the same in all frames, and then those of every frame,
     each where it explains views clearly better that were left out. Without: poses are found first (``first_poses``).
-
-    Raises:
-        DyngsError: no silhouettes, or nobody in them.
+    Raises DyngsError: no silhouettes, or nobody in them.
     """
     if not capture.has_alpha:
         raise DyngsError(f"{capture.root}: the images have no silhouettes; add masks of the person (docs/human.md)")
@@ -219,11 +217,7 @@ def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
 def look_at(
     capture: Capture, motion: CapturedMotion, options: DataConfig, effort: FitEffort, keypoints: Keypoints
 ) -> Seen:
-    """Return the squares around the person in all frames.
-
-    Raises:
-        DyngsError: nobody is seen.
-    """
+    """Return the squares around the person in all frames. Raises DyngsError: nobody is seen."""
     views = capture.splits["train"]
     images = ImageLoader(views, options.model_copy(update={"longest_side": IMAGE_SIDE, "downscale": 1}))
     used, left_out = split_views(views, motion)

@@ -181,10 +181,8 @@ def write_fitted_capture(
 
     Files: ``transforms_SPLIT.json`` and ``images/`` (without both it is for ``data.body``), ``body_train.npz``,
     ``body_pose.npz`` for another clip whose poses were given by the same means, ``fit_report.json``, and
-    ``fit_overlays.png`` to look at. ``given`` is what is known beside the capture, see ``read_person``.
-
-    Raises:
-        DyngsError: see ``fit_capture``; ``out`` is not empty.
+    ``fit_overlays.png`` to look at. ``given`` is what is known beside the capture, see ``read_person``. Raises
+    DyngsError: see ``fit_capture``; ``out`` is not empty.
     """
     require_new_folder(out)
     person = None if given.person is None else known_shape(given.person)
@@ -284,10 +282,8 @@ def with_fitted_body(
     """Return the options with a fit of the free template to the capture; the same capture is fitted once.
 
     Nothing is fitted where ``data.body`` names a fit, where the capture itself holds one, or without silhouettes.
-    ``only_if_needed``: nothing is fitted where the capture has body parameters.
-
-    Raises:
-        DyngsError: neither body parameters nor silhouettes.
+    ``only_if_needed``: nothing is fitted where the capture has body parameters. Raises DyngsError: neither body
+    parameters nor silhouettes.
     """
     if data.body is not None:
         return data

@@ -58,10 +58,7 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
 
     ``root`` of the options is a capture, or a video or a folder of images of one fixed camera. Masks of ``given`` take
     the place of those of the capture; without any the person is told from the background. Masks that are made are
-    written to the folder ``work``.
-
-    Raises:
-        DyngsError: neither capture nor clip; no masks, and none that can be made.
+    written to the folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and none that can be made.
     """
     source = options.root
     if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
@@ -79,11 +76,7 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
 
 
 def joints_of(capture: Capture, given: FitInputs) -> Joints3D | None:
-    """Return the 3D joints of the frames of a capture, None without any.
-
-    Raises:
-        DyngsError: see ``read_joints``.
-    """
+    """Return the 3D joints of the frames of a capture, None without any. Raises DyngsError: see ``read_joints``."""
     if given.joints is None:
         return None
     return read_joints(given.joints, capture, default_template() if given.body is None else read_body(given.body))

@@ -35,10 +35,7 @@ def joints_of_vertices(where: Path, body: BodyTemplate, vertices: np.ndarray) ->
     """Return the joints (F, 22, 3) of posed vertices (F, N, 3) of a body with N vertices; NaN where they do not tell.
 
     The vertices around a joint, which follow it or its parent, are moved from rest to the pose by the similarity that
-    fits them best (Umeyama 1991); so is the joint.
-
-    Raises:
-        DyngsError: another number of vertices; names ``where``.
+    fits them best (Umeyama 1991); so is the joint. Raises DyngsError: another number of vertices; names ``where``.
     """
     rest, joints = body.vertices.double().cpu().numpy(), body.joints.double().cpu().numpy()
     if vertices.ndim != 3 or vertices.shape[1:] != rest.shape:
@@ -96,10 +93,8 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
     numbers, else 0, 1, ...; ``order`` and ``space`` as text. ``.json``: an object of ``order``, ``space`` and
     ``joints``, which maps images or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body,
     ``IMAGE.npz`` with ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck
-    et al. (2018), whose vertices are those of SMPL. ``body`` is the template, for vertices.
-
-    Raises:
-        DyngsError: another layout, no frame of the capture, or no numbers; names the file.
+    et al. (2018), whose vertices are those of SMPL. ``body`` is the template, for vertices. Raises DyngsError: another
+    layout, no frame of the capture, or no numbers; names the file.
     """
     views = capture.splits["train"]
     with reading(path):

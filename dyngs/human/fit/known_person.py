@@ -31,10 +31,8 @@ _BODY, _CONFIG = "body_train.npz", "config.yaml"
 def known_shape(path: Path) -> BodyFrames:
     """Return the body parameters of a person, of whom only the shape counts.
 
-    ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one.
-
-    Raises:
-        DyngsError: none of these, or a shape that is not of the free template.
+    ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one. Raises
+    DyngsError: none of these, or a shape that is not of the free template.
     """
     with reading(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
         folder = path

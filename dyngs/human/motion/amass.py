@@ -48,10 +48,8 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
 
     A file without ``scale`` and ``up_axis`` was made for SMPL, SMPL-H or SMPL-X (told by its width). Shape parameters
     that ``body`` lacks are left out. If ``body`` is of another family, all are set to zero and the lowest vertex of the
-    motion to y = 0, as the pelvis of the file's body is not known.
-
-    Raises:
-        DyngsError: names the file and what is missing or wrong.
+    motion to y = 0, as the pelvis of the file's body is not known. Raises DyngsError: names the file and what is
+    missing or wrong.
     """
     with reading(path):
         return _motion(path, _arrays(path), body, up)
@@ -60,10 +58,8 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
 def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") -> None:
     """Write the motion of 55 joints as an AMASS file of SMPL-X with ``up_axis`` y; reading it gives the same motion.
 
-    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as its model.
-
-    Raises:
-        DyngsError: the suffix is not ``.npz``, or the file cannot be written.
+    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as its model. Raises
+    DyngsError: the suffix is not ``.npz``, or the file cannot be written.
     """
     if path.suffix.lower() != ".npz":
         raise DyngsError(f"cannot write {path}: a motion is written as .npz")

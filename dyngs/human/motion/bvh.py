@@ -40,9 +40,7 @@ def read_bvh(path: Path) -> SkeletonMotion:
 
     The transform of a joint relative to its parent is T R: T from its position channels, or from OFFSET along axes
     without one, and R = R_1 R_2 R_3 from its rotations about single axes, in degrees, in the order of its channels.
-
-    Raises:
-        DyngsError: names the file and what is wrong with it.
+    Raises DyngsError: names the file and what is wrong with it.
     """
     with reading(path):
         hierarchy, rows = _halves(path)

@@ -91,9 +91,7 @@ def captured_motion(where: Path, given: BodyFrames, views: Sequence[View], joint
     """Return the frames of ``given`` that ``views`` show, for a body with ``joints`` (J, 3) at rest.
 
     Joints that the body of ``given`` lacks do not rotate. Views without times are spread over [0, 1] by frame number.
-
-    Raises:
-        DyngsError: a view without parameters.
+    Raises DyngsError: a view without parameters.
     """
     found = about_pelvis(given, joints[0].double().cpu().numpy())
     rows = rows_of(where, found, views)

@@ -59,11 +59,8 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
     without these the nodes without animation. A file without a skin, as Mixamo exports "without skin", has the nodes
     that are animated for joints, and must show a T-pose or an A-pose without animation. The world is that of the scene,
     y up. The rotation of a joint is the product of those of its nodes: scale is left out. ``clip`` names the animation,
-    where several move the joints.
-
-    Raises:
-        DyngsError: no such animation, anything broken or not supported (sparse accessors, meshopt compression, mirrored
-            nodes); names the file.
+    where several move the joints. Raises DyngsError: no such animation, anything broken or not supported (sparse
+    accessors, meshopt compression, mirrored nodes); names the file.
     """
     with reading(path):
         file = GltfFile(path)
@@ -75,10 +72,7 @@ def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -
     """Read a VRM animation (``.vrma``, extension VRMC_vrm_animation 1.0): the bones have the names of VRM's humanoid.
 
     Without animation the nodes stand in a T-pose. The first animation counts unless ``clip`` names another. Expressions
-    and the gaze are left out.
-
-    Raises:
-        DyngsError: as ``read_gltf``, or the extension is missing.
+    and the gaze are left out. Raises DyngsError: as ``read_gltf``, or the extension is missing.
     """
     with reading(path):
         file = GltfFile(path)

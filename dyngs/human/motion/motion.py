@@ -53,10 +53,8 @@ class Motion:
     def resampled(self, fps: float) -> Motion:
         """Return the motion at ``fps`` frames per second, from the first frame to at most the last one.
 
-        Rotations are interpolated spherically the shorter way, all else linearly. Nothing is smoothed.
-
-        Raises:
-            DyngsError: ``fps`` is not a positive number, or gives more frames than ``MAX_JOINT_POSES`` allows.
+        Rotations are interpolated spherically the shorter way, all else linearly. Nothing is smoothed. Raises
+        DyngsError: ``fps`` is not a positive number, or gives more frames than ``MAX_JOINT_POSES`` allows.
         """
         most = allowed(MAX_JOINT_POSES) / len(JOINT_NAMES)
         if not len(self) * fps <= most * self.fps:
@@ -96,8 +94,7 @@ def frame_chunks(count: int) -> list[slice]:
 def require_frame_count(path: Path, frames: float, joints: int) -> None:
     """Check that the motion of a file fits into memory before it is allocated.
 
-    Raises:
-        DyngsError: it exceeds ``MAX_JOINT_POSES``.
+    Raises DyngsError: it exceeds ``MAX_JOINT_POSES``.
     """
     amount, most = frames * max(joints, len(JOINT_NAMES)), allowed(MAX_JOINT_POSES)
     if not amount <= most:
@@ -109,11 +106,7 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
 
 
 def require_frame_rate(path: Path, fps: float) -> float:
-    """Return ``fps`` if it is a plausible frame rate of a motion.
-
-    Raises:
-        DyngsError: it is not.
-    """
+    """Return ``fps`` if it is a plausible frame rate of a motion. Raises DyngsError: it is not."""
     if not _RATES[0] <= fps <= _RATES[1]:
         raise DyngsError(
             f"{path}: {fps:g} frames per second is not the rate of a motion ({_RATES[0]:g} to {_RATES[1]:g}); correct "
@@ -125,10 +118,8 @@ def require_frame_rate(path: Path, fps: float) -> float:
 def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
     """Return times (F,) in [0, last], in frames of ``from_fps``, that are 1 / ``fps`` seconds apart.
 
-    The last frame is included if it is missed by at most a thousandth of a frame.
-
-    Raises:
-        DyngsError: ``fps`` is not a positive number.
+    The last frame is included if it is missed by at most a thousandth of a frame. Raises DyngsError: ``fps`` is not a
+    positive number.
     """
     if not 0 < fps < math.inf:
         raise DyngsError(f"{fps:g} frames per second is not a frame rate; ask for 30 or the like")

@@ -129,10 +129,8 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
     """Return the joints of SMPL-X that a skeleton with these joint names has, with their indices in ``names``.
 
     Case, punctuation and a prefix before the name of the pelvis (``mixamorig:``, ``Bip01``) do not matter. The rig that
-    matches most joints of the body is chosen.
-
-    Raises:
-        DyngsError: the pelvis, a leg or an arm is missing; names the joint and the file ``path``.
+    matches most joints of the body is chosen. Raises DyngsError: the pelvis, a leg or an arm is missing; names the
+    joint and the file ``path``.
     """
     plain = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     best: dict[str, int] = {}
@@ -196,11 +194,9 @@ def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     and ankles) and N those of its world: the identity if that is y up, else M. Joints without a counterpart follow
     their parents.
 
-    The pelvis follows the source's path times the ratio of leg lengths, so units of length do not matter; the motion
-    is then moved vertically so that its lowest vertex has y = 0.
-
-    Raises:
-        DyngsError: unknown joint names, or a rest pose that does not stand upright.
+    The pelvis follows the source's path times the ratio of leg lengths, so units of length do not matter; the motion is
+    then moved vertically so that its lowest vertex has y = 0. Raises DyngsError: unknown joint names, or a rest pose
+    that does not stand upright.
     """
     found = match_joints(source.path, source.names)
     target_from_rest = _target_from_rest(source, found)

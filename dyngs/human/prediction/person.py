@@ -50,8 +50,7 @@ class CapturedPerson:
 def captured_person(capture: Capture, model: HumanPredictorModel, body: BodyTemplate) -> CapturedPerson:
     """Return the person of a capture, on the template ``body``.
 
-    Raises:
-        DyngsError: a capture without body parameters, without silhouettes, or a view without parameters.
+    Raises DyngsError: a capture without body parameters, without silhouettes, or a view without parameters.
     """
     if capture.body is None:
         raise DyngsError(f"{capture.root}: has no body parameters, which a prediction needs; see docs/human.md")
@@ -111,8 +110,7 @@ def spread_views(person: CapturedPerson, count: int, first: int | None = None) -
 def named_views(person: CapturedPerson, names: Sequence[str]) -> list[int]:
     """Return the indices of the views with these names, or with images of these file names.
 
-    Raises:
-        DyngsError: an unknown name, or the same view twice.
+    Raises DyngsError: an unknown name, or the same view twice.
     """
     files = [view.image_path.name for view in person.views]
     known = {name: i for i, name in enumerate(files) if files.count(name) == 1}

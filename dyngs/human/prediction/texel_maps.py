@@ -51,11 +51,7 @@ class TexelMaps:
 
 @torch.no_grad()
 def observe_texels(person: CapturedPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
-    """Return the maps of at least one image, each with its body pose.
-
-    Raises:
-        ValueError: no image.
-    """
+    """Return the maps of at least one image, each with its body pose. Raises ValueError: no image."""
     shape, device = (len(person.heights), len(person.texels)), person.texels.points.device
     colour = torch.zeros(*shape, 3, device=device)
     weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))

@@ -86,10 +86,8 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
     """Return the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64; left and right, front and back differ.
 
     Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is correct. The
-    template is in T-pose, with texture coordinates and the 55 joints of SMPL-X; ``resolution`` is S.
-
-    Raises:
-        DyngsError: the template has no texture coordinates.
+    template is in T-pose, with texture coordinates and the 55 joints of SMPL-X; ``resolution`` is S. Raises DyngsError:
+    the template has no texture coordinates.
     """
     uv, uv_faces = texture_coordinates(body)
     columns, rows = texel_coordinates(uv, resolution)
@@ -109,8 +107,7 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
 def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
     """Return texture coordinates (U, 2), float64, and the triangles (T, 3) that index them.
 
-    Raises:
-        DyngsError: the template has none.
+    Raises DyngsError: the template has none.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")

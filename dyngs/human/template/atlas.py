@@ -52,10 +52,8 @@ def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = 
     """Return the texels whose centres the atlas of ``body`` covers; of overlapping triangles the first one wins.
 
     Triangles that are degenerate in the atlas or on the surface cover nothing. Not differentiable. ``resolution`` is S,
-    texels per side; ``vertices`` (M, 3) the rest shape, m, None for that of the template.
-
-    Raises:
-        DyngsError: no texture coordinates, a resolution below 1, or ``vertices`` of a wrong shape or not finite.
+    texels per side; ``vertices`` (M, 3) the rest shape, m, None for that of the template. Raises DyngsError: no texture
+    coordinates, a resolution below 1, or ``vertices`` of a wrong shape or not finite.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")

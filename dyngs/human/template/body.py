@@ -83,10 +83,8 @@ def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | N
     """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape and expression parameters; differentiable.
 
     v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula. Of ``betas`` (...,
-    B) and ``expression`` (..., E) missing ones are 0; None: the mean.
-
-    Raises:
-        DyngsError: a non-zero parameter that the template does not have.
+    B) and ``expression`` (..., E) missing ones are 0; None: the mean. Raises DyngsError: a non-zero parameter that the
+    template does not have.
     """
     vertices, joints = body.vertices, body.joints
     for name, given, dirs, joint_dirs in (
@@ -120,10 +118,8 @@ def posed_vertices(
 
     v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. The root rotates about the pelvis joint.
     ``poses`` (F, J, 3) are axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m, added last; ``betas`` (B,)
-    or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,) of the template.
-
-    Raises:
-        DyngsError: poses for another number of joints, or parameters that the template does not have.
+    or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,) of the template. Raises DyngsError: poses for another
+    number of joints, or parameters that the template does not have.
     """
     if poses.ndim != 3 or tuple(poses.shape[1:]) != tuple(body.joints.shape):
         raise DyngsError(

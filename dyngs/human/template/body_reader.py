@@ -46,10 +46,7 @@ def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> TextureCoordin
     """Read the texture coordinates of an ``.obj``, indexed by the corners of the triangles ``faces`` (T, 3).
 
     Its triangles may come in any order, as ``f v/vt v/vt v/vt``; ``faces`` (T, 3) are those of the body with
-    ``num_vertices``.
-
-    Raises:
-        DyngsError: the file cannot be read, or belongs to another body.
+    ``num_vertices``. Raises DyngsError: the file cannot be read, or belongs to another body.
     """
     if path.exists() and not path.is_file():
         raise DyngsError(f"{path}: is not a file; name the .obj made for this body")
@@ -132,10 +129,7 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
     The number of joints (24, 52 or 55) tells SMPL, SMPL-H and SMPL-X apart. SMPL-X keeps shape and expression in one
     array: 300 and the rest, or 10 and 10. Only the keys that are needed are read. A file cannot run code: arrays of
     Python objects are refused, and only numbers, text and arrays are read from a pickle. ``uv`` is an ``.obj`` with the
-    triangles of the body.
-
-    Raises:
-        DyngsError: names the file and what is missing or wrong.
+    triangles of the body. Raises DyngsError: names the file and what is missing or wrong.
     """
     path = Path(path)
     if path.is_dir():
@@ -350,11 +344,7 @@ def template_path(model: HumanModel) -> Path:
 
 
 def load_template(model: HumanModel) -> BodyTemplate:
-    """Read the template that ``model`` names, or the free one.
-
-    Raises:
-        DyngsError: the file cannot be read.
-    """
+    """Read the template that ``model`` names, or the free one. Raises DyngsError: the file cannot be read."""
     if model.body is None and model.uv is None:
         return default_template()
     if model.body is None:
