@@ -309,7 +309,7 @@ def _first(
             filmed = capture.splits["train"]
             cameras = training_cameras(filmed, config.data)
             views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
-            training = HumanTraining(config.model, subject.footage.frames, rates_of(config), views)
+            training = HumanTraining(config.model, subject.motion.frames, rates_of(config), views)
             lit = config.model.light and config.model.refine and colours.network is None
             normals = rest_normals(gaussians) if lit else None
             return _First(training.first_scene(gaussians, subject, normals), training, colours)

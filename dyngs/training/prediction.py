@@ -337,5 +337,5 @@ def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torc
 
 def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[HumanScene, HumanTraining]:
     """Return a predicted avatar as a scene, and how it is trained on."""
-    training = HumanTraining(model, avatar.subject.footage.frames, rates)
+    training = HumanTraining(model, avatar.subject.motion.frames, rates)
     return training.first_scene(avatar.gaussians, avatar.subject), training

@@ -1,4 +1,4 @@
-"""Learned corrections of the body fit beside the Gaussians: poses of the frames, skeleton, skinning weights.
+"""Learned corrections of the body fit next to the Gaussians: poses of the frames, skeleton, skinning weights.
 
 Body fits are never exact, and the template is not the person. All corrections start at zero. Local letters: F frames,
 J joints, N Gaussians, K joints that one Gaussian follows.

@@ -17,7 +17,7 @@ from dyngs.human.avatar.anchors import Anchors
 _SAME_JOINTS = 0.5
 """Least cosine between the skinning weights of points that belong to the same part of the body."""
 _LOOKED_AT = 4
-"""Points that are looked at, over the number of neighbours that are wanted."""
+"""Points that are looked at, over the number of requested neighbours."""
 
 
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
@@ -32,10 +32,10 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     count = min(count, num_points - 1)
     if count < 1:
         return torch.zeros(num_points, 0, dtype=torch.long, device=points.device)
-    places = points.detach().double().cpu().numpy()
-    if not np.isfinite(places).all():
+    positions = points.detach().double().cpu().numpy()
+    if not np.isfinite(positions).all():
         raise DyngsError("neighbours: a point is not finite; check the positions for NaN")
-    found = np.asarray(KDTree(places).query(places, k=count + 1)[1])
+    found = np.asarray(KDTree(positions).query(positions, k=count + 1)[1])
     own = found == np.arange(num_points)[:, None]
     own[~own.any(1), -1] = True  # more than ``count`` points coincide: drop the last one
     return torch.from_numpy(found[~own].reshape(num_points, count)).long().to(points.device)
@@ -130,7 +130,7 @@ def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: floa
 
 
 def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
-    """Return (N,) rows of the Gaussians nearest to the places mirrored at x = ``middle``, and if they are near (N,)."""
+    """Return (N,) rows of the Gaussians nearest to positions mirrored at x = ``middle``, and if they are near (N,)."""
     from scipy.spatial import KDTree
 
     points = anchors.points.detach().double().cpu().numpy()

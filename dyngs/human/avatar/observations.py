@@ -90,7 +90,7 @@ class Subject:
 
     skeleton: Skeleton
     anchors: Anchors
-    footage: CapturedMotion
+    motion: CapturedMotion
     shapes: PoseBlendShapes | None = None
 
 
@@ -99,8 +99,8 @@ def in_colours_of(gaussians: Gaussians, normals: Tensor, subject: Subject, image
 
     ``normals`` (N, 3) are those of the surface at rest.
     """
-    clip, anchors, skeleton = subject.footage.clip, subject.anchors, subject.skeleton
-    rows = subject.footage.rows
+    clip, anchors, skeleton = subject.motion.clip, subject.anchors, subject.skeleton
+    rows = subject.motion.rows
     shown = ((image, frame_pose(clip, rows[image.frame or 0])) for image in images)
     weights = skinning_weights(anchors, len(skeleton.joints))
 

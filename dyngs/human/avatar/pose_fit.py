@@ -1,6 +1,6 @@
 """Body poses fitted to images: the poses in which an avatar, which stays as it is, looks most like them.
 
-Either the whole images count, or their silhouettes alone (``dyngs.human.avatar.pose_fit``). GART (Lei et al.
+Either the full images count, or their silhouettes alone (``dyngs.human.avatar.pose_fit``). GART (Lei et al.
 2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test images like this before they score new poses.
 Local letters: F moments, J joints, V images of a moment.
 """
@@ -27,7 +27,7 @@ from dyngs.ops.adam import adam_step_
 from dyngs.ops.loss import l1_ssim_loss
 
 SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
-"""Of SSIM and of the mean error of alpha in the loss of whole images, as in training."""
+"""Of SSIM and of the mean error of alpha in the loss of full images, as in training."""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class HumanTraining:
 
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
-        clip = subject.footage.clip
+        clip = subject.motion.clip
         learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
             gaussians=gaussians,

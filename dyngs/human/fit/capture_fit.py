@@ -107,10 +107,11 @@ class Seen:
     judged: dict[int, ObservedFrame | None]
     held_out: int
 
-    def with_places(self, places: Mapping[int, Tensor]) -> Seen:
+    def with_positions(self, positions: Mapping[int, Tensor]) -> Seen:
         """Return the same with joints given in 3D, by row."""
         used = {
-            row: None if frame is None else replace(frame, places=places.get(row)) for row, frame in self.used.items()
+            row: None if frame is None else replace(frame, positions=positions.get(row))
+            for row, frame in self.used.items()
         }
         return replace(self, used=used, judged=used if self.judged is self.used else self.judged)
 
@@ -147,7 +148,9 @@ def fit_capture(
     )
     seen, surface = look_at(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
     joints = known.joints
-    seen = seen if joints is None else seen.with_places({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
+    seen = (
+        seen if joints is None else seen.with_positions({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
+    )
     if given:
         fitting = Fitting(motion.clip, surface, near_given(motion.clip))
         tried = _from_given(fitting, seen, known.learned, report, effort)

@@ -74,35 +74,22 @@ def placed_clip(
     return NewClip(motion, shift, before.iou, after.iou if better else None)
 
 
-@dataclass(frozen=True)
-class FittedClip:
-    """Poses of F frames: one row of ``clip`` for each of the numbers ``frames``."""
-
-    clip: MotionClip
-    frames: tuple[int, ...]
-
-    @property
-    def rows(self) -> dict[int, int]:
-        """The row of each frame."""
-        return {frame: row for row, frame in enumerate(self.frames)}
-
-
 def fitted_clips(
     capture: Capture, body: BodyTemplate, found: CaptureFit, new_poses: NewClip | None
-) -> dict[Split, FittedClip]:
+) -> dict[Split, CapturedMotion]:
     """Return the clip of training, with the frames of val and test, and that of ``pose``, if the capture has one.
 
     Frames that were not fitted have what holds for all frames applied to their given poses; without given poses they
     lie between their neighbours. All views of ``capture`` have frame numbers; ``new_poses`` is the clip of ``pose``.
     """
-    clips: dict[Split, FittedClip] = {"train": _of_training(capture, body, found)}
+    clips: dict[Split, CapturedMotion] = {"train": _of_training(capture, body, found)}
     if new_poses is not None:
         fit = replace(found.fit, shift=new_poses.shift)
-        clips["pose"] = FittedClip(fit.applied(_expanded(new_poses.motion)), new_poses.motion.frames)
+        clips["pose"] = CapturedMotion(fit.applied(_expanded(new_poses.motion)), new_poses.motion.frames)
     return clips
 
 
-def _of_training(capture: Capture, body: BodyTemplate, found: CaptureFit) -> FittedClip:
+def _of_training(capture: Capture, body: BodyTemplate, found: CaptureFit) -> CapturedMotion:
     """Return the clip of all frames in train, val and test."""
     fitted = replace(found.motion, clip=found.fit.fitted(found.motion.clip))
     known, rows = _expanded(fitted), fitted.rows
@@ -118,7 +105,7 @@ def _of_training(capture: Capture, body: BodyTemplate, found: CaptureFit) -> Fit
     tensors = {
         name: torch.cat([getattr(part, name) for part in parts]) for name in ("times", "poses", "trans", "scale")
     }
-    return FittedClip(MotionClip(**tensors), frames)
+    return CapturedMotion(MotionClip(**tensors), frames)
 
 
 def _expanded(motion: CapturedMotion) -> MotionClip:

@@ -31,7 +31,7 @@ from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
-from dyngs.human.fit.clips import FittedClip, NewClip, fitted_clips, placed_clip
+from dyngs.human.fit.clips import NewClip, fitted_clips, placed_clip
 from dyngs.human.fit.inputs import (
     NOTHING_ELSE,
     FitInputs,
@@ -43,6 +43,7 @@ from dyngs.human.fit.inputs import (
 from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
 from dyngs.human.fit.surface import Surface, drawn_silhouettes, surface_of
+from dyngs.human.motion.clip import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
@@ -52,7 +53,7 @@ FRAME_RATE = 30.0
 
 
 def write_body(
-    path: Path, found: FittedClip, betas: np.ndarray, world_offset: np.ndarray, fps: float | None = None
+    path: Path, found: CapturedMotion, betas: np.ndarray, world_offset: np.ndarray, fps: float | None = None
 ) -> None:
     """Write the body parameters of a clip, also readable as a motion: rows are named by their frame numbers.
 
@@ -219,7 +220,7 @@ def write_fitted_capture(
     return FittedCapture(out, found, new_poses, tuple(by_avatar))
 
 
-def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, FittedClip]) -> None:
+def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, CapturedMotion]) -> None:
     full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
     for split, views in capture.splits.items():
         if views:

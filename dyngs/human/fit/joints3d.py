@@ -28,7 +28,7 @@ from dyngs.human.template.joints import JOINT_NAMES
 NUM_JOINTS = 22
 """Joints of the body without hands and face, the same in SMPL, SMPL-H and SMPL-X."""
 NEAR = 0.5
-"""A vertex tells where a joint is if it follows that joint and its parent by this share at least."""
+"""A vertex tells where a joint is if it follows that joint and its parent by this fraction at least."""
 
 
 def joints_of_vertices(where: Path, body: BodyTemplate, vertices: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def _moved(rest: np.ndarray, posed: np.ndarray, point: np.ndarray) -> np.ndarray
 
 Space = Literal["world", "camera"]
 INNER = 0.3
-"""Confidence of joints inside the trunk, whose places differ from model to model by centimetres, over that of limbs."""
+"""Confidence of joints inside the trunk, which differ from model to model by centimetres, over that of limbs."""
 _MHR, _MHR_JOINTS = "mhr70", 70
 _MOST_FRAMES, _FARTHEST = 100_000, 1e6
 _TURNED = (1.0, -1.0, -1.0)
@@ -241,13 +241,13 @@ def _by_frame(path: Path, found: _Found, views: Sequence[View]) -> dict[int, tup
 def _placed(found: _Found, joints: np.ndarray, view: View, offset: np.ndarray) -> Tensor:
     """Return the joints (55, 4) of a frame in the recentred world of the cameras."""
     placed = torch.zeros(len(JOINT_NAMES), 4, device="cpu")
-    places = joints[:, :3] - offset
+    positions = joints[:, :3] - offset
     if found.space == "camera":
         rotation, shift = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
-        places = (joints[:, :3] - shift) @ rotation
+        positions = (joints[:, :3] - shift) @ rotation
     for row, name in enumerate(ORDERS[found.order]):
         if name in JOINT_NAMES and joints[row, 3] > 0:
             confidence = min(joints[row, 3], 1.0) * (1.0 if name in JOINTS else INNER)
-            known = np.append(places[row], confidence)
+            known = np.append(positions[row], confidence)
             placed[JOINT_NAMES.index(name)] = torch.from_numpy(known).float()
     return placed

@@ -173,6 +173,6 @@ def _placed(view: View, points: np.ndarray) -> Tensor:
     for row, name in enumerate(_ORDERS[len(points)]):
         if name in JOINTS and points[row, 2] > 0:
             joints[JOINTS[name]] = torch.from_numpy(points[row])
-    places = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
-    near = (places.abs() < _FARTHEST).all(1, keepdim=True)  # false for NaN
-    return torch.cat([torch.where(near, places, 0.0), joints[:, 2:].clamp(0, 1) * near], dim=1).float()
+    positions = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
+    near = (positions.abs() < _FARTHEST).all(1, keepdim=True)  # false for NaN
+    return torch.cat([torch.where(near, positions, 0.0), joints[:, 2:].clamp(0, 1) * near], dim=1).float()

@@ -19,9 +19,8 @@ from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError, reading
 from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.clips import FittedClip
 from dyngs.human.fit.inputs import KnownAvatar
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import rest_shape
 
@@ -74,7 +73,7 @@ _FEWEST_VIEWS = 3
 class AvatarPoses:
     """Poses that an avatar found."""
 
-    clip: FittedClip  # of all frames; as it was where ``taken`` is false
+    clip: CapturedMotion  # of all frames; as it was where ``taken`` is false
     before: float  # overlap of silhouettes (IoU) at some time steps, of the avatar
     after: float
     left_out: int  # number of views, which were left out of the fit, that this was measured on; 0: on those fitted to
@@ -94,7 +93,9 @@ class AvatarPoses:
         )
 
 
-def posed_by_avatar(avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: FittedClip) -> AvatarPoses:
+def posed_by_avatar(
+    avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: CapturedMotion
+) -> AvatarPoses:
     """Return the poses of a clip in which the avatar has the silhouettes of its images, where that is better.
 
     The size is that of ``start``, or that of the clip of training where the silhouettes show that the world has the

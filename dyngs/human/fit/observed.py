@@ -32,8 +32,8 @@ class ObservedFrame:
     # (V, 55, 3) column and row in the square, as fractions of its side, and confidence of joints that were marked as
     # key points; None without any
     joints: Tensor | None = None
-    # (55, 4) places in the world and confidence of joints that are given in 3D; None without any
-    places: Tensor | None = None
+    # (55, 4) positions in the world and confidence of joints that are given in 3D; None without any
+    positions: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.alpha)
@@ -44,7 +44,7 @@ class ObservedFrame:
         scale = self.cameras.intrinsics.new_tensor([1 / factor, 1 / factor, 1.0])
         cameras = Cameras(self.cameras.cam_from_world, scale[:, None] * self.cameras.intrinsics, size, size)
         known = (_resized(self.known, size) > 0.999).float()
-        return ObservedFrame(cameras, _resized(self.alpha, size), known, self.joints, self.places)
+        return ObservedFrame(cameras, _resized(self.alpha, size), known, self.joints, self.positions)
 
 
 def longest_box_side(images: Iterable[Image]) -> int:

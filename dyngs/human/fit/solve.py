@@ -1,4 +1,4 @@
-"""The fit of a body to silhouettes and key points: few numbers for the whole clip first, then every frame's pose.
+"""The fit of a body to silhouettes and key points: few numbers for the full clip first, then every frame's pose.
 
 Rasterized silhouettes are differentiable, so that everything is found by Adam. Local letters: F frames, J joints, B
 shape parameters, P discs, V views, K key points.
@@ -95,7 +95,7 @@ LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e
     "shift": 3e-3,
     "log_focal": 3e-2,
 }
-"""Learning rates at the first step; those of places per metre of the person's unit."""
+"""Learning rates at the first step; those of positions per metre of the person's unit."""
 LR_DECAY = 0.1
 BETAS_WEIGHT = BONES_WEIGHT = 1e-3
 """Of the mean squared shape parameter, whose unit is the spread among adults."""
@@ -201,14 +201,14 @@ def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
     count = min(len(joints), marked.shape[1])
     local = joints[:count] @ cameras.cam_from_world[:, :3, :3].mT + cameras.cam_from_world[:, None, :3, 3]
     pixels = local @ cameras.intrinsics.mT
-    places = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
-    away = (places - marked[:, :count, :2]).square().sum(-1) / KEYPOINT**2
+    positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
+    away = (positions - marked[:, :count, :2]).square().sum(-1) / KEYPOINT**2
     weights = marked[:, :count, 2]
     return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
 
 
 def place_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
-    """Return the mean robust distance of joints (J, 3) from places (55, 4), see ``ObservedFrame``, as for key points.
+    """Return the mean robust distance of joints (J, 3) from positions (55, 4), as for key points.
 
     ``unit`` is the length of a metre of the person in the world.
     """
@@ -277,11 +277,11 @@ def frame_error(learned: Parameters, clip: MotionClip, surface: Surface, row: in
     """Return the error of frame ``row``: of its silhouettes, and of its joints where they are marked."""
     error = silhouette_error(drawn_frame(learned, clip, surface, row, seen.cameras), seen)
     if seen.joints is not None:
-        places, cameras = posed_joints(learned, clip, surface, row), refined(seen.cameras, learned)
-        error = error + KEYPOINT_WEIGHT * keypoint_error(places, seen.joints, cameras)
-    if seen.places is not None:
+        positions, cameras = posed_joints(learned, clip, surface, row), refined(seen.cameras, learned)
+        error = error + KEYPOINT_WEIGHT * keypoint_error(positions, seen.joints, cameras)
+    if seen.positions is not None:
         unit = clip.scale[row] * learned["log_scale"][0].detach().exp()
-        error = error + PLACE_WEIGHT * place_error(posed_joints(learned, clip, surface, row), seen.places, unit)
+        error = error + PLACE_WEIGHT * place_error(posed_joints(learned, clip, surface, row), seen.positions, unit)
     return error
 
 
@@ -292,7 +292,7 @@ def drawn_frame(learned: Parameters, clip: MotionClip, surface: Surface, row: in
 
 
 def spread_order(count: int) -> list[int]:
-    """Return 0 .. count - 1 in an order whose every stretch is spread over the whole range."""
+    """Return 0 .. count - 1 in an order whose every stretch is spread over the full range."""
     stride = max(1, round(count * 0.618))
     while count > 1 and math.gcd(stride, count) != 1:
         stride += 1
@@ -333,5 +333,5 @@ def body_fit(learned: Parameters, joints: int) -> BodyFit:
         return torch.cat([turns, blank], dim=-2)
 
     shared = SharedCorrection(padded(values["turns"]), float(values["log_scale"][0]))
-    places = (values["offset"], values["shift"])
-    return BodyFit(values["betas"], shared, *places, padded(values["poses"]), values["trans"])
+    positions = (values["offset"], values["shift"])
+    return BodyFit(values["betas"], shared, *positions, padded(values["poses"]), values["trans"])

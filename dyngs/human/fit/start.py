@@ -146,9 +146,9 @@ def _all_headings(
 
 def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
     """Return the clip with another pose (J, 3) and translation (3,) in a frame."""
-    poses, places = clip.poses.clone(), clip.trans.clone()
-    poses[row], places[row] = pose, trans
-    return replace(clip, poses=poses, trans=places)
+    poses, positions = clip.poses.clone(), clip.trans.clone()
+    poses[row], positions[row] = pose, trans
+    return replace(clip, poses=poses, trans=positions)
 
 
 def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
@@ -156,21 +156,21 @@ def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> Mo
 
     Where nobody is seen, the place is that of the frame before.
     """
-    joints, up, places, heights = surface.body.joints, torch.zeros(3, device="cpu"), [], []
+    joints, up, positions, heights = surface.body.joints, torch.zeros(3, device="cpu"), [], []
     for row in range(len(times)):
         seen = observed(row)
         if seen is None:
-            places.append(places[-1] if places else torch.zeros(3, device="cpu"))
+            positions.append(positions[-1] if positions else torch.zeros(3, device="cpu"))
             continue
         up = up if up.any() else up_of(seen)
         place, height = place_and_height(seen, up)
-        places.append(place)
+        positions.append(place)
         heights += [] if height is None else [height]
     upright = Rotation.align_vectors(up[None].numpy(), np.array([[0.0, 1.0, 0.0]]))[0]
     poses = usual_pose(len(joints)).to(joints).repeat(len(times), 1, 1)
     poses[:, 0] = torch.from_numpy(upright.as_rotvec()).to(poses)
     scale = float(np.median(heights)) / STATURE if heights else 1.0
-    trans = torch.stack(places) - scale * joints[0]  # the root turns about the pelvis
+    trans = torch.stack(positions) - scale * joints[0]  # the root turns about the pelvis
     return MotionClip(times, poses, trans, torch.full((len(times),), scale, device="cpu"))
 
 

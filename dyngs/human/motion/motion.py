@@ -143,7 +143,7 @@ def poses_for_joints(poses: Tensor, count: int) -> Tensor:
 
 
 def interpolate_rotations(before: Tensor, after: Tensor, fraction: np.ndarray) -> Tensor:
-    """Return axis-angle vectors (F, J, 3) at ``share`` (F,) of the way between two: R_a exp(s log(R_a^T R_b))."""
+    """Return axis-angle vectors (F, J, 3) at ``fraction`` (F,) of the way between two: R_a exp(s log(R_a^T R_b))."""
     from scipy.spatial.transform import Rotation
 
     start = Rotation.from_rotvec(before.reshape(-1, 3).double().cpu().numpy())

@@ -22,7 +22,7 @@ _KINDS = {
 }
 """Names of the formats by suffix."""
 _GLTF_FPS = 30.0
-"""Frames per second at which glTF's curves are sampled unless asked otherwise."""
+"""Frames per second at which glTF's curves are sampled unless another rate is requested."""
 
 
 def read_motion(

@@ -146,8 +146,8 @@ def predict_gaussians(
     """Return the avatar that ``network`` predicts, differentiable in its weights; None: discs in observed colours.
 
     All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they lie inside at least
-    the share ``min_silhouette_fraction`` of the silhouettes. Rotations are relative to the tangent frame, scales to the
-    initial Gaussian, means move along the normal. Colours are a weighted mean of those of the images and those of the
+    the fraction ``min_silhouette_fraction`` of the silhouettes. Rotations are relative to the tangent frame, scales to
+    the initial Gaussian, means move along the normal. Colours are a weighted mean of those of the images and of the
     network, which mixes and corrects the ``guessed_colours``; without a network those of the images. ``mean`` is as in
     ``network_inputs``.
     """

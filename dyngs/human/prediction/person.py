@@ -43,8 +43,8 @@ class CapturedPerson:
 
     def pose_in(self, view: View) -> BodyPose:
         """Return the pose of the person in ``view``."""
-        footage = self.subject.footage
-        return frame_pose(footage.clip, footage.rows[-1 if view.frame is None else view.frame])
+        motion = self.subject.motion
+        return frame_pose(motion.clip, motion.rows[-1 if view.frame is None else view.frame])
 
 
 def captured_person(capture: Capture, model: HumanPredictorModel, body: BodyTemplate) -> CapturedPerson:
@@ -158,8 +158,8 @@ _UNKNOWN = 0.5
 
 def mirror_texels(texels: Texels) -> Tensor:
     """Return the index (P,) of the texel nearest to the mirror image of each one, at rest."""
-    places = _places(texels)
-    found = KDTree(places).query(places * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
+    positions = _positions(texels)
+    found = KDTree(positions).query(positions * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
     return torch.from_numpy(np.asarray(found, dtype=np.int64)).to(texels.index.device)
 
 
@@ -174,9 +174,9 @@ def colours_nearby(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
         return torch.full_like(rgb, _UNKNOWN)
     if is_seen.all():
         return rgb
-    places, known = _places(texels), np.flatnonzero(is_seen)
+    positions, known = _positions(texels), np.flatnonzero(is_seen)
     count = min(_NEAREST, len(known))
-    found = KDTree(places[known]).query(places[~is_seen], k=count)
+    found = KDTree(positions[known]).query(positions[~is_seen], k=count)
     distance, near = (np.asarray(x).reshape(-1, count) for x in found)  # one neighbour comes without its axis
     rows = torch.from_numpy(known[near.astype(np.int64)]).to(rgb.device)
     weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT).square()
@@ -185,6 +185,6 @@ def colours_nearby(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
     return filled
 
 
-def _places(texels: Texels) -> np.ndarray:
+def _positions(texels: Texels) -> np.ndarray:
     """Return the positions and scaled normals (P, 6) of the texels at rest, m."""
     return torch.cat([texels.points, _TURN * texels.normals], dim=1).double().cpu().numpy()

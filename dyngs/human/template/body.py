@@ -187,7 +187,7 @@ def _joint_directions(parents: tuple[int, ...]) -> np.ndarray:
 
 
 def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray) -> np.ndarray:
-    """Return shares (M, J), rows sum to 1: by how much a vertex moves when a joint at rest does."""
+    """Return fractions (M, J), rows sum to 1: by how much a vertex moves when a joint at rest does."""
     follow = np.zeros_like(weights)
     for joint in range(len(parents)):
         rows = np.flatnonzero(weights[:, joint])

@@ -34,9 +34,9 @@ from dyngs.human.template.joints import JOINT_NAMES
 
 @settings(max_examples=40, deadline=None)
 @given(arrays(np.float64, st.tuples(st.integers(0, 12), st.just(3)), elements=st.integers(0, 3)), st.integers(1, 5))
-def test_neighbours_are_the_nearest_others(places: np.ndarray, count: int) -> None:
+def test_neighbours_are_the_nearest_others(positions: np.ndarray, count: int) -> None:
     """By all distances; on a grid, so that many points coincide and are equally far."""
-    points = torch.from_numpy(places)
+    points = torch.from_numpy(positions)
     found = nearest_neighbours(points, count)
     columns = max(0, min(count, len(points) - 1))
     assert found.shape == (len(points), columns)

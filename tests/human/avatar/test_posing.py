@@ -184,7 +184,7 @@ def ancestors(body: BodyTemplate, joint: int) -> set[int]:
 
 
 def test_a_mirrored_pose_mirrors_the_result() -> None:
-    """x -> -x: the two sides change places, and axis-angle vectors keep x only."""
+    """x -> -x: the two sides change positions, and axis-angle vectors keep x only."""
     body, _, _, _ = person()
     swapped = {"left": "right", "right": "left"}
     sides = (name.partition("_") for name in JOINT_NAMES)

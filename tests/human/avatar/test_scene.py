@@ -43,7 +43,7 @@ def stirred() -> HumanScene:
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
     gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1)))
     subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3)))
-    scene = HumanTraining(OPTIONS, subject.footage.frames, Rates(10)).first_scene(gaussians, subject)
+    scene = HumanTraining(OPTIONS, subject.motion.frames, Rates(10)).first_scene(gaussians, subject)
     generator = torch.Generator().manual_seed(2)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)

@@ -77,8 +77,8 @@ def posed(body: BodyTemplate) -> tuple[torch.Tensor, torch.Tensor]:
     poses[0, KNEE, 0], poses[0, 0, 1], poses[0, 16, 2] = 0.8, 0.5, -0.6
     trans = torch.tensor([[0.3, 0.0, 1.0]])
     moves = joint_transforms(body.joints, body.parents, axis_angle_to_matrix(poses))[0]
-    places = (moves[..., :3] @ body.joints[..., None])[..., 0] + moves[..., 3] + trans
-    return posed_vertices(body, poses, trans, None, None), places[:22]
+    positions = (moves[..., :3] @ body.joints[..., None])[..., 0] + moves[..., 3] + trans
+    return posed_vertices(body, poses, trans, None, None), positions[:22]
 
 
 def test_joints_of_posed_vertices(tmp_path: Path) -> None:

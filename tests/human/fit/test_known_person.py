@@ -17,10 +17,9 @@ from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.clips import FittedClip
 from dyngs.human.fit.inputs import KnownAvatar
 from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.training.trainer import Trainer
@@ -97,7 +96,7 @@ def views(avatar: HumanScene, person: Path, tmp_path_factory: pytest.TempPathFac
 
 
 def posed(avatar: HumanScene, views: list[View], clip: MotionClip) -> AvatarPoses:
-    start = FittedClip(clip, (0, 1, 2))
+    start = CapturedMotion(clip, (0, 1, 2))
     return posed_by_avatar(KnownAvatar(avatar, None), views, DataConfig(root=Path()), start)
 
 

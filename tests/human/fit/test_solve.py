@@ -60,9 +60,9 @@ def clip(elbow: float = 0.0) -> MotionClip:
 
 def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
     joints = torch.tensor([[0.0, 0.0, 0.0], [0.5, 1.0, 0.0]])
-    places = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])[None]
-    assert float(keypoint_error(joints, places, camera())) == pytest.approx(0, abs=1e-6)
-    moved = places.clone()
+    positions = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])[None]
+    assert float(keypoint_error(joints, positions, camera())) == pytest.approx(0, abs=1e-6)
+    moved = positions.clone()
     moved[0, 0, 0] += 3 * KEYPOINT
     assert float(keypoint_error(joints, moved, camera())) == pytest.approx((math.sqrt(10) - 1) / 2, rel=1e-4)
     moved[0, 0, 2] = 0

@@ -74,12 +74,12 @@ def test_upright_turns_a_world_whose_z_is_up() -> None:
     poses[:, 0] += torch.tensor([torch.pi / 2, 0, 0])
     clip = MotionClip(torch.linspace(0, 1, 4).double(), poses, torch.rand(4, 3), torch.full((4,), 0.5))
 
-    def places(x: MotionClip) -> torch.Tensor:
+    def positions(x: MotionClip) -> torch.Tensor:
         moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(x.poses)), joints)
         return x.scale[:, None, None] * moved + x.trans[:, None]
 
     turned = upright(clip, clip, joints)
-    torch.testing.assert_close(places(turned), places(clip) @ y_from_z.T, atol=1e-5, rtol=0)
+    torch.testing.assert_close(positions(turned), positions(clip) @ y_from_z.T, atol=1e-5, rtol=0)
     assert torch.equal(up_direction(turned), torch.tensor([0.0, 1.0, 0.0]))
 
 

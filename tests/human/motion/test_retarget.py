@@ -149,7 +149,7 @@ def of_motion(motion: Motion, own: Skeleton) -> SkeletonMotion:
 
 
 def close(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
-    """The same rotations and the same places."""
+    """The same rotations and the same positions."""
     ours, theirs = (world_rotations(x.poses.double().numpy(), skeleton().parents) for x in (found, expected))
     np.testing.assert_allclose(ours, theirs, atol=atol)
     np.testing.assert_allclose(found.trans.numpy(), expected.trans.numpy(), atol=atol)

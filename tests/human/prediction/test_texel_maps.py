@@ -100,15 +100,15 @@ def arms_before_the_chest() -> Tensor:
 
 
 def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """(256, 256, 3) texture by places (P, 3) of the T-pose and the joint (P,) that moves each."""
+    """(256, 256, 3) texture by positions (P, 3) of the T-pose and the joint (P,) that moves each."""
     uv, uv_faces = texture_coordinates(body())
     columns, rows = texel_coordinates(uv, 256)
     fragments = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
     around = body().faces.numpy()[fragments.faces]
-    places = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
+    positions = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
     joints = interpolate(fragments.barycentric, body().weights.double().numpy()[around]).argmax(1)
     texture = np.full((256 * 256, 3), 0.5)
-    texture[fragments.index] = colour_of(places, joints)
+    texture[fragments.index] = colour_of(positions, joints)
     return texture.reshape(256, 256, 3)
 
 
@@ -168,7 +168,7 @@ def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
 
 def test_a_texel_has_the_colour_of_its_place() -> None:
     """A smooth colour over the body, from two sides; up to the light and half a pixel of its change."""
-    texture = painted(lambda places, _: 0.5 + 0.4 * np.sin(3 * places))
+    texture = painted(lambda positions, _: 0.5 + 0.4 * np.sin(3 * positions))
     aside = sitter(torch.zeros(55, 3))
     shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
     maps = observe_texels(aside, shown)
