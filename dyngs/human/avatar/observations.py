@@ -5,7 +5,7 @@ Local letters: N points, J joints.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -24,40 +24,26 @@ FACING_EXPONENT = 4
 """Exponent of the cosine between normal and view direction in the weights of colours: frontal views count most."""
 
 
-@dataclass(frozen=True)
-class SurfacePoints:
-    """N points on a body at rest."""
-
-    points: Tensor  # (N, 3) m
-    normals: Tensor  # (N, 3) outward unit normals
-    weights: Tensor  # (N, J) skinning weights
-    # returns the pose-dependent offsets (N, 3) at rest, m, or None; None: no offsets in any pose
-    offsets: Callable[[BodyPose], Tensor | None] | None = None
-
-    def at_rest(self, pose: BodyPose) -> Tensor:
-        """Return the points (N, 3) before skinning to a pose, m, with its offsets."""
-        offsets = None if self.offsets is None else self.offsets(pose)
-        return self.points if offsets is None else self.points + offsets
-
-
 @torch.no_grad()
-def observed_colours(surface: SurfacePoints, skeleton: Skeleton, images: Iterable[tuple[Image, BodyPose]]) -> Tensor:
-    """Return the mean colours (N, 3) of the points in images with their body poses, weighted towards frontal views.
+def observed_colours(
+    normals: Tensor, weights: Tensor, skeleton: Skeleton, shown: Iterable[tuple[Image, BodyPose, Tensor]]
+) -> Tensor:
+    """Return the mean colours (N, 3) of points of a body in images, weighted towards frontal views.
 
-    Grey for points that no image faces; occlusion is ignored. Without alpha the full frame is silhouette.
+    Grey for points that no image faces; occlusion is ignored. Without alpha the full frame is silhouette. ``normals``
+    (N, 3) are at rest, ``weights`` (N, J) skin; ``shown`` are images, body poses, and the points (N, 3) at rest for
+    each pose.
     """
-    count, device = len(surface.points), surface.points.device
+    count, device = len(normals), normals.device
     colour, weight = torch.zeros(count, 3, device=device), torch.zeros(count, device=device)
-    for image, pose in images:
-        transforms = blend_transforms(
-            surface.weights, joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
-        )
-        world = pose.scale * apply_transforms(transforms, surface.at_rest(pose)) + pose.trans
-        normals = (transforms[..., :3] * surface.normals[:, None]).sum(-1)
+    for image, pose, points in shown:
+        transforms = blend_transforms(weights, joint_transforms(skeleton.joints, skeleton.parents, pose.rotations))
+        world = pose.scale * apply_transforms(transforms, points) + pose.trans
+        turned = (transforms[..., :3] * normals[:, None]).sum(-1)
         column, row, in_frame = _nearest_pixels(world, image.cameras)
         covered = in_frame.float() if image.alpha is None else image.alpha[row, column] * in_frame
         towards = torch.nn.functional.normalize(image.cameras.centers[0] - world, dim=1)
-        facing = (towards * torch.nn.functional.normalize(normals, dim=1)).sum(1).clamp_min(0) ** FACING_EXPONENT
+        facing = (towards * torch.nn.functional.normalize(turned, dim=1)).sum(1).clamp_min(0) ** FACING_EXPONENT
         colour += facing[:, None] * in_frame[:, None] * image.rgb_premultiplied[row, column]
         weight += facing * covered
     seen = weight > 1e-3
@@ -99,15 +85,15 @@ def in_colours_of(gaussians: Gaussians, normals: Tensor, subject: Subject, image
 
     ``normals`` (N, 3) are those of the surface at rest.
     """
-    clip, anchors, skeleton = subject.motion.clip, subject.anchors, subject.skeleton
-    rows = subject.motion.rows
-    shown = ((image, frame_pose(clip, rows[image.frame or 0])) for image in images)
-    weights = skinning_weights(anchors, len(skeleton.joints))
+    anchors, rows = subject.anchors, subject.motion.rows
 
-    def offsets(posing: BodyPose) -> Tensor | None:
-        return rest_offsets(anchors, posing, subject.shapes)
+    def shown() -> Iterator[tuple[Image, BodyPose, Tensor]]:
+        for image in images:
+            pose = frame_pose(subject.motion.clip, rows[image.frame or 0])
+            offsets = rest_offsets(anchors, pose, subject.shapes)
+            yield image, pose, anchors.points if offsets is None else anchors.points + offsets
 
     sh = gaussians.sh.clone()
-    rgb = observed_colours(SurfacePoints(anchors.points, normals, weights, offsets), skeleton, shown)
-    sh[:, 0] = (rgb - 0.5) / SH_C0
+    weights = skinning_weights(anchors, len(subject.skeleton.joints))
+    sh[:, 0] = (observed_colours(normals, weights, subject.skeleton, shown()) - 0.5) / SH_C0
     return gaussians.replace(sh=sh)

@@ -32,20 +32,14 @@ from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
 from dyngs.human.fit.clips import NewClip, fitted_clips, placed_clip
-from dyngs.human.fit.inputs import (
-    NOTHING_ELSE,
-    FitInputs,
-    has_guessed_lens,
-    joints_of,
-    read_person,
-    with_lens,
-)
+from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, read_person, with_lens
+from dyngs.human.fit.joints3d import read_joints
 from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
 from dyngs.human.fit.surface import Surface, drawn_silhouettes, surface_of
 from dyngs.human.motion.clip import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import default_template
+from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
 
 FRAME_RATE = 30.0
@@ -171,12 +165,7 @@ class FittedCapture:
 
 
 def write_fitted_capture(
-    options: DataConfig,
-    out: Path,
-    report: ReportProgress,
-    given: FitInputs = NOTHING_ELSE,
-    *,
-    with_images: bool = True,
+    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE, *, with_images: bool = True
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
@@ -193,7 +182,10 @@ def write_fitted_capture(
         capture = read_person(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
         points = {} if given.keypoints is None else read_keypoints(given.keypoints, capture.splits["train"])
-        known = Known(joints_of(capture, given), has_guessed_lens(capture), person is not None)
+        joints = None
+        if given.joints is not None:
+            joints = read_joints(given.joints, capture, body if given.body is None else read_body(given.body))
+        known = Known(joints, has_guessed_lens(capture), person is not None)
         shaped = body if person is None else with_shape(body, person)
         found = fit_capture(capture, options, shaped, report, points, known=known)
         if person is not None:

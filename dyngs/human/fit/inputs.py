@@ -14,9 +14,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.joints3d import Joints3D, read_joints
 from dyngs.human.fit.lens_fit import LensFit
-from dyngs.human.template.body_reader import default_template, read_body
 
 _LOOKED_AT, _PRESENT = 128, 0.2
 """Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""
@@ -73,13 +71,6 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
             raise DyngsError(f"{source}: no silhouettes, and the camera moves; add masks of the person")
         capture = with_background_masks(capture, work, given.background, say)
     return _without_empty_frames(capture, options, say) if has_guessed_lens(capture) else capture
-
-
-def joints_of(capture: Capture, given: FitInputs) -> Joints3D | None:
-    """Return the 3D joints of the frames of a capture, None without any. Raises DyngsError: see ``read_joints``."""
-    if given.joints is None:
-        return None
-    return read_joints(given.joints, capture, default_template() if given.body is None else read_body(given.body))
 
 
 def with_lens(capture: Capture, lens: LensFit | None) -> Capture:

@@ -13,13 +13,7 @@ from dyngs.human.motion.retarget import retarget
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template
 
-_KINDS = {
-    ".npz": "an AMASS or SMPL-X .npz",
-    ".bvh": "a .bvh",
-    ".glb": "a .glb",
-    ".gltf": "a .gltf",
-    ".vrma": "a .vrma",
-}
+_KINDS = {".npz": "an AMASS or SMPL-X .npz", ".bvh": "a .bvh", ".glb": "a .glb", ".gltf": "a .gltf", ".vrma": "a .vrma"}
 """Names of the formats by suffix."""
 _GLTF_FPS = 30.0
 """Frames per second at which glTF's curves are sampled unless another rate is requested."""
