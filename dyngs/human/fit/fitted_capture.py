@@ -193,10 +193,10 @@ def write_fitted_capture(
         capture = with_lens(capture, found.lens)
         new_poses = placed_clip(capture, options, shaped, found, report)
         clips = fitted_clips(capture, shaped, found, new_poses)
-        by_avatar: list[AvatarPoses] = []
-        for split, clip in clips.items() if given.avatar is not None else ():
-            by_avatar.append(posed_by_avatar(given.avatar, capture.splits[split], options, clip))
-            clips[split] = by_avatar[-1].clip
+        by_avatar: dict[Split, AvatarPoses] = {}
+        if given.avatar is not None:
+            by_avatar = {x: posed_by_avatar(given.avatar, capture.splits[x], options, clips[x]) for x in clips}
+        clips |= {split: found_by.clip for split, found_by in by_avatar.items()}
         if with_images:
             _write_images(folder, capture, options, clips)
             for split, clip in clips.items():
@@ -204,12 +204,14 @@ def write_fitted_capture(
         for split, clip in clips.items():
             write_body(folder / f"body_{split}.npz", clip, found.fit.betas.numpy(), capture.world_offset, capture.fps)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
-        write_text(folder / REPORT_NAME, json.dumps(_report(found, new_poses, by_avatar), indent=1) + "\n")
+        write_text(
+            folder / REPORT_NAME, json.dumps(_report(found, new_poses, tuple(by_avatar.values())), indent=1) + "\n"
+        )
         shutil.rmtree(masks, ignore_errors=True)
         folder.replace(out)  # also where ``out`` is an empty folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return FittedCapture(out, found, new_poses, tuple(by_avatar))
+    return FittedCapture(out, found, new_poses, tuple(by_avatar.values()))
 
 
 def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, CapturedMotion]) -> None:
