@@ -1,6 +1,6 @@
 """Gaussians on the texels of a body template's atlas, and what ties them to its skeleton.
 
-Local letters: N Gaussians, J joints, K joints that one Gaussian follows, P texels.
+Local letters: K joints that one Gaussian follows, P texels.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The captured person, and the first Gaussians on its template, in the colours of images.
 
-Local letters: N points, J joints.
+Local letter: N points.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Either the full images count, or their silhouettes alone (``dyngs.human.avatar.pose_fit``). GART (Lei et al.
 2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test images like this before they score new poses.
-Local letters: F moments, J joints, V images of a moment.
+Local letters: F moments, V images of a moment.
 """
 
 from __future__ import annotations

@@ -53,12 +53,7 @@ class HumanScene(Scene):
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        """Return the scene of what ``state`` returned; it plays the clip of training.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as the others and the options have it.
-        """
+        """Return the scene of what ``state`` returned, playing the clip of training. Raises KeyError or ValueError."""
         tensors = dict(tensors)
         tensors.setdefault(
             "learned.weights", torch.zeros_like(tensors["anchors.weights"])
@@ -236,12 +231,7 @@ _MOST_FACES = 2**31
 
 
 def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
-    """Check the state of an avatar against its Gaussians.
-
-    Raises:
-        KeyError: a tensor is missing.
-        ValueError: a tensor has a wrong shape, type or range.
-    """
+    """Check the state of an avatar against its Gaussians. Raises KeyError or ValueError."""
     n, j, f = len(gaussians), len(state["joints"]), len(state["clip.times"])
     require_body(n, gaussians.sh.shape[1], state["parents"], j)
     require_moments("clip.times", state["clip.times"])

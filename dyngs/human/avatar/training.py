@@ -37,13 +37,9 @@ WORTH_TELLING = 0.01
 
 
 class HumanTraining:
-    """See ``SceneTraining``.
+    """See ``SceneTraining``; ``frames`` are numbers of the rows of the clip of training, ``rates`` say how rates fall.
 
-    Args:
-        options: of the model.
-        frames: number of the frame of each row of the clip of training.
-        rates: how learning rates fall.
-        views: camera and frame of the training views; none: what they do not show is not filled.
+    ``views`` are camera and frame of the training views; without any, what they do not show is not filled.
     """
 
     moves_by = ("pose", "model")

@@ -1,7 +1,4 @@
-"""The fit of a whole capture: reads silhouettes and given poses, fits the body, judges the result on views left out.
-
-Local letters: F frames, V views.
-"""
+"""The fit of a whole capture: reads silhouettes and given poses, fits the body, judges the result on views left out."""
 
 from __future__ import annotations
 

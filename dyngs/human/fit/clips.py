@@ -1,7 +1,4 @@
-"""The fitted poses of all frames that a capture shows, those of the fit and others.
-
-Local letters: F frames.
-"""
+"""The fitted poses of all frames that a capture shows, those of the fit and others."""
 
 from __future__ import annotations
 

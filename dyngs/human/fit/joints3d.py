@@ -1,6 +1,6 @@
 """Fits of other programs as 3D joints: of our own ``.npz`` and ``.json``, of SAM 3D Body, and of posed vertices.
 
-Local letters: F frames, K joints of a format, J joints of SMPL-X, N vertices.
+Local letters: K joints of a format, N vertices.
 """
 
 from __future__ import annotations

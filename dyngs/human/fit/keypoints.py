@@ -1,6 +1,6 @@
 """2D key points of a person in images, as detectors write them: OpenPose and COCO.
 
-Local letters: J joints of SMPL-X, K key points of a format, V views.
+Local letter: K key points of a format.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The observations that a body is fitted to: squares around the person, cut out of the images of each frame.
 
-Local letters: F frames, V views of one frame, S side of a square in pixels.
+Local letters: V views of one frame, S side of a square in pixels.
 """
 
 from __future__ import annotations

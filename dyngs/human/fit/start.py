@@ -1,7 +1,4 @@
-"""First poses of a person of whom only silhouettes are known: where they stand, how they face, frame after frame.
-
-Local letters: F frames, V views, J joints.
-"""
+"""First poses of a person of whom only silhouettes are known: where they stand, how they face, frame after frame."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The template's surface as discs, in any shape and pose: its silhouettes are drawn by the rasterizer.
 
-Local letters: P discs, J joints, B shape parameters.
+Local letters: P discs, B shape parameters.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Reader and writer of AMASS motion files, and of other ``.npz`` with the parameters of SMPL, SMPL-H and SMPL-X.
 
-Local letters: J joints, F frames, B shape parameters.
+Local letter: B shape parameters.
 """
 
 from __future__ import annotations

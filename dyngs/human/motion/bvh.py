@@ -1,6 +1,6 @@
 """Reader of Biovision Hierarchy files (``.bvh``).
 
-Local letters: S joints of the file, F frames, C channels of all joints together.
+Local letters: S joints of the file, C channels of all joints together.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A motion clip in the world of the cameras: body parameters at given times, interpolated at any time between.
-
-Local letters: F frames, J joints, V views.
-"""
+"""A motion clip in the world of the cameras: body parameters at given times, interpolated at any time between."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Reader of skeletal animations in glTF 2.0 files (``.glb``, ``.gltf``), and of VRM animations (``.vrma``).
 
-Local letters: S joints, F frames, K keys of a channel.
+Local letters: S joints, K keys of a channel.
 """
 
 from __future__ import annotations

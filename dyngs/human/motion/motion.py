@@ -1,6 +1,6 @@
 """The motion of a body: pose parameters per frame, resampling, limits of its length.
 
-Local letters: J joints, F frames, B shape parameters.
+Local letter: B shape parameters.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Motion clips moved to the size, place, floor and up direction of a captured person.
-
-Local letters: F frames, J joints.
-"""
+"""Motion clips moved to the size, place, floor and up direction of a captured person."""
 
 from __future__ import annotations
 

@@ -24,16 +24,10 @@ def read_motion(
 ) -> Motion:
     """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``, ``.gltf`` or ``.vrma``.
 
-    Args:
-        path: of the file.
-        body: the template to move; None: the default one. The motion of another skeleton is retargeted to it, with the
-            lowest vertex at y = 0.
-        fps: frames per second to resample to; None: those of the file, 30 for glTF.
-        up: the up axis of an ``.npz``; "auto": see ``dyngs.human.motion.amass.read_amass``.
-        clip: name of the animation of a glTF file; needed where there are several.
-
-    Raises:
-        DyngsError: names the file and what is wrong with it.
+    The motion of another skeleton is retargeted to ``body`` (None: the default template), with the lowest vertex at
+    y = 0. Without ``fps`` it has the frame rate of the file, 30 for glTF. ``up`` is the up axis of an ``.npz``, see
+    ``read_amass``; ``clip`` names the animation of a glTF file, where there are several. Raises DyngsError: names the
+    file and what is wrong with it.
     """
     path, suffix = Path(path), Path(path).suffix.lower()
     if suffix not in _KINDS:

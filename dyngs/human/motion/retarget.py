@@ -1,6 +1,6 @@
 """Retargeting: the motion of another skeleton carried over to a body, by world rotations.
 
-Local letters: J joints of the body, S joints of the other skeleton, F frames, M vertices.
+Local letter: S joints of the other skeleton.
 """
 
 from __future__ import annotations

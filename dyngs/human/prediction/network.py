@@ -33,15 +33,9 @@ class AtlasNetwork(nn.Module):
     """
 
     def __init__(self, channels: int, scaffolds: int, widths: Sequence[int], generator: torch.Generator) -> None:
-        """
-        Args:
-            channels: D, of the input.
-            scaffolds: K.
-            widths: channels at 1/2, 1/4, ... of the resolution; multiples of 8.
-            generator: of the initial weights, on the CPU, where the network is made.
+        """D ``channels`` come in, K ``scaffolds`` go out; ``widths`` are channels at 1/2, 1/4, ... of the resolution.
 
-        Raises:
-            DyngsError: a width that is not a multiple of 8.
+        The network is made on the CPU, with weights of ``generator``. Raises DyngsError: a width is no multiple of 8.
         """
         super().__init__()
         if any(width % _GROUPS for width in widths):

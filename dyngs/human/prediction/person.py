@@ -1,6 +1,6 @@
 """A captured person to predict: the template in the person's shape, its texels, and the choice of views.
 
-Local letters: P texels, K scaffolds, V views, M vertices.
+Local letters: P texels, K scaffolds.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The images of a person become maps over the atlas (GHG, Kwon et al. 2024): each scaffold is rasterized as a mesh into
 each view, and a texel counts as seen where no part of that mesh is in front of it.
 
-Local letters: P texels, K scaffolds, M vertices.
+Local letters: P texels, K scaffolds.
 """
 
 from __future__ import annotations

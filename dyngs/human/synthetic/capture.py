@@ -2,7 +2,7 @@
 
 Images are rasterized with a depth buffer in numpy, independently of the rasterizer of Gaussians, as ground truth.
 
-Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H fragments, S texels per side.
+Local letters: T triangles, U vertices of the atlas, H fragments, S texels per side.
 """
 
 from __future__ import annotations

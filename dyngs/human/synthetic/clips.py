@@ -1,7 +1,4 @@
-"""Clips of synthetic people: a walk, a squat, and random ones, chosen by a seed.
-
-Local letters: F frames.
-"""
+"""Clips of synthetic people: a walk, a squat, and random ones, chosen by a seed."""
 
 from __future__ import annotations
 

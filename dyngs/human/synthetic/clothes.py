@@ -1,6 +1,6 @@
 """Clothes and hair of synthetic people: colours, patterns and cut, chosen by a seed.
 
-Local letters: M vertices, P points, U vertices of the atlas, S texels per side.
+Local letters: P points, U vertices of the atlas, S texels per side.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Body templates of the SMPL family: rest mesh, shape space, joints, skinning weights, and posed vertices.
 
-Local letters: J joints, M vertices, T triangles, U UV vertices, F frames, B shape and E expression parameters.
+Local letters: T triangles, U UV vertices, B shape and E expression parameters.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Reader of body templates: SMPL, SMPL-H and SMPL-X in ``.npz`` or ``.pkl``, and the free template.
 
-Local letters: J joints, M vertices, T triangles, n any number.
+Local letters: T triangles, n any number.
 """
 
 from __future__ import annotations
