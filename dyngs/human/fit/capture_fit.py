@@ -19,10 +19,9 @@ from dyngs.human.fit.joints3d import Joints3D
 from dyngs.human.fit.keypoints import Keypoints
 from dyngs.human.fit.lens_fit import LensFit, fit_lens
 from dyngs.human.fit.lens_fit import num_ticks as num_lens_ticks
-from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
+from dyngs.human.fit.silhouettes import ObservedFrame, longest_box_side, observed_frame, surface_of
 from dyngs.human.fit.solve import FRAMES, BodyFit, Fitting, body_fit, drawn_frame, near_given, new_fit, usual
 from dyngs.human.fit.start import first_poses, num_ticks
-from dyngs.human.fit.surface import surface_of
 from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 

@@ -11,8 +11,8 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.capture import Capture, Split
 from dyngs.human.fit.capture_fit import RESOLUTION, CaptureFit, FitEffort, look_at, measured, ticker
+from dyngs.human.fit.silhouettes import surface_of
 from dyngs.human.fit.solve import Fitting, near_given, new_fit
-from dyngs.human.fit.surface import surface_of
 from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 

@@ -36,7 +36,7 @@ from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, re
 from dyngs.human.fit.joints3d import read_joints
 from dyngs.human.fit.keypoints import read_keypoints
 from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
-from dyngs.human.fit.surface import Surface, drawn_silhouettes, surface_of
+from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
 from dyngs.human.motion.clip import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template, read_body

@@ -14,9 +14,8 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.images.silhouettes import silhouette_box
-from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface
 from dyngs.human.fit.solve import NUM_TURNED, Fitting, Observations, frame_error, new_fit, prior, usual, usual_pose
-from dyngs.human.fit.surface import Surface
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 

@@ -14,8 +14,8 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.human.fit.capture_fit import RESOLUTION, CaptureFit, FitEffort, TriedFit
 from dyngs.human.fit.clips import fitted_clips, placed_clip
+from dyngs.human.fit.silhouettes import surface_of
 from dyngs.human.fit.solve import body_fit, new_fit
-from dyngs.human.fit.surface import surface_of
 from dyngs.human.motion.clip import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body_reader import default_template

@@ -4,9 +4,8 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.human.fit.lens_fit import fit_lens, num_ticks
-from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import Fitting, drawn_frame, near_given, new_fit, with_lens
-from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES

@@ -10,7 +10,7 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import (
     KEYPOINT,
     LIMIT_WEIGHT,
@@ -30,7 +30,6 @@ from dyngs.human.fit.solve import (
     usual,
     with_lens,
 )
-from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES

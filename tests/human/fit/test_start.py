@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dyngs.camera import Cameras
-from dyngs.human.fit.observed import ObservedFrame
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import drawn_frame, new_fit, posed_joints, usual_pose
 from dyngs.human.fit.start import (
     NUM_HEADINGS,
@@ -30,7 +30,6 @@ from dyngs.human.fit.start import (
     standing_clip,
     up_of,
 )
-from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.body_reader import default_template
 
