@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.avatar.anchors import Anchors, skinning_weights
+from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
@@ -141,8 +141,3 @@ def share_sides(learned: Parameters) -> None:
 def learned_light(learned: Parameters) -> Light | None:
     """Return the light, None if none is learned."""
     return Light(learned["normals"], learned["light"]) if "light" in learned else None
-
-
-def corrected_weights(learned: Parameters, anchors: Anchors, num_joints: int) -> Tensor:
-    """Return the corrected skinning weights (N, J)."""
-    return skinning_weights(anchors, num_joints, learned["weights"])

@@ -17,7 +17,6 @@ from torch import Tensor
 from dyngs.data.images.images import area_downscale
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.gaussians.rendering import Rendering, RenderOptions
-from dyngs.gaussians.scene import Moment
 from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
@@ -218,12 +217,12 @@ class _Fit:
             start.scale[0],
         )
         moment = self.scene.in_pose(posing, self.time)
-        losses = [how.difference(self._drawn(x, moment), x, self.background, shrink) for x in images]
+        losses = []
+        for image in images:
+            drawn = self.scene.render(image.cameras, moment, options=self.options, background=self.background)
+            losses.append(how.difference(drawn, image, self.background, shrink))
         size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
         return torch.stack(losses).mean() + size
-
-    def _drawn(self, image: Image, moment: Moment) -> Rendering:
-        return self.scene.render(image.cameras, moment, options=self.options, background=self.background)
 
 
 def _shrinks(images: Sequence[Image]) -> tuple[int, int, int]:

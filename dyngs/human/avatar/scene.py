@@ -18,7 +18,6 @@ from dyngs.human.avatar.corrections import (
     corrected_clip,
     corrected_pose,
     corrected_skeleton,
-    corrected_weights,
     learned_light,
     new_corrections,
 )
@@ -100,7 +99,9 @@ class HumanScene(Scene):
         """(N, J) skinning weights as they were learned."""
         if "weights" not in self._derived:
             with torch.no_grad():
-                self._derived["weights"] = corrected_weights(self.learned, self.anchors, len(self.skeleton.joints))
+                self._derived["weights"] = skinning_weights(
+                    self.anchors, len(self.skeleton.joints), self.learned["weights"]
+                )
         return self._derived["weights"]
 
     @property
@@ -161,7 +162,7 @@ class HumanScene(Scene):
         skeleton, light = self.skeleton, None
         if given_weights is None:
             posing, skeleton = corrected_pose(self.learned, self.clip, row), corrected_skeleton(self.learned, skeleton)
-            weights = corrected_weights(self.learned, self.anchors, len(skeleton.joints))
+            weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
             light = learned_light(self.learned)
         else:
             posing, weights = frame_pose(self.clip, row), given_weights

@@ -100,7 +100,7 @@ def first_poses(
     if seen is None:
         raise ValueError("nobody is seen in the first frame")
     standing, up = standing_clip(times, surface, observed), up_of(seen)
-    anchors = [row for row in anchors_of(len(times)) if observed(row) is not None]
+    anchors = [row for row in evenly_spaced(len(times), MOST_ANCHORS) if observed(row) is not None]
     tried = [_all_headings(standing, row, up, surface, observed, tick) for row in anchors]
     path = likely_path([[error for _, _, error in own] for own in tried])
     roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
@@ -116,14 +116,9 @@ def first_poses(
     return min(followed, key=lambda found: found[1])[0]
 
 
-def anchors_of(frames: int) -> list[int]:
-    """Return the frames of a clip of so many in which all headings are tried."""
-    return evenly_spaced(frames, MOST_ANCHORS)
-
-
 def num_ticks(frames: int, *, marked: bool) -> int:
     """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without key points."""
-    return NUM_HEADINGS * len(anchors_of(frames)) + (frames - 1) * (1 if marked else 1 + _WITHOUT_PATH)
+    return NUM_HEADINGS * len(evenly_spaced(frames, MOST_ANCHORS)) + (frames - 1) * (1 if marked else 1 + _WITHOUT_PATH)
 
 
 def _all_headings(

@@ -6,7 +6,6 @@ Local letter: B shape parameters.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -65,7 +64,9 @@ class Motion:
         times = sample_times(len(self) - 1, self.fps, fps)
         if fps == self.fps:
             return self
-        return concatenated([self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))])
+        parts = [self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))]
+        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
+        return replace(parts[0], **tensors)
 
     def _interpolated(self, times: np.ndarray, fps: float) -> Motion:
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
@@ -78,12 +79,6 @@ class Motion:
 
         poses = interpolate_rotations(self.poses[before], self.poses[after], times - before)
         return Motion(poses, linear(self.trans), self.betas, fps, linear(self.scale))
-
-
-def concatenated(parts: Sequence[Motion]) -> Motion:
-    """Return the motions one after the other: at least one, all of the same person and frame rate."""
-    whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
-    return replace(parts[0], **whole)
 
 
 def frame_chunks(count: int) -> list[slice]:
