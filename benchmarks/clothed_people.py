@@ -52,10 +52,10 @@ from dyngs.human.motion.amass import read_amass, write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import least_rotation
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
-from dyngs.human.synthetic.capture import Light, random_light
+from dyngs.human.synthetic.capture import Lamp, random_light
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES, JOINT_PARENTS
-from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import interpolate, normalized, rasterize
 
 SAMPLES = 3
@@ -246,9 +246,7 @@ class Lens:
         return np.concatenate([SAMPLES * image - 0.5, -1.0 / back[:, None]], axis=1)
 
 
-def draw(
-    avatar: Avatar, posed: tuple[np.ndarray, np.ndarray], pose: np.ndarray, lens: Lens, light: Light
-) -> np.ndarray:
+def draw(avatar: Avatar, posed: tuple[np.ndarray, np.ndarray], pose: np.ndarray, lens: Lens, light: Lamp) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1]: the texture's value times the light received."""
     vertices, normals = posed
     wide = SAMPLES * lens.size
@@ -321,7 +319,7 @@ class Shots:
     fit: Motion
 
 
-def write_split(out: Path, split: str, avatar: Avatar, shots: Shots, lens: Lens, light: Light) -> list[float]:
+def write_split(out: Path, split: str, avatar: Avatar, shots: Shots, lens: Lens, light: Lamp) -> list[float]:
     """Write images and JSON of a split; return the overlap of the fit's silhouette with each mask."""
     body, clip, frames, overlaps = default_template(), shots.clip, [], []
     fit = posed_vertices(body, shots.fit.poses, shots.fit.trans, scale=shots.fit.scale).double().numpy()

@@ -29,11 +29,11 @@ from dyngs.api.train import train
 from dyngs.config import Config, HumanPredictorModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.evaluate.report import evaluate_run
+from dyngs.human.prediction.network import predict_gaussians
 from dyngs.human.prediction.person import spread_views
-from dyngs.human.prediction.predict import predict_gaussians
 from dyngs.human.prediction.texel_maps import from_atlas
 from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
-from dyngs.human.template.load import load_template
+from dyngs.human.template.body_reader import load_template
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
 from dyngs.training.prediction import filmed, human_options, load_network, new_network
 

@@ -15,8 +15,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError
-from dyngs.human.motion.gltf_file import GltfFile
-from dyngs.human.motion.rigs import match_joints
+from dyngs.files.gltf import GltfFile
+from dyngs.human.motion.retarget import match_joints
 from dyngs.human.template.mesh import normalized
 
 

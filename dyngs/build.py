@@ -52,14 +52,13 @@ from dyngs.gaussians.colour.network import box_around, network_of
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions, Shader
 from dyngs.gaussians.scene import Scene, SceneTraining, render_options
-from dyngs.human.avatar.fine_limbs import pixel_size, surface_gaussians, surface_texels
-from dyngs.human.avatar.light import rest_normals
-from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes
+from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
+from dyngs.human.avatar.observations import Subject, in_colours_of
+from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.subject import Subject, first_look
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.captured import captured_motion
-from dyngs.human.template.load import load_template, rest_shape
+from dyngs.human.motion.clip import captured_motion
+from dyngs.human.template.body_reader import load_template, rest_shape
 from dyngs.ops.device import device_for
 from dyngs.static.densify import DefaultDensifier, Densifier
 from dyngs.static.fixed import FixedDensifier
@@ -252,7 +251,7 @@ def _restored(model: SceneModel, gaussians: Gaussians, own: dict[str, torch.Tens
         case DynamicModel():
             return DynamicScene.restored(model, gaussians, own)
         case HumanModel():
-            return HumanScene.restored(model, gaussians, own)
+            return HumanScene.restored(gaussians, own)
         case HumanPredictorModel():
             raise ValueError("the run of a network has no scene")
         case _:
@@ -310,7 +309,7 @@ def _first(
             filmed = capture.splits["train"]
             cameras = training_cameras(filmed, config.data)
             views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
-            training = HumanTraining(config.model, subject.footage.frames, rates_of(config), views)
+            training = HumanTraining(config.model, subject.motion.frames, rates_of(config), views)
             lit = config.model.light and config.model.refine and colours.network is None
             normals = rest_normals(gaussians) if lit else None
             return _First(training.first_scene(gaussians, subject, normals), training, colours)
@@ -374,10 +373,10 @@ def human_start(config: Config, model: HumanModel, capture: Capture, images: Ima
     filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
     cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
     parts = surface_texels(body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0]))
-    gaussians, anchors, normals = surface_gaussians(parts, sorted(set(model.scaffold_heights)), sh_degree)
+    gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
     subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
     shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
-    return first_look(gaussians, normals, subject, shown, model.min_silhouette_fraction)
+    return in_colours_of(gaussians, normals, subject, shown), subject
 
 
 def _training_views(

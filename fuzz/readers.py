@@ -64,7 +64,7 @@ def read_whole_capture(root: Path) -> object:
     from dyngs.data.read import read_capture
     from dyngs.data.tracks import read_tracks
     from dyngs.errors import DyngsError
-    from dyngs.human.motion.captured import captured_motion
+    from dyngs.human.motion.clip import captured_motion
 
     options = DataConfig.model_validate({"root": root})
     try:

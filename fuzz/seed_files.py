@@ -273,7 +273,7 @@ def write_person(root: Path) -> None:
         "anchors.barycentric": torch.ones(n, 3) / 3,
     }
     tensors |= {"anchors.weights": torch.full((n, k), 0.5), "anchors.joints": torch.tensor([[0, 1]] * n).byte()}
-    tensors |= {"anchors.face": torch.zeros(n, dtype=torch.int32), "pose_dirs": torch.zeros(n, 27)}
+    tensors |= {"anchors.face": torch.zeros(n, dtype=torch.int32)}
     tensors |= {
         "skeleton.joints": joints,
         "skeleton.template_joints": joints,

@@ -19,7 +19,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.runs.checkpoint import CheckpointInfo, LoadedRun
 
 RESOLUTION = 64
@@ -56,7 +56,6 @@ def bare_scene(
     clip: MotionClip | None = None,
     colours: Callable[[Tensor], Tensor] = bands,
     resolution: int = RESOLUTION,
-    pose_offsets: bool = False,
     light: bool = False,
 ) -> HumanScene:
     """Opaque discs on the skin; the joints are moved, the pose turned and the size changed by what was learned."""
@@ -68,8 +67,7 @@ def bare_scene(
     )
     clip = random_clip() if clip is None else clip
     skeleton = Skeleton(body.joints, body.parents)
-    options = HumanModel(pose_offsets=pose_offsets)
-    learned = new_corrections(options, clip, skeleton, anchors, texels.normals if light else None)
+    learned = new_corrections(clip, skeleton, anchors, texels.normals if light else None)
     make = torch.Generator().manual_seed(7)
     values = {name: x.detach().clone() for name, x in learned.values().items()}
     values["joints"] = 0.01 * torch.randn(55, 3, generator=make)

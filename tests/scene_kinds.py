@@ -15,14 +15,13 @@ from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import texel_gaussians
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.subject import Subject
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.captured import CapturedMotion
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 from dyngs.state import State, part_of, tensors_of
@@ -32,7 +31,7 @@ from dyngs.static.scene import StaticScene
 KINDS = ("static", *FIELDS, "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])
 SEEN_AT = (0.0, 0.5, 1.0)
-PERSON = HumanModel(sh_degree=0, pose_offsets=True)
+PERSON = HumanModel(sh_degree=0)
 
 
 def scene_of_kind(kind: str) -> Scene:
@@ -59,7 +58,7 @@ def restored(kind: str, state: State) -> Scene:
     if kind == "static":
         return StaticScene.restored(gaussians, own)
     if kind == "human":
-        return HumanScene.restored(PERSON, gaussians, own)
+        return HumanScene.restored(gaussians, own)
     return DynamicScene.restored(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from dyngs.config import DataConfig, HumanPredictorModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.training.prediction import Filmed, filmed
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)

@@ -15,10 +15,10 @@ from dyngs.config.io import load_config, load_resolved, packaged_preset
 from dyngs.config.kinds import network_of, person_of
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
-from dyngs.human.fit.before_training import with_fitted_body
+from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.prediction.network import PredictedAvatar, predict_gaussians
 from dyngs.human.prediction.person import CapturedPerson, named_views, spread_views
-from dyngs.human.prediction.predict import PredictedAvatar, predict_gaussians
-from dyngs.human.template.load import load_template
+from dyngs.human.template.body_reader import load_template
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import new_folder, require_empty
@@ -123,17 +123,7 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
     person = person_of(preset)
     if person is None:
         raise ValueError(f"the preset of one person is of model.kind={preset.model.kind}")
-    same = (
-        "body",
-        "uv",
-        "resolution",
-        "scaffold_heights",
-        "min_silhouette_fraction",
-        "near",
-        "eps2d",
-        "rasterize_mode",
-        "sh_degree",
-    )
+    same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
     given = human_options(model)
     human = person.model_copy(update={name: getattr(given, name) for name in same})
     config = preset.model_copy(

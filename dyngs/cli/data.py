@@ -241,8 +241,7 @@ def run_motion(arguments: argparse.Namespace) -> int:
     """Convert the motion and print a summary."""
     from dyngs.human.motion.amass import write_amass
     from dyngs.human.motion.read import read_motion
-    from dyngs.human.template.body_reader import read_body
-    from dyngs.human.template.load import default_template
+    from dyngs.human.template.body_reader import default_template, read_body
 
     out: Path = arguments.out
     if out.exists():

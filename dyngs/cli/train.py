@@ -134,7 +134,7 @@ def _with_poses(config: Config) -> Config:
 def _with_fitted_body(config: Config) -> Config:
     """Return the configuration with the free template fitted to the person, where asked for or needed."""
     from dyngs.config.kinds import person_of
-    from dyngs.human.fit.before_training import with_fitted_body
+    from dyngs.human.fit.fitted_capture import with_fitted_body
 
     model = person_of(config)
     if model is None or model.body is not None:

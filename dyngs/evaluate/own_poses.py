@@ -20,8 +20,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.temporal import Drawing
 from dyngs.evaluate.view_scores import PoseScores, means_of, score_views
-from dyngs.human.avatar.pose_comparison import IMAGES, SILHOUETTES, Comparison
-from dyngs.human.avatar.pose_fit import fitted_to_images
+from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.metrics import Lpips, psnr
 from dyngs.runs.cameras import found_corrections

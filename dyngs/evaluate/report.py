@@ -26,7 +26,7 @@ from dyngs.evaluate.view_scores import PoseScores, ViewScore, mean_of, means_of,
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.human.avatar.scene import avatar_of
-from dyngs.human.motion.captured import captured_motion, same_bodies
+from dyngs.human.motion.clip import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run

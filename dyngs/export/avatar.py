@@ -22,13 +22,11 @@ from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
-from dyngs.human.avatar.light import TERMS
-from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
-from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.human.avatar.validation import require_body, require_shapes
+from dyngs.human.avatar.posing import TERMS, PoseBlendShapes, Skeleton
+from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.motion.placement import rest_clip
-from dyngs.human.template.load import template_path
+from dyngs.human.template.body_reader import template_path
 from dyngs.runs.checkpoint import LoadedRun, info_of
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
@@ -93,8 +91,6 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
     }
     if scene.shapes is not None:
         tensors |= {"shapes.directions": scene.shapes.directions.half(), "shapes.faces": scene.shapes.faces.int()}
-    if scene.pose_dirs is not None:
-        tensors["pose_dirs"] = scene.pose_dirs
     if scene.light is not None:
         tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
     header = {**asdict(run.info), "near": model.near, "eps2d": model.eps2d, "template": asdict(_template_ref(model))}
@@ -162,8 +158,6 @@ def _check(tensors: Mapping[str, Tensor]) -> None:
     shapes |= {f"anchors.{name}": shape for name, shape in anchors.items()}
     shapes |= dict.fromkeys(("skeleton.joints", "skeleton.template_joints", "fit.turns", "reference.poses"), (j, 3))
     shapes |= {"fit.log_scale": (1,), "reference.trans": (3,), "reference.scale": (1,)}
-    if "pose_dirs" in tensors:
-        shapes["pose_dirs"] = (n, 27)
     if "light" in tensors:
         shapes |= {"light": (TERMS, 3), "normals": (n, 3)}
     if not n:
@@ -208,14 +202,13 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
         "log_scale": tensors["fit.log_scale"],
         "weights": torch.zeros_like(anchors.weights),
     }
-    values |= {name: tensors[name] for name in ("pose_dirs", "light", "normals") if name in tensors}
-    options = HumanModel(pose_offsets="pose_dirs" in tensors)
+    values |= {name: tensors[name] for name in ("light", "normals") if name in tensors}
     return HumanScene(
         gaussians=Gaussians.stored(Gaussians(**part("gaussians.")).tensors()),  # and nothing else
         anchors=anchors,
         skeleton=skeleton,
         clip=reference,
-        learned=new_corrections(options, reference, skeleton, anchors, tensors.get("normals")).restored(values),
+        learned=new_corrections(reference, skeleton, anchors, tensors.get("normals")).restored(values),
         shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
     )
 

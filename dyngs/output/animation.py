@@ -11,7 +11,7 @@ from dyngs.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.clip import motion_clip
 from dyngs.human.motion.placement import place_like, rest_clip
-from dyngs.human.template.load import load_template
+from dyngs.human.template.body_reader import load_template
 from dyngs.runs.checkpoint import LoadedRun
 
 

@@ -14,7 +14,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.html.page import Staging, WrittenPage, write_page
-from dyngs.human.avatar.light import LEFT_OUT
+from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction as up_of_clip
 from dyngs.output.aim import look_at_point, up_direction

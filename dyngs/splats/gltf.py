@@ -6,24 +6,27 @@ and ``SH_DEGREE_l_COEF_n`` up to degree 3, and ``COLOR_0`` (linear RGB) for view
 
 from __future__ import annotations
 
-import json
-import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from dyngs.conventions import SH_C0, num_sh_terms
+from dyngs.files.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
+from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
-from dyngs.splats.glb_file import GlbFile
 from dyngs.splats.packing import logit
 from dyngs.splats.rotation import turned
-from dyngs.splats.splat_file import SplatFile, unit_rotations
+from dyngs.splats.similarity import Placement, placement_of
+from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
 
 EXTENSION = "KHR_gaussian_splatting"
-_FLOAT, _POINTS, _ARRAY_BUFFER = 5126, 0, 34962
-_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_POINTS = 0
+_MOST_NODES, _MOST_DEPTH = 4096, 32
+"""Limits on the nodes that are visited, and on those above one another."""
 
 
 def read_gltf(path: Path) -> SplatFile:
@@ -32,9 +35,9 @@ def read_gltf(path: Path) -> SplatFile:
     Raises:
         DyngsError: no primitive of Gaussians, a kernel or colour space other than those of 3DGS, or damaged contents.
     """
-    file = GlbFile(path)
+    file = GltfFile(path)
     found: list[Gaussians] = []
-    for primitive, placement in file.primitives(EXTENSION):
+    for primitive, placement in _placed_primitives(file):
         own = _gaussians(file, primitive)
         found.append(turned(own, placement.rotation, placement.scale, placement.shift_tensor))
     if not found:
@@ -46,40 +49,19 @@ def read_gltf(path: Path) -> SplatFile:
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
     """Write a .glb with one primitive of Gaussians, harmonics up to degree 3."""
-    arrays = gaussian_attributes(splat.gaussians)
-    views, accessors, start = [], [], 0
-    for name, values in arrays.items():
-        size = 4 * values.size
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": size, "target": _ARRAY_BUFFER})
-        accessor: dict[str, Any] = {"bufferView": len(views) - 1, "componentType": _FLOAT, "count": len(values)}
-        accessor["type"] = _KINDS[values.shape[1]]
-        if name == "POSITION":
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        accessors.append(accessor)
-        start += size
-    document = {
-        "asset": {"version": "2.0", "generator": "dyngs"},
+    document = GlbDocument()
+    document.json |= {
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [gaussian_primitive({name: i for i, name in enumerate(arrays)})]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": start}],
+        "meshes": [{"primitives": [add_gaussians(document, splat.gaussians)]}],
     }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    with open(path, "wb") as out:
-        out.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + start))
-        out.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        out.write(struct.pack("<I4s", start, b"BIN\0"))
-        for values in arrays.values():
-            out.write(np.ascontiguousarray(values, "<f4").tobytes())
+    document.write(path)
 
 
-def gaussian_attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the numbers (N, D) of Gaussians by attribute of a primitive, harmonics up to degree 3."""
+def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]:
+    """Add the numbers of Gaussians to a document, harmonics up to degree 3; return their primitive."""
     sh = gaussians.sh.numpy()
     arrays = {
         "POSITION": gaussians.means.numpy(),
@@ -92,11 +74,10 @@ def gaussian_attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         first = num_sh_terms(degree - 1)
         for k in range(first, num_sh_terms(degree)):
             arrays[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - first}"] = sh[:, k]
-    return arrays
-
-
-def gaussian_primitive(attributes: dict[str, int]) -> dict[str, Any]:
-    """Return a primitive of Gaussians with accessors by attribute."""
+    attributes = {
+        name: document.add_numbers(values.astype(np.float32, copy=False), VERTICES, limits=name == "POSITION")
+        for name, values in arrays.items()
+    }
     own = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     own |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
@@ -108,32 +89,71 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
     return np.where(inside <= 0.04045, inside / 12.92, ((inside + 0.055) / 1.055) ** 2.4)
 
 
-def _gaussians(file: GlbFile, primitive: dict[str, Any]) -> Gaussians:
+def _placed_primitives(file: GltfFile) -> Iterator[tuple[Primitive, Placement]]:
+    """Yield the primitives of Gaussians, and where nodes put them."""
+    document, visited = file.document, 0
+    if document.scenes and document.scene >= len(document.scenes):
+        raise file.error(f"scene {document.scene} is missing; export it again")
+    roots = document.scenes[document.scene].nodes if document.scenes else range(len(document.nodes))
+    waiting = [(node, np.eye(4), 0) for node in roots]
+    while waiting:
+        index, above, depth = waiting.pop()
+        visited += 1
+        if depth > _MOST_DEPTH or visited > _MOST_NODES:
+            raise file.error(f"has more than {_MOST_NODES} nodes or {_MOST_DEPTH} of them above one another")
+        if index >= len(document.nodes):
+            raise file.error(f"node {index} is missing; export it again")
+        node = document.nodes[index]
+        world = above @ _matrix(node)
+        waiting += [(child, world, depth + 1) for child in node.children]
+        if node.mesh is not None and node.mesh >= len(document.meshes):
+            raise file.error(f"mesh {node.mesh} is missing; export it again")
+        primitives = () if node.mesh is None else document.meshes[node.mesh].primitives
+        for primitive in primitives:
+            if EXTENSION in primitive.extensions:
+                placement = placement_of(world)
+                if placement is None:
+                    raise file.error("a node distorts or mirrors its Gaussians; apply its transform before exporting")
+                yield primitive, placement
+
+
+def _matrix(node: Node) -> np.ndarray:
+    """Return the transform (4, 4) of a node; a rotation of zeros counts as none."""
+    if node.matrix is not None:
+        return np.array(node.matrix).reshape(4, 4).T
+    matrix = np.eye(4)
+    if np.linalg.norm(node.rotation) > 1e-6:
+        matrix[:3, :3] = Rotation.from_quat(node.rotation).as_matrix()
+    matrix[:3, :3] *= node.scale
+    matrix[:3, 3] = node.translation
+    return matrix
+
+
+def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
     """Return the Gaussians of a primitive, in the axes of its node."""
-    own = primitive["extensions"][EXTENSION]
-    if "extensions" in own:
+    own, names = primitive.extensions[EXTENSION], primitive.attributes
+    if not isinstance(own, dict) or "extensions" in own:
         raise file.error("its Gaussians are compressed by another extension; export them without")
     for key, known in (("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")):
         if own.get(key) != known:
             raise file.error(f"{key} {own.get(key)!r:.40} is not supported, only {known}")
-    names = primitive.get("attributes")
-    if not isinstance(names, dict):
-        raise file.error("its Gaussians have no attributes; export it again")
 
-    def numbers(name: str, width: int) -> np.ndarray:
+    def numbers(name: str, kind: str) -> np.ndarray:
         if name not in names:
             raise file.error(f"its Gaussians have no {name:.60}; export it again")
-        return file.numbers(names[name], width)
+        found = file.numbers(names[name], kind, np.float32)
+        require_at_most(file.path, len(found), MOST_GAUSSIANS, "Gaussians")
+        return found
 
-    means = numbers("POSITION", 3)
+    means = numbers("POSITION", "VEC3")
     terms = []
     for degree in range(4):
         keys = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)]
         if degree and keys[0] not in names:
             break
-        terms += [numbers(key, 3) for key in keys]
-    scales, opacities = numbers(f"{EXTENSION}:SCALE", 3), numbers(f"{EXTENSION}:OPACITY", 1)[:, 0]
-    rotations = numbers(f"{EXTENSION}:ROTATION", 4)
+        terms += [numbers(key, "VEC3") for key in keys]
+    scales, opacities = numbers(f"{EXTENSION}:SCALE", "VEC3"), numbers(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0]
+    rotations = numbers(f"{EXTENSION}:ROTATION", "VEC4")
     if any(len(x) != len(means) for x in (*terms, scales, opacities, rotations)):
         raise file.error("the attributes of its Gaussians have different lengths; export it again")
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -17,12 +17,11 @@ from dyngs.gaussians.rendering import Rendering
 from dyngs.gaussians.scene import render_options
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.prediction.network import AtlasNetwork
+from dyngs.human.prediction.network import AtlasNetwork, PredictedAvatar, num_input_channels, predict_gaussians
 from dyngs.human.prediction.person import CapturedPerson, captured_person, spread_views
-from dyngs.human.prediction.predict import PredictedAvatar, num_input_channels, predict_gaussians
 from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atlas
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import load_template
+from dyngs.human.template.body_reader import load_template
 from dyngs.ops.device import CPU, device_for
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.transfer import sent
@@ -269,8 +268,8 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
 
 
 def human_options(model: HumanPredictorModel) -> HumanModel:
-    """Return the section of one person with the same template, texels and scaffolds; nothing of it is learned."""
-    shared = ("body", "uv", "resolution", "scaffold_heights", "min_silhouette_fraction")
+    """Return the section of one person with the same template and texels; nothing of it is learned."""
+    shared = ("body", "uv", "resolution")
     drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     none = {"refine": False, "offset_weight": 0, "scale_weight": 0, "rigidity": 0, "smoothness": 0}
     return HumanModel.model_validate({"sh_degree": 0, **none} | {name: getattr(model, name) for name in shared + drawn})
@@ -296,7 +295,7 @@ def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> 
         DyngsError: no capture there, or not one of a person.
     """
     capture = read_capture(data)
-    return Filmed(captured_person(capture, human_options(model), body), ImageLoader(capture.splits["train"], data), [])
+    return Filmed(captured_person(capture, model, body), ImageLoader(capture.splits["train"], data), [])
 
 
 def mean_colours(people: list[Filmed], resolution: int) -> Tensor:
@@ -338,5 +337,5 @@ def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torc
 
 def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[HumanScene, HumanTraining]:
     """Return a predicted avatar as a scene, and how it is trained on."""
-    training = HumanTraining(model, avatar.subject.footage.frames, rates)
+    training = HumanTraining(model, avatar.subject.motion.frames, rates)
     return training.first_scene(avatar.gaussians, avatar.subject), training

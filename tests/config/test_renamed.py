@@ -14,7 +14,7 @@ from dyngs.errors import DyngsError
 
 FORMER = Path(__file__).parent / "former"
 """Resolved configurations as the version before the new names wrote them."""
-PRESETS = ("static", "blender", "colmap", "dynamic", "human", "human_net", "mip", "static_mcmc")
+PRESETS = ("static", "blender", "colmap", "dynamic", "human_net", "mip", "static_mcmc")
 MORE = {
     "dynamic_hexplane": (
         "model.deform.kind=hexplane",
@@ -38,7 +38,6 @@ def now(preset: str, *overrides: str) -> Config:
 
 ADDED = {
     "dynamic": ("model.compare_with_still=false", "model.pilot_steps=0", "train.alpha_weight=0"),
-    "human": ("model.scaffold_heights=[0,0.02]", "train.steps=2000"),
 }
 """Overrides that undo what presets ask for since."""
 
@@ -56,8 +55,7 @@ def with_choices(config: Config) -> Config:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_runs_of_before_are_what_their_presets_still_say(preset: str, tmp_path: Path) -> None:
-    """But for what the preset of moving scenes asks for since: silhouettes where needed, a static model beside it;
-    and that of people: one scaffold, more steps."""
+    """But for what the preset of moving scenes asks for since: silhouettes where needed, a static model beside it."""
     config, asked = load_resolved(FORMER / f"{preset}.yaml"), ADDED.get(preset, ())
     assert with_choices(config) == now(preset, *asked)
     save_config(config, tmp_path / "config.yaml")
@@ -92,7 +90,6 @@ def test_keys_that_are_constants_are_gone(key: str) -> None:
 @pytest.mark.parametrize(
     ("name", "line", "key", "value"),
     [
-        ("human", "lr_poses: 0.001", "model.lr_poses", "0.002"),
         ("dynamic", "lr_decay: 0.2", "model.deform.lr_decay", "0.01"),
         ("static", "eps: 1.0e-15", "optim.eps", "1.0e-8"),
         ("static", "eps: 1.0e-15", "optim.eps", "true"),

@@ -40,7 +40,7 @@ def trained(capture: Path, folder: Path, **model: object) -> Path:
     return train(
         Config(
             data=DataConfig(root=capture),
-            model=HumanModel(resolution=16, min_silhouette_fraction=0.0, refine_from=0.0, sh_degree=0, **model),  # type: ignore[arg-type]
+            model=HumanModel(resolution=16, refine_from=0.0, sh_degree=0, **model),  # type: ignore[arg-type]
             strategy=DefaultStrategy(grow=False),
             train=TrainConfig(steps=4),
             run=RunConfig(dir=folder, threads=1),
@@ -50,7 +50,7 @@ def trained(capture: Path, folder: Path, **model: object) -> Path:
 
 @pytest.fixture(scope="module")
 def run_dir(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(capture, tmp_path_factory.mktemp("run"), pose_offsets=True, light=True)
+    return trained(capture, tmp_path_factory.mktemp("run"), light=True)
 
 
 @pytest.fixture
@@ -78,7 +78,6 @@ def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> N
             assert float((a - b).abs().amax((1, 2)).div(b.abs().amax((1, 2))).max()) < 1e-4
     assert isinstance(read.scene, HumanScene)
     assert isinstance(run.scene, HumanScene)
-    assert read.scene.pose_dirs is not None
     assert read.scene.light is not None
     assert read.scene.light.factors.any()
     assert asdict(read.info) == asdict(run.info)
@@ -141,7 +140,6 @@ Change = Callable[[dict[str, Tensor]], object]
         (lambda x: x["anchors.weights"].mul_(2), "negative or do not sum to 1"),
         (lambda x: x["skeleton.parents"].fill_(7), "joint 0 has parent 7"),
         (lambda x: x["reference.scale"].zero_(), "'reference.scale' must be above 0"),
-        (lambda x: x.update({"pose_dirs": torch.zeros(1, 27)}), "'pose_dirs' is"),
         (lambda x: x.update({"shapes.directions": torch.zeros(486, 3)}), "shapes.faces is missing"),
         (lambda x: x.update({"gaussians.more": torch.zeros(1)}), "more"),
     ],

@@ -12,22 +12,11 @@ from dyngs.config.keys.section import Fraction, Positive
 
 
 class _OnTemplate(SceneModel):
-    """Keys that models of people share: a body template, and scaffolds of Gaussians around it."""
+    """Keys that models of people share: a body template."""
 
     body: Path | None = Field(default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template")
     uv: Path | None = Field(default=None, description=".obj with the texture coordinates of body; null: its own")
     resolution: int = Field(default=128, ge=8, le=1024, description="texels per side of the template's texture atlas")
-    scaffold_heights: tuple[float, ...] = Field(
-        default=(0.0,),
-        min_length=1,
-        description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
-        "multi-scaffold of GHG)",
-    )
-    min_silhouette_fraction: Fraction = Field(
-        default=0.9,
-        description="Gaussians above the lowest scaffold must lie inside at least this fraction of the silhouettes "
-        "(visual hull); 0: all are kept",
-    )
 
 
 class HumanModel(_OnTemplate):
@@ -48,10 +37,6 @@ class HumanModel(_OnTemplate):
     refine_frames_from: Fraction = Field(
         default=0.25,
         description="fraction of the run after which poses of single frames are, too: what frames share comes first",
-    )
-    pose_offsets: bool = Field(
-        default=False,
-        description="learn offsets at rest that are linear in the rotations of nearby joints (pose blend shapes)",
     )
     light: bool = Field(
         default=True,
@@ -91,7 +76,13 @@ class HumanPredictorModel(_OnTemplate):
     scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02, 0.04),
         min_length=1,
-        description=str(_OnTemplate.model_fields["scaffold_heights"].description),
+        description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
+        "multi-scaffold of GHG)",
+    )
+    min_silhouette_fraction: Fraction = Field(
+        default=0.9,
+        description="Gaussians above the lowest scaffold must lie inside at least this fraction of the silhouettes "
+        "(visual hull); 0: all are kept",
     )
     source_views: int = Field(default=3, ge=1, description="images of a person that it is predicted from, at most")
     fewest_views: int = Field(

@@ -122,7 +122,7 @@ def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float
     lists.exact("clip_places", _numpy(torch.cat([clip.trans, clip.scale[:, None]], dim=1)))
     lists.quantised("clip_quats", quats, 16)
     told: dict[str, Any] = {"bones": {"parents": list(skeleton.parents)}}
-    if scene.shapes is not None or scene.pose_dirs is not None:
+    if scene.shapes is not None:
         heads, error = fitted_curves(lambda time: _rest_offsets(scene, time), len(clip), tolerance)
         told["curves"] = _add_curves(Curves(heads, error=error), order, lists)
     return told
@@ -130,7 +130,7 @@ def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float
 
 def _rest_offsets(scene: HumanScene, time: float) -> Offsets:
     posing = frame_pose(scene.moves_as.at(time), 0)
-    found = rest_offsets(scene.anchors, scene.weights, posing, scene.shapes, scene.pose_dirs)
+    found = rest_offsets(scene.anchors, posing, scene.shapes)
     return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
 
 

@@ -13,16 +13,24 @@ import torch
 from dyngs.config.kinds import person_of
 from dyngs.errors import DyngsError
 from dyngs.export.rigged.body import BodyMesh, anchor_normals, body_mesh, rest_vertices
-from dyngs.export.rigged.skeleton import Animation, Rig, add_animation, add_skeleton, add_weights, animation_of, rig_of
+from dyngs.export.rigged.skeleton import (
+    JointAnimation,
+    Rig,
+    add_animation,
+    add_skeleton,
+    add_weights,
+    animation_of,
+    rig_of,
+)
 from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
-from dyngs.files.glb import INDICES, VERTICES, GlbDocument
+from dyngs.files.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.files.write import atomic_file
-from dyngs.human.avatar.light import LEFT_OUT
+from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import load_template
+from dyngs.human.template.body_reader import load_template
 from dyngs.runs.checkpoint import LoadedRun
 
 SUFFIX = ".glb"
@@ -101,7 +109,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
             f"the surface is moved to the Gaussians: silhouettes agree at {surface.agreement:.3f} (intersection over "
             f"union), those of the template at {surface.plain:.3f}"
         )
-    if scene.shapes is not None or scene.pose_dirs is not None:
+    if scene.shapes is not None:
         notes.append("offsets that depend on the pose are left out: glTF's skins have none")
     if scene.light is not None:
         notes.append(LEFT_OUT)
@@ -128,7 +136,7 @@ def texture_size(scene: HumanScene) -> int:
     return min(_FINER * max(round(1 / finest), 1), _LARGEST)
 
 
-def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: Animation | None) -> GlbDocument:
+def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointAnimation | None) -> GlbDocument:
     """Return a mesh with its skeleton, texture and animation as a glTF document."""
     document, nodes = GlbDocument(), list[dict[str, Any]]()
     armature, first = add_skeleton(document, rig, nodes)

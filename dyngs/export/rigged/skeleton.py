@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.files.glb import VERTICES, GlbDocument
+from dyngs.files.gltf import VERTICES, GlbDocument
 from dyngs.human.avatar.anchors import heaviest_joints
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
@@ -61,7 +61,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Animation:
+class JointAnimation:
     """Motion of a rig's joints.
 
     Attributes:
@@ -85,7 +85,9 @@ def rig_of(scene: HumanScene, vertices: Tensor) -> Rig:
     return Rig(scene.learned_skeleton, scale, -scale * float(vertices[:, 1].amin()))
 
 
-def animation_of(scene: HumanScene, rig: Rig, vertices: Tensor, weights: Tensor, fps: float, name: str) -> Animation:
+def animation_of(
+    scene: HumanScene, rig: Rig, vertices: Tensor, weights: Tensor, fps: float, name: str
+) -> JointAnimation:
     """Return the motion that a person plays: y up, on the floor y = 0, around the origin.
 
     Args:
@@ -111,7 +113,7 @@ def animation_of(scene: HumanScene, rig: Rig, vertices: Tensor, weights: Tensor,
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
     for before, after in pairwise(quats):
         after[(before * after).sum(-1) < 0] *= -1  # programs that interpolate the numbers go the shorter way
-    return Animation(name, np.arange(len(root)) / fps, quats, root, clip.scale.double().numpy() / rig.scale)
+    return JointAnimation(name, np.arange(len(root)) / fps, quats, root, clip.scale.double().numpy() / rig.scale)
 
 
 def add_skeleton(document: GlbDocument, rig: Rig, nodes: list[dict[str, Any]]) -> tuple[int, int]:
@@ -133,7 +135,7 @@ def add_skeleton(document: GlbDocument, rig: Rig, nodes: list[dict[str, Any]]) -
     return len(nodes) - 1, first
 
 
-def add_animation(document: GlbDocument, animation: Animation, first: int) -> None:
+def add_animation(document: GlbDocument, animation: JointAnimation, first: int) -> None:
     """Add an animation of the joints, whose nodes begin at ``first``; joints that never turn have no channel."""
     times = document.add_numbers(animation.seconds.astype(np.float32), limits=True)
     channels, samplers = [], []

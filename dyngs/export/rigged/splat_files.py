@@ -17,14 +17,14 @@ from dyngs.export.rigged.body import anchor_normals, rest_vertices
 from dyngs.export.rigged.mesh_file import Played, person_and_template
 from dyngs.export.rigged.skeleton import Rig, add_animation, add_skeleton, add_weights, animation_of, rig_of
 from dyngs.export.rigged.texture import frontal_colours
-from dyngs.files.glb import VERTICES, GlbDocument
+from dyngs.files.gltf import GlbDocument
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import heaviest_joints
-from dyngs.human.avatar.light import LEFT_OUT
+from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.splats.gltf import EXTENSION, gaussian_attributes, gaussian_primitive
+from dyngs.splats.gltf import EXTENSION, add_gaussians
 from dyngs.splats.ply import write_ply
 
 SUFFIXES = (".ply", ".glb")
@@ -67,7 +67,7 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
         colours = frontal_colours(scene, anchor_normals(scene.anchors, body, vertices))
         gaussians = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None])
         notes = ("the colours of the run are a network; the file has those seen from straight above the skin",)
-    if scene.shapes is not None or scene.pose_dirs is not None:
+    if scene.shapes is not None:
         notes = (*notes, "offsets that depend on the pose are left out: skinning weights hold none")
     if scene.light is not None:
         notes = (*notes, LEFT_OUT)
@@ -106,15 +106,13 @@ def _document(scene: HumanScene, rig: Rig, gaussians: Gaussians) -> GlbDocument:
     nodes: list[dict[str, object]] = []
     armature, _ = add_skeleton(document, rig, nodes)
     nodes.append({"name": "person", "mesh": 0, "skin": 0})
-    attributes = {
-        name: document.add_numbers(values.astype(np.float32), VERTICES, limits=name == "POSITION")
-        for name, values in gaussian_attributes(gaussians).items()
-    } | add_weights(document, scene.weights)
+    primitive = add_gaussians(document, gaussians)
+    primitive["attributes"] |= add_weights(document, scene.weights)
     document.json |= {
         "scene": 0,
         "scenes": [{"nodes": [armature, len(nodes) - 1]}],
         "nodes": nodes,
-        "meshes": [{"name": "person", "primitives": [gaussian_primitive(attributes)]}],
+        "meshes": [{"name": "person", "primitives": [primitive]}],
         "extensionsUsed": [EXTENSION],
     }
     return document

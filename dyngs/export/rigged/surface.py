@@ -39,7 +39,7 @@ _ANGLES = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 
 
 @dataclass(frozen=True)
-class Surface:
+class FittedSurface:
     """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians.
 
     Attributes:
@@ -57,7 +57,7 @@ class Surface:
 
 def fitted_surface(
     gaussians: Gaussians, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels
-) -> Surface:
+) -> FittedSurface:
     """Return the surface whose silhouettes agree best with the Gaussians', of the template's and some moved ones.
 
     A vertex is displaced by the mean displacement of the samples around it in space, along their normals, up to what is
@@ -73,13 +73,13 @@ def fitted_surface(
     cameras = _cameras(vertices)
     shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5
     plain = best = _agreement(vertices, body, cameras, shown)
-    found = Surface(vertices, None, plain, plain)
+    found = FittedSurface(vertices, None, plain, plain)
     pull = _Pull(body, vertices, samples, baked)
     for margin in MARGINS if pull.is_known else ():
         moved = pull.moved(margin)
         agreement = _agreement(moved, body, cameras, shown)
         if agreement > best:
-            best, found = agreement, Surface(moved, margin, agreement, plain)
+            best, found = agreement, FittedSurface(moved, margin, agreement, plain)
     return found
 
 

@@ -1,6 +1,6 @@
 """Gaussians on the texels of a body template's atlas, and what ties them to its skeleton.
 
-Local letters: N Gaussians, J joints, K joints that one Gaussian follows, P texels.
+Local letters: K joints that one Gaussian follows, P texels.
 """
 
 from __future__ import annotations
@@ -11,47 +11,37 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.nearest_rotation import quats_of
-from dyngs.human.template.atlas import Texels, scaffold_points
+from dyngs.human.template.atlas import Texels, atlas_texels
+from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.state import fields_moved_to
 
 MAX_JOINTS = 8
 """Limit on the joints that one Gaussian follows; vertices of the free template follow no more."""
-
-
 _WIDTH, _THICKNESS = 0.5, 0.25
 """Standard deviations of an initial Gaussian in the tangent plane and along the normal, in sides of its texel."""
-
-
 _LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1
 """Initial opacities: on the lowest scaffold, and on those above it."""
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """Constant attributes that tie N Gaussians to the template, row by row.
+    """Constant attributes that tie N Gaussians to the template, row by row."""
 
-    Attributes:
-        points: (N, 3) at rest on the scaffold, m.
-        size: (N,) side of the texel, m.
-        joints: (N, K) int64 joints that the Gaussian follows, heaviest first.
-        weights: (N, K) skinning weights of these joints, rows sum to 1.
-        face: (N,) int64 triangle of the template that holds the texel's centre.
-        barycentric: (N, 3) of the texel's centre in that triangle.
-        uv: (N, 2) of the texel's centre in the atlas.
-        height: (N,) of the scaffold above the skin, m.
-    """
-
-    points: Tensor
-    size: Tensor
-    joints: Tensor
-    weights: Tensor
-    face: Tensor
-    barycentric: Tensor
-    uv: Tensor
-    height: Tensor
+    points: Tensor  # (N, 3) at rest on the scaffold, m
+    size: Tensor  # (N,) side of the texel, m
+    joints: Tensor  # (N, K) int64 joints that the Gaussian follows, heaviest first
+    weights: Tensor  # (N, K) skinning weights of these joints, rows sum to 1
+    face: Tensor  # (N,) int64 triangle of the template that holds the texel's centre
+    barycentric: Tensor  # (N, 3) of the texel's centre in that triangle
+    uv: Tensor  # (N, 2) of the texel's centre in the atlas
+    height: Tensor  # (N,) of the scaffold above the skin, m
 
     def __len__(self) -> int:
         return len(self.points)
@@ -72,32 +62,36 @@ class Anchors:
 def texel_gaussians(texels: Texels, heights: Sequence[float], sh_degree: int) -> tuple[Gaussians, Anchors]:
     """Return grey discs on every texel, at all ``heights`` (m) above the surface at rest; nearly opaque at the lowest.
 
-    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by texel.
+    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by texel. Raises
+    DyngsError: no height, or one that is not finite.
     """
-    scaffolds = scaffold_points(texels, heights)
-    rows = scaffolds.texel
+    levels = texels.points.new_tensor(heights)
+    if levels.numel() == 0 or not bool(levels.isfinite().all()):
+        raise DyngsError(f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}")
+    rows = torch.arange(len(texels), device=levels.device).repeat(len(levels))
+    height = levels.repeat_interleave(len(texels))
     size = texels.size[rows]
     joints, weights = heaviest_joints(texels.weights)
     row, column = (texels.index // texels.resolution, texels.index % texels.resolution)
     uv = torch.stack([column + 0.5, texels.resolution - 0.5 - row], dim=1).to(size) / texels.resolution
     anchors = Anchors(
-        points=scaffolds.points(texels),
+        points=texels.points[rows] + height[:, None] * texels.normals[rows],
         size=size,
         joints=joints[rows],
         weights=weights[rows],
         face=texels.faces[rows],
         barycentric=texels.barycentric[rows],
         uv=uv[rows],
-        height=scaffolds.height,
+        height=height,
     )
     ratios = size.new_tensor([_WIDTH, _WIDTH, _THICKNESS]).log()
-    opacity = torch.where(scaffolds.height == min(heights), _LOWEST_OPACITY, _UPPER_OPACITY)
+    opacity = torch.where(height == min(heights), _LOWEST_OPACITY, _UPPER_OPACITY)
     gaussians = Gaussians(
         means=anchors.points.clone(),
         quats=quats_of(texels.frames)[rows],
         log_scales=size.log()[:, None] + ratios,
         logit_opacities=(opacity / (1 - opacity)).log().to(size),
-        sh=size.new_zeros(len(scaffolds), num_sh_terms(sh_degree), 3),
+        sh=size.new_zeros(len(rows), num_sh_terms(sh_degree), 3),
     )
     return gaussians, anchors
 
@@ -121,3 +115,45 @@ def skinning_weights(anchors: Anchors, num_joints: int, corrections: Tensor | No
         weights = weights / weights.sum(1, keepdim=True)
     dense = weights.new_zeros(len(anchors), num_joints)
     return dense.scatter_add(1, anchors.joints, weights)
+
+
+FINER = 2
+"""Texels of the finer atlas along a side of one."""
+PIXELS = 2.0
+"""Pixels along the side of a texel from which it is replaced by smaller ones."""
+_LIMBS = ("wrist", "ankle", "foot", "index", "middle", "pinky", "ring", "thumb")
+
+
+def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> float:
+    """Return the side of a pixel on the person, m of the template: the median over the cameras; infinite without any.
+
+    The mean position in ``clip`` counts; ``pelvis`` (3,) is at rest, m.
+    """
+    scale = float(clip.scale.mean())
+    place = clip.trans.mean(0) + scale * pelvis
+    away = [float((camera.centers[0] - place).norm() / camera.intrinsics[0, 0, 0]) for camera in cameras]
+    return sorted(away)[len(away) // 2] / scale if away else torch.inf
+
+
+def surface_texels(body: BodyTemplate, resolution: int, vertices: Tensor, pixel: float) -> list[Texels]:
+    """Return the texels of the atlas, and apart from them smaller ones of hands and feet where images show more.
+
+    ``vertices`` (M, 3) are the rest shape, m; ``pixel`` is the side of a pixel on the person, m.
+    """
+    texels = atlas_texels(body, resolution, vertices)
+    named = [any(part in name for part in _LIMBS) for name in JOINT_NAMES[: len(body.parents)]]
+    limbs = torch.tensor(named, device=texels.points.device)
+    on_limbs = limbs[texels.weights.argmax(1)]
+    if not bool(on_limbs.any()) or float(texels.size[on_limbs].median()) < PIXELS * pixel:
+        return [texels]
+    fine = atlas_texels(body, FINER * resolution, vertices)
+    return [texels.select(~on_limbs), fine.select(limbs[fine.weights.argmax(1)])]
+
+
+def surface_gaussians(parts: Sequence[Texels], sh_degree: int) -> tuple[Gaussians, Anchors, Tensor]:
+    """Return the ``texel_gaussians`` on the skin of all parts, part by part, their anchors, and normals (N, 3)."""
+    made = [texel_gaussians(texels, (0.0,), sh_degree) for texels in parts]
+    normals = torch.cat([texels.normals for texels in parts])
+    gaussians = {name: torch.cat([g.tensors()[name] for g, _ in made]) for name in made[0][0].tensors()}
+    anchors = {name: torch.cat([a.tensors()[name] for _, a in made]) for name in made[0][1].tensors()}
+    return Gaussians(**gaussians), Anchors(**anchors), normals

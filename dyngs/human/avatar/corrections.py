@@ -1,4 +1,4 @@
-"""Learned corrections of the body fit beside the Gaussians: poses of the frames, skeleton, skinning weights.
+"""Learned corrections of the body fit next to the Gaussians: poses of the frames, skeleton, skinning weights.
 
 Body fits are never exact, and the template is not the person. All corrections start at zero. Local letters: F frames,
 J joints, N Gaussians, K joints that one Gaussian follows.
@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.avatar.anchors import Anchors, skinning_weights
-from dyngs.human.avatar.light import TERMS, Light
-from dyngs.human.avatar.posing import BodyPose, Skeleton
+from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.joints import mirrored_joints
@@ -30,7 +28,6 @@ LR = {
     "joints": 2e-3,  # at rest, m
     "log_scale": 2e-4,
     "weights": 5e-3,  # logarithms
-    "pose_dirs": 1e-4,  # m per unit of a rotation matrix
     "light": 5e-3,  # fraction of the colour
     "normals": 1e-3,
 }
@@ -47,15 +44,10 @@ POSE_CM = 0.05
 
 @dataclass(frozen=True)
 class SharedCorrection:
-    """The correction of all poses of a person.
+    """The correction of all poses of a person."""
 
-    Attributes:
-        turns: (J, 3) axis-angle, rad: rotations of the joints applied before those of a pose.
-        log_scale: natural logarithm of the factor on the template's size.
-    """
-
-    turns: Tensor
-    log_scale: float
+    turns: Tensor  # (J, 3) axis-angle, rad: rotations of the joints applied before those of a pose
+    log_scale: float  # natural logarithm of the factor on the template's size
 
     def to(self, *, device: torch.device | str) -> SharedCorrection:
         """Return the correction on ``device``."""
@@ -63,7 +55,7 @@ class SharedCorrection:
 
 
 def new_corrections(
-    options: HumanModel, clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
+    clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
 ) -> Parameters:
     """Return the corrections to learn, all zero, of a clip of F frames, a skeleton and skinning weights.
 
@@ -71,8 +63,7 @@ def new_corrections(
 
     Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
     ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
-    optionally ``pose_dirs`` (N, 27), see ``dyngs.human.avatar.posing.learned_offsets``, ``light`` (8, 3) and
-    ``normals`` (N, 3), see ``dyngs.human.avatar.light``.
+    optionally ``light`` (8, 3) and ``normals`` (N, 3), see ``dyngs.human.avatar.posing.Light``.
     """
     unit = float(clip.scale.mean())
     zeros = {
@@ -83,21 +74,17 @@ def new_corrections(
         "log_scale": skeleton.joints.new_zeros(1),
         "weights": torch.zeros_like(anchors.weights),
     }
-    if options.pose_offsets:
-        zeros["pose_dirs"] = anchors.weights.new_zeros(len(anchors), 27)
     if normals is not None:
         zeros |= {"light": normals.new_zeros(TERMS, 3), "normals": normals}
-    own = ("weights", "pose_dirs", "normals")
+    own = ("weights", "normals")
     roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
     return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
 
 
-def correction_penalties(learned: Parameters, options: HumanModel) -> dict[str, Tensor]:
+def correction_penalties(learned: Parameters) -> dict[str, Tensor]:
     """Return weighted mean squares that keep poses, joints and skinning weights near what was given."""
     turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
     terms = {"pose": POSE_WEIGHT * (turns + (100 * learned["joints"]).square().mean())}
-    if "pose_dirs" in learned and options.offset_weight > 0:
-        terms["pose offsets"] = options.offset_weight * (100 * learned["pose_dirs"]).square().sum(1).mean()
     if "light" in learned:
         terms["light"] = LIGHT_WEIGHT * learned["light"].square().sum()
     terms["skinning weights"] = WEIGHTS_WEIGHT * learned["weights"].square().mean()
@@ -154,8 +141,3 @@ def share_sides(learned: Parameters) -> None:
 def learned_light(learned: Parameters) -> Light | None:
     """Return the light, None if none is learned."""
     return Light(learned["normals"], learned["light"]) if "light" in learned else None
-
-
-def corrected_weights(learned: Parameters, anchors: Anchors, num_joints: int) -> Tensor:
-    """Return the corrected skinning weights (N, J)."""
-    return skinning_weights(anchors, num_joints, learned["weights"])

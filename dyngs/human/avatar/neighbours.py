@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions, contributions
+from dyngs.human.avatar.anchors import Anchors
 
 _SAME_JOINTS = 0.5
 """Least cosine between the skinning weights of points that belong to the same part of the body."""
 _LOOKED_AT = 4
-"""Points that are looked at, over the number of neighbours that are wanted."""
+"""Points that are looked at, over the number of requested neighbours."""
 
 
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     """Return the rows (Q, count) int64 of the nearest other points of each of ``points`` (Q, 3), nearest first.
 
-    Points may coincide; none is its own neighbour. There are at most Q - 1 columns.
-
-    Raises:
-        DyngsError: a point that is not finite.
+    Points may coincide; none is its own neighbour. There are at most Q - 1 columns. Raises DyngsError: a point that is
+    not finite.
     """
     from scipy.spatial import KDTree
 
@@ -28,10 +32,10 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     count = min(count, num_points - 1)
     if count < 1:
         return torch.zeros(num_points, 0, dtype=torch.long, device=points.device)
-    places = points.detach().double().cpu().numpy()
-    if not np.isfinite(places).all():
+    positions = points.detach().double().cpu().numpy()
+    if not np.isfinite(positions).all():
         raise DyngsError("neighbours: a point is not finite; check the positions for NaN")
-    found = np.asarray(KDTree(places).query(places, k=count + 1)[1])
+    found = np.asarray(KDTree(positions).query(positions, k=count + 1)[1])
     own = found == np.arange(num_points)[:, None]
     own[~own.any(1), -1] = True  # more than ``count`` points coincide: drop the last one
     return torch.from_numpy(found[~own].reshape(num_points, count)).long().to(points.device)
@@ -53,3 +57,130 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
     own = torch.arange(len(points), device=near.device)[:, None]
     order = others.int().sort(dim=1, stable=True).indices[:, :count]
     return torch.where(others, own, near).gather(1, order)
+
+
+ENOUGH = 1.0
+"""Sightings (see ``sightings``) at which a Gaussian's own values count as much as what is around it."""
+MIRRORED = 0.9
+"""Trust in the other side of the body, where that was seen."""
+HARDLY = 0.5
+"""Trust in a Gaussian's own values below which it is counted as unseen in the line for people."""
+_NEIGHBOURS = 8
+_SAME_PLACE = 1.5
+"""Distance from the mirrored anchor, in sides of its texel, within which a Gaussian is its mirror image."""
+_OWN = 1e-6
+"""Least weight of own values, which decides where nothing around is seen either."""
+_SURE = 1e-3
+"""Least doubt in own values, so that the numbers stay in range."""
+_RESIDUAL, _MAX_ROUNDS = 1e-5, 1000
+"""Largest residual of the linear system at which its solution is good enough, and bound on the rounds it takes."""
+
+
+@torch.no_grad()
+def sightings(
+    drawn: Iterable[tuple[Gaussians, Cameras]], sizes: Tensor, scale: float, options: RenderOptions
+) -> Tensor:
+    """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen there.
+
+    A view counts as 1 where the texel is in full view, and hardly at all where little of it shines through others: a
+    hundred views that see a hundredth of it tell less than one that sees all. Independent of the size of the images.
+    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the N Gaussians in the pose of
+    each view, and its camera; ``sizes`` (N,) sides of the texels, m; ``scale`` world units per metre.
+    """
+    total = torch.zeros_like(sizes)
+    for gaussians, camera in drawn:
+        opacity = gaussians.opacities
+        pose, focal = camera.cam_from_world[0].to(opacity), camera.intrinsics[0, 0, 0].to(opacity)
+        depth = (gaussians.means @ pose[2, :3] + pose[2, 3]).clamp_min(options.near)
+        seen = contributions(gaussians, camera, options)[0] / opacity.clamp_min(options.alpha_min)
+        total += (seen / (sizes * scale * focal / depth).square()).square()
+        total[opacity <= options.alpha_min] = torch.inf
+    return total
+
+
+def trust_in(seen: Tensor) -> Tensor:
+    """Return the trust (N,) in [0, 1] in values learned from so many sightings (N,)."""
+    return 1 - ENOUGH / (seen + ENOUGH)
+
+
+def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: float, trust: Tensor) -> dict[str, Tensor]:
+    """Return new ``sh``, ``means`` and ``logit_opacities`` of N Gaussians at rest; the same where trust is 1.
+
+    Offsets from the scaffold, opacities and colours are mixed with those of the mirror image. Base colours are also
+    made like those of the neighbours that follow the same joints: harmonic where there is no trust. ``weights`` (N, J)
+    are those of the template; ``middle`` is x of the plane of symmetry at rest, m; ``trust`` (N,) in what was learned
+    is in [0, 1].
+    """
+    other, is_image = mirror_images(anchors, middle)
+    borrowed = (1 - trust) * trust[other] * is_image * MIRRORED
+    known = trust + borrowed
+    fraction = (borrowed / known.clamp_min(_OWN))[:, None]
+    away = gaussians.means - anchors.points
+    flipped = away[other] * away.new_tensor([-1.0, 1.0, 1.0])
+    opacity = gaussians.logit_opacities[:, None]
+    sh = gaussians.sh.clone()
+    colour = torch.lerp(sh[:, 0], sh[other, 0], fraction)
+    sh[:, 0] = smoothed(colour, known, anchors, weights)
+    sh[:, 1:] *= trust[:, None, None]
+    return {
+        "sh": sh,
+        "means": anchors.points + torch.lerp(away, flipped, fraction),
+        "logit_opacities": torch.lerp(opacity, opacity[other], fraction)[:, 0],
+    }
+
+
+def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
+    """Return (N,) rows of the Gaussians nearest to positions mirrored at x = ``middle``, and if they are near (N,)."""
+    from scipy.spatial import KDTree
+
+    points = anchors.points.detach().double().cpu().numpy()
+    mirrored = points * [-1, 1, 1] + [2 * middle, 0, 0]
+    away, rows = KDTree(points).query(mirrored)
+    is_near = torch.from_numpy(np.asarray(away)).to(anchors.size) < _SAME_PLACE * anchors.size
+    return torch.from_numpy(np.asarray(rows)).long().to(anchors.points.device), is_near
+
+
+def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -> Tensor:
+    """Return values (N, C) that are like those of linked neighbours, and like ``values`` where there is trust.
+
+    They minimize the sum of trust / (1 - trust) (x_i - v_i)^2 over Gaussians, and of w_ij (x_i - x_j)^2 over
+    neighbours that follow the same joints, where w falls with their distance; by conjugate gradients.
+    """
+    from scipy.sparse import csr_array
+
+    count, given = len(values), values.detach().double().cpu().numpy()
+    near = linked_neighbours(anchors.points, weights, _NEIGHBOURS)  # a link to itself changes nothing
+    if not near.shape[1]:
+        return values
+    steps = (anchors.points[near] - anchors.points[:, None]).norm(dim=-1) / anchors.size[:, None]
+    strength = (1 / (1 + steps.square())).double().cpu().numpy()
+    rows = np.repeat(np.arange(count), near.shape[1])
+    links = csr_array((strength.ravel(), (rows, near.cpu().numpy().ravel())), (count, count))
+    links = links.maximum(links.T)
+    sure = trust.detach().double().cpu().numpy()
+    own = sure / np.maximum(1 - sure, _SURE) + _OWN
+    diagonal = (np.asarray(links.sum(1)).ravel() + own)[:, None]
+    found = _conjugate_gradients(lambda x: diagonal * x - links @ x, own[:, None] * given, given, 1 / diagonal)
+    return torch.where(trust[:, None] > 1 - _SURE, values, torch.from_numpy(found).to(values))
+
+
+def _conjugate_gradients(
+    applied: Callable[[np.ndarray], np.ndarray], wanted: np.ndarray, first: np.ndarray, scaling: np.ndarray
+) -> np.ndarray:
+    """Return x (N, C) with ``applied`` (x) = ``wanted``, a positive definite system, column by column, from ``first``.
+
+    ``scaling`` (N, 1) is the inverse of its diagonal (Jacobi's preconditioner).
+    """
+    x, residual = first, wanted - applied(first)
+    direction = scaled = scaling * residual
+    size = (residual * scaled).sum(0)
+    for _ in range(_MAX_ROUNDS):
+        if float(np.abs(residual).max(initial=0)) < _RESIDUAL:
+            break
+        image = applied(direction)
+        step = size / np.maximum((direction * image).sum(0), 1e-300)
+        x, residual = x + step * direction, residual - step * image
+        scaled = scaling * residual
+        before, size = size, (residual * scaled).sum(0)
+        direction = scaled + size / np.maximum(before, 1e-300) * direction
+    return x

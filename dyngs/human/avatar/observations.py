@@ -1,86 +1,53 @@
-"""Observations of surface points of a posed body in images: inside the silhouette or not, and colour.
+"""The captured person, and the first Gaussians on its template, in the colours of images.
 
-Local letters: N points, J joints.
+Local letter: N points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0
 from dyngs.data.loader import Image
-from dyngs.human.avatar.posing import BodyPose, Skeleton
+from dyngs.gaussians import Gaussians
+from dyngs.human.avatar.anchors import Anchors, skinning_weights
+from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
+from dyngs.human.motion.clip import CapturedMotion
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
 
 FACING_EXPONENT = 4
 """Exponent of the cosine between normal and view direction in the weights of colours: frontal views count most."""
 
 
-@dataclass(frozen=True)
-class SurfacePoints:
-    """N points on a body at rest.
-
-    Attributes:
-        points: (N, 3) m.
-        normals: (N, 3) outward unit normals.
-        weights: (N, J) skinning weights.
-        offsets: returns the pose-dependent offsets (N, 3) at rest, m, or None; None: no offsets in any pose.
-    """
-
-    points: Tensor
-    normals: Tensor
-    weights: Tensor
-    offsets: Callable[[BodyPose], Tensor | None] | None = None
-
-    def at_rest(self, pose: BodyPose) -> Tensor:
-        """Return the points (N, 3) before skinning to a pose, m, with its offsets."""
-        offsets = None if self.offsets is None else self.offsets(pose)
-        return self.points if offsets is None else self.points + offsets
-
-
-@dataclass(frozen=True)
-class PointObservations:
-    """Observations of N points.
-
-    Attributes:
-        inside: (N,) fraction of the images in whose silhouette a point lies, of those that have it in the frame; 1
-            where none has. Without alpha the whole frame is silhouette.
-        rgb: (N, 3) mean colour, weighted towards frontal views; grey for points that no image faces.
-    """
-
-    inside: Tensor
-    rgb: Tensor
-
-
 @torch.no_grad()
-def observe_points(
-    surface: SurfacePoints, skeleton: Skeleton, images: Iterable[tuple[Image, BodyPose]]
-) -> PointObservations:
-    """Return the observations of the points in the images, each with its body pose; occlusion is ignored."""
-    count, device = len(surface.points), surface.points.device
-    inside, in_frames, weight = (torch.zeros(count, device=device) for _ in range(3))
-    colour = torch.zeros(count, 3, device=device)
-    for image, pose in images:
-        transforms = blend_transforms(
-            surface.weights, joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
-        )
-        world = pose.scale * apply_transforms(transforms, surface.at_rest(pose)) + pose.trans
-        normals = (transforms[..., :3] * surface.normals[:, None]).sum(-1)
+def observed_colours(
+    normals: Tensor, weights: Tensor, skeleton: Skeleton, shown: Iterable[tuple[Image, BodyPose, Tensor]]
+) -> Tensor:
+    """Return the mean colours (N, 3) of points of a body in images, weighted towards frontal views.
+
+    Grey for points that no image faces; occlusion is ignored. Without alpha the full frame is silhouette. ``normals``
+    (N, 3) are at rest, ``weights`` (N, J) skin; ``shown`` are images, body poses, and the points (N, 3) at rest for
+    each pose.
+    """
+    count, device = len(normals), normals.device
+    colour, weight = torch.zeros(count, 3, device=device), torch.zeros(count, device=device)
+    for image, pose, points in shown:
+        transforms = blend_transforms(weights, joint_transforms(skeleton.joints, skeleton.parents, pose.rotations))
+        world = pose.scale * apply_transforms(transforms, points) + pose.trans
+        turned = (transforms[..., :3] * normals[:, None]).sum(-1)
         column, row, in_frame = _nearest_pixels(world, image.cameras)
         covered = in_frame.float() if image.alpha is None else image.alpha[row, column] * in_frame
-        inside += (covered > 0.5).float()
-        in_frames += in_frame
         towards = torch.nn.functional.normalize(image.cameras.centers[0] - world, dim=1)
-        facing = (towards * torch.nn.functional.normalize(normals, dim=1)).sum(1).clamp_min(0) ** FACING_EXPONENT
+        facing = (towards * torch.nn.functional.normalize(turned, dim=1)).sum(1).clamp_min(0) ** FACING_EXPONENT
         colour += facing[:, None] * in_frame[:, None] * image.rgb_premultiplied[row, column]
         weight += facing * covered
     seen = weight > 1e-3
-    rgb = torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5)
-    return PointObservations(torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0), rgb.clamp(0, 1))
+    return torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5).clamp(0, 1)
 
 
 def project_points(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
@@ -98,3 +65,35 @@ def _nearest_pixels(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Ten
     size = pixels.new_tensor([camera.width, camera.height])
     column, row = pixels.floor().nan_to_num().clamp(pixels.new_zeros(2), size - 1).long().unbind(1)
     return column, row, in_frame
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A person in a capture: the template's skeleton, the anchors of the first N Gaussians, the poses of the images.
+
+    ``shapes`` are the template's pose blend shapes, None where it has none.
+    """
+
+    skeleton: Skeleton
+    anchors: Anchors
+    motion: CapturedMotion
+    shapes: PoseBlendShapes | None = None
+
+
+def in_colours_of(gaussians: Gaussians, normals: Tensor, subject: Subject, images: Iterable[Image]) -> Gaussians:
+    """Return the first Gaussians, on the texels of ``subject``, in the colours of some images.
+
+    ``normals`` (N, 3) are those of the surface at rest.
+    """
+    anchors, rows = subject.anchors, subject.motion.rows
+
+    def shown() -> Iterator[tuple[Image, BodyPose, Tensor]]:
+        for image in images:
+            pose = frame_pose(subject.motion.clip, rows[image.frame or 0])
+            offsets = rest_offsets(anchors, pose, subject.shapes)
+            yield image, pose, anchors.points if offsets is None else anchors.points + offsets
+
+    sh = gaussians.sh.clone()
+    weights = skinning_weights(anchors, len(subject.skeleton.joints))
+    sh[:, 0] = (observed_colours(normals, weights, subject.skeleton, shown()) - 0.5) / SH_C0
+    return gaussians.replace(sh=sh)

@@ -1,29 +1,82 @@
 """Body poses fitted to images: the poses in which an avatar, which stays as it is, looks most like them.
 
-Either the whole images count, or their silhouettes alone (``dyngs.human.avatar.pose_comparison``). GART (Lei et al.
+Either the full images count, or their silhouettes alone (``dyngs.human.avatar.pose_fit``). GART (Lei et al.
 2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test images like this before they score new poses.
-Local letters: F moments, J joints, V images of a moment.
+Local letters: F moments, V images of a moment.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from dyngs.data.images.images import area_downscale
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.gaussians.rendering import Rendering, RenderOptions
-from dyngs.gaussians.scene import Moment
-from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
-from dyngs.human.avatar.pose_comparison import IMAGES, Comparison
+from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.ops.adam import adam_step_
+from dyngs.ops.loss import l1_ssim_loss
+
+SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
+"""Of SSIM and of the mean error of alpha in the loss of full images, as in training."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How renders of a person are compared with images, and what keeps the pose near that given."""
+
+    # the loss () between a rendering and an image on a background (3,), with sides divided by a factor
+    difference: Callable[[Rendering, Image, Tensor, int], Tensor]
+    turn_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
+    shift_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
+    views_to_turn: int = 1  # fewest images of one moment from which rotations are fitted; from fewer the translation is
+
+
+def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
+    """Return 0.8 L1 + 0.2 (1 - SSIM) + 0.1 of the mean error of alpha ()."""
+    rendered, truth, mask = drawn.rgb[0], image.composite(background), image.mask
+    error = None if image.alpha is None else (drawn.alpha[0] - image.alpha)[..., None]
+    if mask is not None:
+        rendered, truth = rendered * mask[..., None], truth * mask[..., None]
+        error = None if error is None else error * mask[..., None]
+        mask = shrunk(mask[..., None], shrink)[..., 0]
+    loss = l1_ssim_loss(shrunk(rendered, shrink), shrunk(truth, shrink), SSIM_WEIGHT, mask)
+    return loss if error is None else loss + ALPHA_WEIGHT * shrunk(error, shrink).abs().mean()
+
+
+def difference_of_silhouettes(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
+    """Return the squared error of alpha, over the area of the silhouette (); nothing else of the image is looked at.
+
+    Raises ValueError: an image without alpha.
+    """
+    if image.alpha is None:
+        raise ValueError(f"{image.name}: has no silhouette")
+    error, truth = drawn.alpha[0] - image.alpha, image.alpha
+    if image.mask is not None:
+        error, truth = error * image.mask, truth * image.mask
+    return shrunk(error[..., None], shrink).square().sum() / shrunk(truth[..., None], shrink).sum().clamp_min(1)
+
+
+IMAGES = Comparison(difference_of_images, turn_weight=POSE_WEIGHT / POSE_CM**2)
+SILHOUETTES = Comparison(difference_of_silhouettes, turn_weight=1.0, shift_weight=10.0, views_to_turn=2)
+"""One view hides how far limbs reach towards the camera: rotations fitted to it look wrong from elsewhere."""
+
+
+def shrunk(image: Tensor, factor: int) -> Tensor:
+    """Return the (H, W, C) image with its sides divided by ``factor``, averaged over pixel areas."""
+    if factor == 1:
+        return image
+    height, width = (max(1, round(side / factor)) for side in image.shape[:2])
+    return area_downscale(image, width, height)
+
 
 COARSE_PX = 40
 """Height of the person, px, in the coarsest of the three rounds."""
@@ -51,36 +104,20 @@ class Correction:
 
 @dataclass(frozen=True)
 class FittedPoses:
-    """Poses fitted to images.
+    """Poses fitted to images."""
 
-    Attributes:
-        scene: the same person, playing them.
-        updates: number of updates at each of the F moments.
-    """
-
-    scene: HumanScene
-    updates: tuple[int, ...]
+    scene: HumanScene  # the same person, playing them
+    updates: tuple[int, ...]  # number of updates at each of the F moments
 
 
 def fitted_to_images(
-    scene: HumanScene,
-    images: ImageLoader,
-    background: Tensor,
-    options: RenderOptions,
-    comparison: Comparison = IMAGES,
+    scene: HumanScene, images: ImageLoader, background: Tensor, options: RenderOptions, comparison: Comparison = IMAGES
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
-    All images of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with
-    that corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are.
-    No random numbers are drawn.
-
-    Args:
-        scene: playing the clip that is to be corrected.
-        images: of a split.
-        background: (3,) behind both.
-        options: as in training.
-        comparison: what of the images counts.
+    All images of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with that
+    corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are. No
+    random numbers are drawn. ``scene`` plays the clip to correct; ``background`` (3,) is behind both.
     """
     groups: dict[float, list[int]] = {}
     for index, time in enumerate(images.times):
@@ -102,7 +139,6 @@ def fitted_to_images(
 
 
 def _moments(clip: MotionClip, times: Sequence[float]) -> MotionClip:
-    """Return the clip at ``times``, ascending."""
     parts = [clip.at(time) for time in times]
     poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
     return MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
@@ -116,30 +152,20 @@ def _playing_exactly(scene: HumanScene, clip: MotionClip) -> HumanScene:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The fit of one pose.
+    """The fit of one pose."""
 
-    Attributes:
-        scene: the person.
-        start: the pose to begin with, a clip of one frame.
-        time: of the images.
-        background, options: to draw with.
-        images: V.
-        comparison: what of these counts.
-    """
-
-    scene: HumanScene
-    start: MotionClip
-    time: float
+    scene: HumanScene  # the person
+    start: MotionClip  # the pose to begin with, a clip of one frame
+    time: float  # of the images
     background: Tensor
     options: RenderOptions
-    images: tuple[Image, ...]
-    comparison: Comparison
+    images: tuple[Image, ...]  # V
+    comparison: Comparison  # what of these counts
 
     def fitted(self, guess: Correction | None) -> tuple[Correction, int]:
         """Return the correction of the pose, and the number of updates it took.
 
-        Args:
-            guess: another correction to begin with than none.
+        ``guess`` is another correction to begin with than none.
         """
         joints = self.scene.skeleton.joints
         none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))
@@ -191,13 +217,12 @@ class _Fit:
             start.scale[0],
         )
         moment = self.scene.in_pose(posing, self.time)
-        losses = [how.difference(self._drawn(x, moment), x, self.background, shrink) for x in images]
+        losses = []
+        for image in images:
+            drawn = self.scene.render(image.cameras, moment, options=self.options, background=self.background)
+            losses.append(how.difference(drawn, image, self.background, shrink))
         size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
         return torch.stack(losses).mean() + size
-
-    def _drawn(self, image: Image, moment: Moment) -> Rendering:
-        """Return the person at ``moment`` as the camera of an image sees it."""
-        return self.scene.render(image.cameras, moment, options=self.options, background=self.background)
 
 
 def _shrinks(images: Sequence[Image]) -> tuple[int, int, int]:

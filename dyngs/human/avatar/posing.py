@@ -11,15 +11,57 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.avatar.light import Light
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.nearest_rotation import nearest_rotations
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 from dyngs.ops.posing import pose_by_joints
+from dyngs.ops.quaternions import rotation_matrices
 from dyngs.state import fields_moved_to
+
+LEFT_OUT = "the learned light is left out: colours are those in even light"
+"""Message of files that cannot hold it."""
+TERMS = 8
+"""Number of harmonics of degree 1 and 2; degree 0 is the colour itself."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light that falls on N Gaussians."""
+
+    normals: Tensor  # (N, 3) outward at rest, of any length
+    factors: Tensor  # (8, 3) A, red, green and blue
+
+    def on(self, sh: Tensor, linear: Tensor) -> Tensor:
+        """Return harmonics (N, K, 3) with their colours times the light, of Gaussians moved by (N, 3, 3)."""
+        facing = torch.nn.functional.normalize((linear * self.normals[:, None]).sum(-1), dim=1)
+        factor = (1 + harmonics(facing) @ self.factors)[:, None]
+        lit = sh * factor
+        return torch.cat([lit[:, :1] + (factor - 1) * (0.5 / SH_C0), lit[:, 1:]], dim=1)
+
+
+def harmonics(directions: Tensor) -> Tensor:
+    """Return the harmonics (N, 8) of degree 1 and 2, not normalised, in unit directions (N, 3)."""
+    x, y, z = directions.unbind(1)
+    return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], dim=1)
+
+
+def rest_normals(gaussians: Gaussians) -> Tensor:
+    """Return the outward normals (N, 3) at rest of the first Gaussians, which are discs in the tangent plane."""
+    return rotation_matrices(gaussians.quats)[..., 2]
+
+
+def difference_of_sides(gaussians: Gaussians, images: Tensor, is_image: Tensor) -> Tensor:
+    """Return the mean squared difference () between base colours and those of the mirror images.
+
+    Clothes are mostly the same on both sides and light is not: this tells one from the other where nobody turns.
+    ``images`` (N,) are rows of the mirror images, ``is_image`` (N,) says where there is one.
+    """
+    colours = gaussians.sh[:, 0] * SH_C0
+    return ((colours - colours.index_select(0, images)).square().sum(1) * is_image).mean()
 
 
 @dataclass(frozen=True)
@@ -36,15 +78,11 @@ class Skeleton:
 
 @dataclass(frozen=True)
 class PoseBlendShapes:
-    """SMPL's pose blend shapes: offsets of a template's vertices at rest that depend on the pose (Loper et al. 2015).
+    """SMPL's pose blend shapes: pose-dependent offsets of a template's vertices at rest (Loper et al. 2015)."""
 
-    Attributes:
-        directions: (9 (J - 1), 3 M) m per unit of the rotations minus the identity, without the root.
-        faces: (T, 3) int64 vertices of the triangles.
-    """
-
+    # m per unit of the rotations minus the identity, without the root, as 9 (J - 1) rows of 3 M numbers
     directions: Tensor
-    faces: Tensor
+    faces: Tensor  # (T, 3) int64 vertices of the triangles
 
     def to(self, *, device: torch.device | str) -> PoseBlendShapes:
         """Return the blend shapes on ``device``."""
@@ -53,9 +91,7 @@ class PoseBlendShapes:
     def offsets(self, anchors: Anchors, rotations: Tensor) -> Tensor:
         """Return offsets (N, 3) at rest, m: interpolated between the vertices of each anchor's triangle.
 
-        Args:
-            anchors: of N Gaussians on this template.
-            rotations: (J, 3, 3) relative to the parent joints.
+        ``rotations`` (J, 3, 3) are relative to the parent joints.
         """
         at_vertices = (_pose_features(rotations)[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
         around = self.faces.index_select(0, anchors.face)
@@ -73,17 +109,11 @@ def pose_blend_shapes(body: BodyTemplate) -> PoseBlendShapes | None:
 
 @dataclass(frozen=True)
 class BodyPose:
-    """One pose of a body; differentiable.
+    """One pose of a body; differentiable."""
 
-    Attributes:
-        rotations: (J, 3, 3) relative to the parent joints.
-        trans: (3,) world units, added last.
-        scale: () world units per metre.
-    """
-
-    rotations: Tensor
-    trans: Tensor
-    scale: Tensor
+    rotations: Tensor  # (J, 3, 3) relative to the parent joints
+    trans: Tensor  # (3,) world units, added last
+    scale: Tensor  # () world units per metre
 
 
 def pose_gaussians(
@@ -97,15 +127,8 @@ def pose_gaussians(
     """Return the N Gaussians in a pose, in the world; differentiable in all arguments.
 
     x' = s T x + t with T = sum_j w_j A_j (Loper et al. 2015); covariances under the same linear map, exactly. Harmonics
-    of degree 1 are rotated by the nearest rotation of T, so that colours turn with the body.
-
-    Args:
-        gaussians: at rest, m; SH degree 0 or 1.
-        weights: (N, J) skinning weights.
-        skeleton: of J joints.
-        posing: the pose.
-        offsets: (N, 3) m, added to the means at rest; None: no offsets.
-        light: that falls on them; None: even light.
+    of degree 1 are rotated by the nearest rotation of T, so that colours turn with the body. Gaussians are at rest, m,
+    of SH degree 0 or 1; ``weights`` (N, J) skin them; ``offsets`` (N, 3), m, are added to the means at rest.
     """
     moves = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
     world = torch.cat([posing.scale * moves[..., :3], posing.scale * moves[..., 3:] + posing.trans[:, None]], dim=-1)
@@ -122,24 +145,9 @@ def pose_gaussians(
     )
 
 
-def rest_offsets(
-    anchors: Anchors, weights: Tensor, posing: BodyPose, shapes: PoseBlendShapes | None, pose_dirs: Tensor | None
-) -> Tensor | None:
-    """Return the pose-dependent offsets (N, 3) at rest, m: of the template plus learned; None without either."""
-    given = None if shapes is None else shapes.offsets(anchors, posing.rotations)
-    if pose_dirs is None:
-        return given
-    learned = learned_offsets(weights, posing, pose_dirs)
-    return learned if given is None else given + learned
-
-
-def learned_offsets(weights: Tensor, posing: BodyPose, pose_dirs: Tensor) -> Tensor:
-    """Return learned offsets (N, 3), m: P vec(sum_j w_j (R_j - I)), P = ``pose_dirs`` (N, 27) as 3 x 9; no root.
-
-    Like SMPL's pose blend shapes (Loper et al. 2015), but learned, and only for joints that a Gaussian follows.
-    """
-    features = weights[:, 1:] @ _pose_features(posing.rotations)[1:].flatten(1)
-    return (pose_dirs.unflatten(1, (3, 9)) * features[:, None]).sum(-1)
+def rest_offsets(anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None) -> Tensor | None:
+    """Return the pose-dependent offsets (N, 3) at rest, m; None where the template has none."""
+    return None if shapes is None else shapes.offsets(anchors, posing.rotations)
 
 
 def _pose_features(rotations: Tensor) -> Tensor:

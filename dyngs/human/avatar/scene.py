@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.parameters import Parameters
@@ -19,52 +18,41 @@ from dyngs.human.avatar.corrections import (
     corrected_clip,
     corrected_pose,
     corrected_skeleton,
-    corrected_weights,
     learned_light,
     new_corrections,
 )
-from dyngs.human.avatar.light import Light
 from dyngs.human.avatar.posing import (
+    TERMS,
     BodyPose,
+    Light,
     PoseBlendShapes,
     Skeleton,
     frame_pose,
     pose_gaussians,
     rest_offsets,
 )
-from dyngs.human.avatar.validation import require_avatar, require_shapes
 from dyngs.human.motion.clip import MotionClip
+from dyngs.human.pose.skinning import check_tree
+from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.state import Role, State, StateTensor, part_of, prefixed, with_role
+from dyngs.tensor_checks import require_indices, require_moments, require_positive, require_tensor
 
 
 @dataclass(frozen=True, kw_only=True)
 class HumanScene(Scene):
-    """N Gaussians at rest, m, and a person who moves as a clip says.
+    """N Gaussians at rest, m, and a person who moves as a clip says."""
 
-    Attributes:
-        anchors: of the Gaussians, with the template's weights.
-        skeleton: of the template in the person's shape; clips are given for it.
-        clip: that of training, as it was given.
-        learned: corrections to all of these, see ``new_corrections``.
-        shapes: the template's pose blend shapes, or None.
-        played: another clip to play, given as that of training was; None: that of training, corrected frame by frame.
-    """
-
-    anchors: Anchors
-    skeleton: Skeleton
-    clip: MotionClip
-    learned: Parameters
-    shapes: PoseBlendShapes | None = None
+    anchors: Anchors  # of the Gaussians, with the template's weights
+    skeleton: Skeleton  # of the template in the person's shape; clips are given for it
+    clip: MotionClip  # that of training, as it was given
+    learned: Parameters  # corrections to all of these, see ``new_corrections``
+    shapes: PoseBlendShapes | None = None  # the template's pose blend shapes, or None
+    # another clip to play, given as that of training was; None: that of training, corrected frame by frame
     played: MotionClip | None = None
 
     @staticmethod
-    def restored(options: HumanModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        """Return the scene of what ``state`` returned; it plays the clip of training.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as the others and the options have it.
-        """
+    def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+        """Return the scene of what ``state`` returned, playing the clip of training. Raises KeyError or ValueError."""
         tensors = dict(tensors)
         tensors.setdefault(
             "learned.weights", torch.zeros_like(tensors["anchors.weights"])
@@ -74,7 +62,7 @@ class HumanScene(Scene):
         clip = MotionClip(*(tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
         own = part_of(tensors, "learned")
-        learned = new_corrections(options, clip, skeleton, anchors, own.get("normals")).restored(own)
+        learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
             anchors=anchors,
@@ -111,7 +99,9 @@ class HumanScene(Scene):
         """(N, J) skinning weights as they were learned."""
         if "weights" not in self._derived:
             with torch.no_grad():
-                self._derived["weights"] = corrected_weights(self.learned, self.anchors, len(self.skeleton.joints))
+                self._derived["weights"] = skinning_weights(
+                    self.anchors, len(self.skeleton.joints), self.learned["weights"]
+                )
         return self._derived["weights"]
 
     @property
@@ -119,11 +109,6 @@ class HumanScene(Scene):
         """With joints where they were learned to be."""
         with torch.no_grad():
             return corrected_skeleton(self.learned, self.skeleton)
-
-    @property
-    def pose_dirs(self) -> Tensor | None:
-        """(N, 27) learned offsets that depend on the pose, or None."""
-        return self.learned["pose_dirs"].detach() if "pose_dirs" in self.learned else None
 
     @property
     def light(self) -> Light | None:
@@ -165,25 +150,23 @@ class HumanScene(Scene):
 
     def in_pose(self, posing: BodyPose, time: float) -> Moment:
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
-        offsets = rest_offsets(self.anchors, self.weights, posing, self.shapes, self.pose_dirs)
+        offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
         return Moment(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.
 
-        Args:
-            row: of the clip.
-            given_weights: (N, J) of ``skinning_weights``; then nothing that was learned about the body is applied.
+        With ``given_weights`` (N, J) nothing that was learned about the body is applied.
         """
-        skeleton, pose_dirs, light = self.skeleton, None, None
+        skeleton, light = self.skeleton, None
         if given_weights is None:
             posing, skeleton = corrected_pose(self.learned, self.clip, row), corrected_skeleton(self.learned, skeleton)
-            weights = corrected_weights(self.learned, self.anchors, len(skeleton.joints))
-            pose_dirs, light = self.learned.get("pose_dirs"), learned_light(self.learned)
+            weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
+            light = learned_light(self.learned)
         else:
             posing, weights = frame_pose(self.clip, row), given_weights
-        offsets = rest_offsets(self.anchors, weights, posing, self.shapes, pose_dirs)
+        offsets = rest_offsets(self.anchors, posing, self.shapes)
         return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light), posing
 
     def given_weights(self) -> Tensor:
@@ -243,3 +226,61 @@ def stored_shapes(tensors: Mapping[str, Tensor]) -> PoseBlendShapes | None:
         return None
     require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
     return PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
+
+
+_MOST_FACES = 2**31
+
+
+def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
+    """Check the state of an avatar against its Gaussians. Raises KeyError or ValueError."""
+    n, j, f = len(gaussians), len(state["joints"]), len(state["clip.times"])
+    require_body(n, gaussians.sh.shape[1], state["parents"], j)
+    require_moments("clip.times", state["clip.times"])
+    shapes = dict.fromkeys(("joints", "learned.joints", "learned.turns"), (j, 3))
+    shapes |= dict.fromkeys(("clip.poses", "learned.poses"), (f, j, 3))
+    shapes |= dict.fromkeys(("clip.trans", "learned.trans"), (f, 3))
+    shapes |= {"clip.scale": (f,), "learned.log_scale": (1,)}
+    for name, shape in shapes.items():
+        require_tensor(name, state[name], shape)
+    require_positive("clip.scale", state["clip.scale"])
+    if not f:
+        raise ValueError("the clip has no frame")
+    prefix = "anchors."
+    require_anchors({name.removeprefix(prefix): x for name, x in state.items() if name.startswith(prefix)}, n, j)
+    if bool((state["anchors.weights"] < 0).any()) or not bool((state["anchors.weights"].sum(1) > 0).all()):
+        raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
+    require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
+    if "learned.light" in state:
+        require_tensor("learned.light", state["learned.light"], (TERMS, 3))
+        require_tensor("learned.normals", state["learned.normals"], (n, 3))
+    if "shapes.directions" in state:
+        require_indices("anchors.face", state["anchors.face"], (n,), len(state["shapes.faces"]))
+    if "near" in state:
+        require_indices("near", state["near"], (n, None), n)
+
+
+def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: int) -> None:
+    """Check that the Gaussians have 1 or 4 harmonics and the skeleton is of a known family. Raises ValueError."""
+    if num_joints not in SMPLX_ROWS or terms not in (1, 4):
+        raise ValueError(f"{num_gaussians} Gaussians of {terms} harmonics on {num_joints} joints")
+    if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
+        raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
+    check_tree(tuple(parents.tolist()))
+
+
+def require_anchors(anchors: Mapping[str, Tensor], num_gaussians: int, num_joints: int) -> None:
+    """Check the anchors of N Gaussians on J joints. Raises KeyError or ValueError."""
+    n, k = num_gaussians, anchors["weights"].shape[-1]
+    shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
+    for name, shape in shapes.items():
+        require_tensor(f"anchors.{name}", anchors[name], shape)
+    require_indices("anchors.joints", anchors["joints"], (n, k), num_joints)
+    require_indices("anchors.face", anchors["face"], (n,), _MOST_FACES)
+
+
+def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:
+    """Check the pose blend shapes of a template with J joints. Raises ValueError."""
+    require_tensor("shapes.directions", directions, (9 * (num_joints - 1), None), torch.float16)
+    require_indices("shapes.faces", faces, (None, 3), directions.shape[1] // 3, torch.int32)
+    if directions.shape[1] % 3:
+        raise ValueError(f"'shapes.directions' has {directions.shape[1]} columns, not three for each vertex")

@@ -18,12 +18,10 @@ from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import Moment, Scene
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
-from dyngs.human.avatar.light import difference_of_sides
-from dyngs.human.avatar.neighbours import linked_neighbours
-from dyngs.human.avatar.posing import BodyPose
+from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, trust_in
+from dyngs.human.avatar.observations import Subject
+from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.subject import Subject
-from dyngs.human.avatar.unseen import HARDLY, filled, mirror_images, sightings, trust_in
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates
@@ -39,13 +37,9 @@ WORTH_TELLING = 0.01
 
 
 class HumanTraining:
-    """See ``SceneTraining``.
+    """See ``SceneTraining``; ``frames`` are numbers of the rows of the clip of training, ``rates`` say how rates fall.
 
-    Args:
-        options: of the model.
-        frames: number of the frame of each row of the clip of training.
-        rates: how learning rates fall.
-        views: camera and frame of the training views; none: what they do not show is not filled.
+    ``views`` are camera and frame of the training views; without any, what they do not show is not filled.
     """
 
     moves_by = ("pose", "model")
@@ -63,8 +57,8 @@ class HumanTraining:
 
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
-        clip = subject.footage.clip
-        learned = new_corrections(self.options, clip, subject.skeleton, subject.anchors, normals)
+        clip = subject.motion.clip
+        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
             gaussians=gaussians,
             anchors=subject.anchors,
@@ -88,8 +82,7 @@ class HumanTraining:
     def moment(self, scene: HumanScene, image: Image, step: int) -> Moment:
         """Return the Gaussians in the pose of ``image``, and the regularizers.
 
-        Raises:
-            DyngsError: the image's frame has no pose.
+        Raises DyngsError: the image's frame has no pose.
         """
         row = self._rows.get(-1 if image.frame is None else image.frame)
         if row is None:
@@ -98,7 +91,7 @@ class HumanTraining:
         row = min(row, len(scene.clip) - 1)  # who never moves has one row
         gaussians, posing = self._in_frame(scene, row, step)
         if self._refines(step):
-            penalties |= correction_penalties(scene.learned, self.options)
+            penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
                 penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
@@ -157,7 +150,7 @@ class HumanTraining:
         self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> HumanScene:
-        scene = HumanScene.restored(self.options, gaussians, tensors)
+        scene = HumanScene.restored(gaussians, tensors)
         self._near, self._given_weights, self._images = tensors.get("near"), None, None
         return replace(scene, colour=like.colour, options=like.options, background=like.background)
 
@@ -173,7 +166,6 @@ class HumanTraining:
         return scene.in_frame(row, self._given_weights)
 
     def _images_in(self, scene: HumanScene) -> tuple[Tensor, Tensor]:
-        """Return the mirror images of the Gaussians, see ``mirror_images``."""
         if self._images is None:
             self._images = mirror_images(scene.anchors, float(scene.skeleton.joints[0, 0]))
         return self._images

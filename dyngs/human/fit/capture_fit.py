@@ -1,7 +1,4 @@
-"""The fit of a whole capture: reads silhouettes and given poses, fits the body, judges the result on views left out.
-
-Local letters: F frames, V views.
-"""
+"""The fit of a whole capture: reads silhouettes and given poses, fits the body, judges the result on views left out."""
 
 from __future__ import annotations
 
@@ -22,14 +19,10 @@ from dyngs.human.fit.joints3d import Joints3D
 from dyngs.human.fit.keypoints import Keypoints
 from dyngs.human.fit.lens_fit import LensFit, fit_lens
 from dyngs.human.fit.lens_fit import num_ticks as num_lens_ticks
-from dyngs.human.fit.observed import ObservedFrame, longest_box_side, observed_frame
-from dyngs.human.fit.pose_prior import near_given, usual
-from dyngs.human.fit.result import BodyFit, body_fit
-from dyngs.human.fit.solve import Stage, drawn_frame, new_fit, run_stage
+from dyngs.human.fit.silhouettes import ObservedFrame, longest_box_side, observed_frame, surface_of
+from dyngs.human.fit.solve import FRAMES, BodyFit, Fitting, body_fit, drawn_frame, near_given, new_fit, usual
 from dyngs.human.fit.start import first_poses, num_ticks
-from dyngs.human.fit.surface import Surface, surface_of
-from dyngs.human.motion.captured import CapturedMotion, captured_motion
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 
 IMAGE_SIDE = 512
@@ -44,25 +37,17 @@ GAIN, GAIN_OF_SHAPE = 0.01, 0.03
 Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another shape explains thick
 clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
-FRAMES = 3
-"""Frames drawn in each step."""
 SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
 """What is the same in all frames."""
 
 
 @dataclass(frozen=True)
 class FitEffort:
-    """How much a fit may cost.
+    """How much a fit may cost."""
 
-    Attributes:
-        side: of the squares around the person that are looked at, px.
-        steps: least number of steps of Adam of a stage.
-        visits: how often a frame is drawn where its pose is learned.
-    """
-
-    side: int = 128
-    steps: int = 120
-    visits: int = 18
+    side: int = 128  # of the squares around the person that are looked at, px
+    steps: int = 120  # least number of steps of Adam of a stage
+    visits: int = 18  # how often a frame is drawn where its pose is learned
 
     def steps_for(self, clip: MotionClip) -> int:
         """Return the number of steps that draws every frame often enough."""
@@ -71,17 +56,12 @@ class FitEffort:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known beside images and given poses.
+    """What is known beside images and given poses."""
 
-    Attributes:
-        joints: in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without.
-        guessed_lens: the capture is one camera that stands at the origin, with a guessed focal length to be refined.
-        shape: the body has the shape of the person already.
-    """
-
-    joints: Joints3D | None = None
+    joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without
+    # the capture is one camera that stands at the origin, with a guessed focal length to be refined
     guessed_lens: bool = False
-    shape: bool = False
+    shape: bool = False  # the body has the shape of the person already
 
     @property
     def learned(self) -> tuple[str, ...]:
@@ -94,43 +74,25 @@ NOTHING_KNOWN = Known()
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """One way to fit.
+class TriedFit:
+    """One way to fit."""
 
-    Attributes:
-        name: for people.
-        learned: of the clip.
-        iou: mean IoU of drawn and seen silhouettes.
-        per_frame: (F,) the same, per frame.
-    """
-
-    name: str
-    learned: Parameters
-    iou: float
-    per_frame: tuple[float, ...]
+    name: str  # for people
+    learned: Parameters  # of the clip
+    iou: float  # mean IoU of drawn and seen silhouettes
+    per_frame: tuple[float, ...]  # (F,) the same, per frame
 
 
 @dataclass(frozen=True)
 class CaptureFit:
-    """A fit of a capture's clip of training.
+    """A fit of a capture's clip of training."""
 
-    Attributes:
-        fit: of the clip.
-        motion: the given clip, F frames.
-        chosen: the candidate that was taken.
-        tried: all candidates; the first one has the poses as given.
-        held_out: views left out of the fit, on which the candidates were measured; 0: measured on those fitted to.
-        from_silhouettes: no poses were given.
-        lens: the focal length of one fixed camera that was guessed; None where cameras are known.
-    """
-
-    fit: BodyFit
-    motion: CapturedMotion
-    chosen: Candidate
-    tried: tuple[Candidate, ...]
-    held_out: int
-    from_silhouettes: bool
-    lens: LensFit | None = None
+    fit: BodyFit  # of the clip
+    motion: CapturedMotion  # the given clip, F frames
+    chosen: TriedFit  # the candidate that was taken
+    tried: tuple[TriedFit, ...]  # all candidates; the first one has the poses as given
+    held_out: int  # views left out of the fit, on which the candidates were measured; 0: measured on those fitted to
+    lens: LensFit | None = None  # the focal length of one fixed camera that was guessed; None where cameras are known
 
 
 @dataclass(frozen=True)
@@ -141,10 +103,11 @@ class Seen:
     judged: dict[int, ObservedFrame | None]
     held_out: int
 
-    def with_places(self, places: Mapping[int, Tensor]) -> Seen:
+    def with_positions(self, positions: Mapping[int, Tensor]) -> Seen:
         """Return the same with joints given in 3D, by row."""
         used = {
-            row: None if frame is None else replace(frame, places=places.get(row)) for row, frame in self.used.items()
+            row: None if frame is None else replace(frame, positions=positions.get(row))
+            for row, frame in self.used.items()
         }
         return replace(self, used=used, judged=used if self.judged is self.used else self.judged)
 
@@ -167,18 +130,7 @@ def fit_capture(
 
     With given poses: first the shape; then rotations that are the same in all frames, and then those of every frame,
     each where it explains views clearly better that were left out. Without: poses are found first (``first_poses``).
-
-    Args:
-        capture: with alpha.
-        options: how its images are read.
-        body: with a shape space.
-        report: of progress.
-        keypoints: of the training views, see ``dyngs.human.fit.keypoints``; None without.
-        effort: how much it may cost.
-        known: what else is known.
-
-    Raises:
-        DyngsError: no silhouettes, or nobody in them.
+    Raises DyngsError: no silhouettes, or nobody in them.
     """
     if not capture.has_alpha:
         raise DyngsError(f"{capture.root}: the images have no silhouettes; add masks of the person (docs/human.md)")
@@ -192,24 +144,31 @@ def fit_capture(
     )
     seen, surface = look_at(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
     joints = known.joints
-    seen = seen if joints is None else seen.with_places({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
+    seen = (
+        seen if joints is None else seen.with_positions({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
+    )
     if given:
-        tried = _from_given(motion.clip, surface, seen, known.learned, report, effort)
+        fitting = Fitting(motion.clip, surface, near_given(motion.clip))
+        tried = _from_given(fitting, seen, known.learned, report, effort)
     else:
         tick = ticker("first poses", report, num_ticks(len(motion.clip), marked=bool(keypoints)))
         clip = first_poses(motion.clip.times, surface, seen.used.__getitem__, tick)
         motion = CapturedMotion(clip, motion.frames)
-        tried = _from_silhouettes(clip, surface, seen, known.learned, report, effort)
+        fitting = Fitting(clip, surface, usual(clip))
+        tried = _from_silhouettes(fitting, seen, known.learned, report, effort)
     lens = None
     if known.guessed_lens:
-        candidate, lens = _with_lens(tried[-1], motion.clip, surface, seen, known.learned, report, effort)
-        tried = (*tried, candidate) if lens.taken else tried
+        fitting, steps = replace(fitting, expected=usual(motion.clip)), effort.steps_for(motion.clip)
+        tick = ticker("focal length", report, num_lens_ticks(steps))
+        refined, lens = fit_lens(fitting, tried[-1].learned, known.learned, seen.used.__getitem__, steps, tick)
+        if lens.taken:
+            tried = (*tried, measured("the focal length refined", refined, fitting, seen))
     first_gain = 0.0 if not given else GAIN if known.shape else GAIN_OF_SHAPE
     chosen = tried[-1] if lens is not None and lens.taken else simplest_of_the_best(tried, first_gain)
-    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, not given, lens)
+    return CaptureFit(body_fit(chosen.learned, len(body.joints)), motion, chosen, tried, seen.held_out, lens)
 
 
-def simplest_of_the_best(tried: Sequence[Candidate], first_gain: float = GAIN_OF_SHAPE) -> Candidate:
+def simplest_of_the_best(tried: Sequence[TriedFit], first_gain: float = GAIN_OF_SHAPE) -> TriedFit:
     """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to complex.
 
     ``first_gain`` is the gain of IoU for which the first one is left: given poses are touched for much only.
@@ -257,11 +216,7 @@ def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
 def look_at(
     capture: Capture, motion: CapturedMotion, options: DataConfig, effort: FitEffort, keypoints: Keypoints
 ) -> Seen:
-    """Return the squares around the person in all frames.
-
-    Raises:
-        DyngsError: nobody is seen.
-    """
+    """Return the squares around the person in all frames. Raises DyngsError: nobody is seen."""
     views = capture.splits["train"]
     images = ImageLoader(views, options.model_copy(update={"longest_side": IMAGE_SIDE, "downscale": 1}))
     used, left_out = split_views(views, motion)
@@ -292,68 +247,36 @@ def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], po
 
 
 def _from_given(
-    clip: MotionClip,
-    surface: Surface,
-    seen: Seen,
-    shared: tuple[str, ...],
-    report: ReportProgress,
-    effort: FitEffort,
-) -> tuple[Candidate, ...]:
+    fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
+) -> tuple[TriedFit, ...]:
     """Return the poses as given, with a fitted shape, and with fitted poses."""
-    start, expected = new_fit(clip, surface), near_given(clip)
-    tick = ticker("shape", report, 4 * effort.steps)
-    stage = Stage(effort.steps, FRAMES, ("padding",))  # clothes and hair are no sign of wrong poses
-    dressed = run_stage(start, stage, clip, surface, seen.halved, expected, tick)
-    tried = [measured("the poses as given", dressed, clip, surface, seen)]
+    start = new_fit(fitting.clip, fitting.surface)
+    tick, full = ticker("shape", report, 4 * effort.steps), seen.used.__getitem__
+    # Clothes and hair are no sign of wrong poses.
+    dressed = fitting.run(start, ("padding",), effort.steps, seen.halved, tick)
+    tried = [measured("the poses as given", dressed, fitting, seen)]
     shape = start
-    for look in (seen.halved, seen.used.__getitem__):
-        shape = run_stage(shape, Stage(effort.steps, FRAMES, shared), clip, surface, look, expected, tick)
-    tried.append(measured("one shape", shape, clip, surface, seen))
-    stage = Stage(effort.steps, FRAMES, (*shared, "turns"))
-    turns = run_stage(shape, stage, clip, surface, seen.used.__getitem__, expected, tick)
-    tried.append(measured("turns that are the same in all frames as well", turns, clip, surface, seen))
-    stage = Stage(effort.steps_for(clip), FRAMES, (*shared, "turns", "poses", "trans"))
-    tick = ticker("poses", report, stage.steps)
-    poses = run_stage(turns, stage, clip, surface, seen.used.__getitem__, expected, tick)
-    tried.append(measured("turns of every frame as well", poses, clip, surface, seen))
-    return tuple(tried)
+    for look in (seen.halved, full):
+        shape = fitting.run(shape, shared, effort.steps, look, tick)
+    tried.append(measured("one shape", shape, fitting, seen))
+    turns = fitting.run(shape, (*shared, "turns"), effort.steps, full, tick)
+    tried.append(measured("turns that are the same in all frames as well", turns, fitting, seen))
+    steps = effort.steps_for(fitting.clip)
+    tick = ticker("poses", report, steps)
+    poses = fitting.run(turns, (*shared, "turns", "poses", "trans"), steps, full, tick)
+    return (*tried, measured("turns of every frame as well", poses, fitting, seen))
 
 
 def _from_silhouettes(
-    clip: MotionClip,
-    surface: Surface,
-    seen: Seen,
-    shape: tuple[str, ...],
-    report: ReportProgress,
-    effort: FitEffort,
-) -> tuple[Candidate, ...]:
+    fitting: Fitting, seen: Seen, shape: tuple[str, ...], report: ReportProgress, effort: FitEffort
+) -> tuple[TriedFit, ...]:
     """Return the poses as they were found first, and shape and poses fitted together."""
-    start, expected = new_fit(clip, surface), usual(clip)
-    tried = [measured("poses found frame by frame", start, clip, surface, seen)]
-    stage = Stage(effort.steps_for(clip), FRAMES, (*shape, "poses", "trans"))
-    tick = ticker("shape", report, 2 * stage.steps)
-    found = start
+    start, steps = new_fit(fitting.clip, fitting.surface), effort.steps_for(fitting.clip)
+    tick, found = ticker("shape", report, 2 * steps), start
+    first = measured("poses found frame by frame", start, fitting, seen)
     for look in (seen.halved, seen.used.__getitem__):
-        found = run_stage(found, stage, clip, surface, look, expected, tick)
-    tried.append(measured("one shape, and poses of every frame", found, clip, surface, seen))
-    return tuple(tried)
-
-
-def _with_lens(
-    start: Candidate,
-    clip: MotionClip,
-    surface: Surface,
-    seen: Seen,
-    shape: tuple[str, ...],
-    report: ReportProgress,
-    effort: FitEffort,
-) -> tuple[Candidate, LensFit]:
-    """Return the fit with the focal length of one camera refined, where that pays, and what was found about it."""
-    steps, look = effort.steps_for(clip), seen.used.__getitem__
-    tick = ticker("focal length", report, num_lens_ticks(steps))
-    args = (start.learned, shape, clip, surface, look, usual(clip), steps, tick)
-    found, lens = fit_lens(*args)
-    return measured("the focal length refined", found, clip, surface, seen), lens
+        found = fitting.run(found, (*shape, "poses", "trans"), steps, look, tick)
+    return first, measured("one shape, and poses of every frame", found, fitting, seen)
 
 
 def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
@@ -369,17 +292,17 @@ def ticker(name: str, report: ReportProgress, total: int) -> Callable[[], None]:
 
 
 @torch.no_grad()
-def measured(name: str, learned: Parameters, clip: MotionClip, surface: Surface, seen: Seen) -> Candidate:
+def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> TriedFit:
     """Return the candidate with its IoU in the frames that judge."""
     found = []
     for row, frame in seen.judged.items():
         if frame is not None:
-            drawn = drawn_frame(learned, clip, surface, row, frame.cameras)
+            drawn = drawn_frame(learned, fitting.clip, fitting.surface, row, frame.cameras)
             found.append(_iou(drawn, frame))
         else:
             found.append(torch.zeros(0, device="cpu"))
     per_frame = tuple(float(x.mean()) if len(x) else float("nan") for x in found)
-    return Candidate(name, learned, float(torch.cat(found).mean()), per_frame)
+    return TriedFit(name, learned, float(torch.cat(found).mean()), per_frame)
 
 
 def _iou(drawn: Tensor, seen: ObservedFrame) -> Tensor:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,37 +14,124 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig
-from dyngs.conventions import ReportProgress
+from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.body_frames import numbered
-from dyngs.data.capture import Capture, Split
-from dyngs.data.loader import ImageLoader
+from dyngs.data.capture import Capture, Split, View
+from dyngs.data.geometry import opengl_from_cam
+from dyngs.data.images.images import straight_uint8
+from dyngs.data.loader import Image, ImageLoader
+from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.data.times import evenly_spaced
+from dyngs.errors import DyngsError, reading
+from dyngs.files.cache import cache_folder
 from dyngs.files.temporary import temporary_folder_beside
-from dyngs.files.write import write_image, write_text
-from dyngs.human.avatar.posing import frame_pose
+from dyngs.files.write import atomic_file, write_image, write_text
+from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
-from dyngs.human.fit.clips import FittedClip, fitted_clips
-from dyngs.human.fit.inputs import (
-    NOTHING_ELSE,
-    FitInputs,
-    KnownAvatar,
-    has_guessed_lens,
-    joints_of,
-    read_person,
-    with_lens,
-)
+from dyngs.human.fit.clips import NewClip, fitted_clips, placed_clip
+from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, read_person, with_lens
+from dyngs.human.fit.joints3d import read_joints
 from dyngs.human.fit.keypoints import read_keypoints
-from dyngs.human.fit.known_avatar import AvatarPoses, posed_by_avatar
-from dyngs.human.fit.known_person import known_shape, shape_of, with_shape
-from dyngs.human.fit.new_clip import NewClip, placed_clip
-from dyngs.human.fit.overlays import FITTED, GIVEN, overlay, side_by_side
-from dyngs.human.fit.surface import surface_of
-from dyngs.human.fit.written import write_body, write_split
+from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
+from dyngs.human.motion.clip import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
+
+FRAME_RATE = 30.0
+"""Frames per second of a clip whose capture does not say."""
+
+
+def write_body(
+    path: Path, found: CapturedMotion, betas: np.ndarray, world_offset: np.ndarray, fps: float | None = None
+) -> None:
+    """Write the body parameters of a clip, also readable as a motion: rows are named by their frame numbers.
+
+    ``betas`` (B,) are of the free template's shape space; ``fps`` frames per second, None where nobody knows.
+    """
+    clip = found.clip
+    with atomic_file(path) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            poses=clip.poses.reshape(len(clip), -1).cpu().numpy(),
+            trans=(clip.trans.double().cpu().numpy() + world_offset).astype(np.float32),
+            betas=betas.astype(np.float32),
+            scale=clip.scale.cpu().numpy(),
+            surface_model_type="anny",
+            gender="neutral",
+            up_axis="y",
+            frames=np.asarray(found.frames, dtype=np.int64),
+            mocap_frame_rate=np.float64(FRAME_RATE if fps is None else fps),
+        )
+
+
+def write_split(
+    out: Path, split: Split, shown: Iterator[tuple[View, Image]], rows: Mapping[int, int], world_offset: np.ndarray
+) -> None:
+    """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
+
+    ``rows`` maps frame numbers to rows of the body parameters; ``world_offset`` (3,) is added to all positions.
+    """
+    frames: list[dict[str, object]] = []
+    for view, image in shown:
+        row = rows[-1 if view.frame is None else view.frame]
+        name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
+        write_image(out / name, _straight(image))
+        camera = image.cameras
+        intrinsics = camera.intrinsics[0].double().numpy()
+        pose = opengl_from_cam(view.cam_from_world).copy()
+        pose[:3, 3] += world_offset
+        entry: dict[str, object] = {"file_path": name, "frame": row, "camera": view.camera_id}
+        entry |= {} if view.time is None else {"time": view.time}
+        entry |= {"w": camera.width, "h": camera.height, "fl_x": intrinsics[0, 0], "fl_y": intrinsics[1, 1]}
+        frames.append(entry | {"cx": intrinsics[0, 2], "cy": intrinsics[1, 2], "transform_matrix": pose.tolist()})
+    write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
+
+
+def _straight(image: Image) -> np.ndarray:
+    parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
+    return straight_uint8(torch.cat(parts, dim=-1)).numpy()
+
+
+GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)
+"""Colours of the outlines: red and green."""
+
+
+@torch.no_grad()
+def overlay(
+    image: Image, surface: Surface, bodies: Sequence[tuple[Tensor, BodyPose, tuple[float, float, float]]]
+) -> np.ndarray:
+    """Return the image (H, W, 3) in [0, 1] over white with the outlines of bodies.
+
+    ``bodies`` are shape parameters, pose and colour of each, drawn one over the other.
+    """
+    sheet = image.composite(torch.ones_like(image.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
+    for betas, pose, colour in bodies:
+        discs = surface.in_pose(betas, torch.zeros_like(surface.weights[:, 0]), pose)
+        sheet[_outline(drawn_silhouettes(discs, image.cameras)[0] > 0.5)] = sheet.new_tensor(colour)
+    return sheet.cpu().numpy()
+
+
+def side_by_side(sheets: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Return one image of several, white where they are smaller than the largest."""
+    height, width = (max(sheet.shape[axis] for sheet in sheets) for axis in (0, 1))
+    rows = -(-len(sheets) // columns)
+    whole = np.ones((rows * height, min(columns, len(sheets)) * width, 3), np.float32)
+    for i, sheet in enumerate(sheets):
+        top, left = i // columns * height, i % columns * width
+        whole[top : top + sheet.shape[0], left : left + sheet.shape[1]] = sheet
+    return whole
+
+
+def _outline(inside: Tensor) -> Tensor:
+    """Return the pixels (H, W) inside whose neighbour is outside."""
+    grown = torch.nn.functional.max_pool2d((~inside).float()[None, None], 3, 1, 1)[0, 0] > 0
+    return inside & grown
+
 
 REPORT_NAME, OVERLAYS_NAME = "fit_report.json", "fit_overlays.png"
 _MASKS = ".masks"
@@ -76,28 +165,15 @@ class FittedCapture:
 
 
 def write_fitted_capture(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE
+    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE, *, with_images: bool = True
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
-    Files: ``transforms_SPLIT.json``, ``images/``, ``body_train.npz``, ``body_pose.npz`` for another clip whose poses
-    were given by the same means, ``fit_report.json``, and ``fit_overlays.png`` to look at. ``given`` is what is
-    known beside the capture, which may be a plain clip as well: see ``read_person``.
-
-    Raises:
-        DyngsError: see ``fit_capture``; ``out`` is not empty.
+    Files: ``transforms_SPLIT.json`` and ``images/`` (without both it is for ``data.body``), ``body_train.npz``,
+    ``body_pose.npz`` for another clip whose poses were given by the same means, ``fit_report.json``, and
+    ``fit_overlays.png`` to look at. ``given`` is what is known beside the capture, see ``read_person``. Raises
+    DyngsError: see ``fit_capture``; ``out`` is not empty.
     """
-    return _fitted(options, out, report, given, with_images=True)
-
-
-def write_fit(options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE) -> FittedCapture:
-    """As ``write_fitted_capture``, but without images and cameras: for ``data.body``."""
-    return _fitted(options, out, report, given, with_images=False)
-
-
-def _fitted(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs, *, with_images: bool
-) -> FittedCapture:
     require_new_folder(out)
     person = None if given.person is None else known_shape(given.person)
     body, folder = default_template(), temporary_folder_beside(out)
@@ -106,7 +182,10 @@ def _fitted(
         capture = read_person(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
         points = {} if given.keypoints is None else read_keypoints(given.keypoints, capture.splits["train"])
-        known = Known(joints_of(capture, given), has_guessed_lens(capture), person is not None)
+        joints = None
+        if given.joints is not None:
+            joints = read_joints(given.joints, capture, body if given.body is None else read_body(given.body))
+        known = Known(joints, has_guessed_lens(capture), person is not None)
         shaped = body if person is None else with_shape(body, person)
         found = fit_capture(capture, options, shaped, report, points, known=known)
         if person is not None:
@@ -114,41 +193,28 @@ def _fitted(
         capture = with_lens(capture, found.lens)
         new_poses = placed_clip(capture, options, shaped, found, report)
         clips = fitted_clips(capture, shaped, found, new_poses)
-        by_avatar = () if given.avatar is None else _posed(given.avatar, capture, options, clips)
+        by_avatar: dict[Split, AvatarPoses] = {}
+        if given.avatar is not None:
+            by_avatar = {x: posed_by_avatar(given.avatar, capture.splits[x], options, clips[x]) for x in clips}
+        clips |= {split: found_by.clip for split, found_by in by_avatar.items()}
         if with_images:
             _write_images(folder, capture, options, clips)
             for split, clip in clips.items():
                 clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
-        _write_bodies(folder, capture, clips, found.fit.betas)
+        for split, clip in clips.items():
+            write_body(folder / f"body_{split}.npz", clip, found.fit.betas.numpy(), capture.world_offset, capture.fps)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
-        write_text(folder / REPORT_NAME, json.dumps(_report(found, new_poses, by_avatar), indent=1) + "\n")
+        write_text(
+            folder / REPORT_NAME, json.dumps(_report(found, new_poses, tuple(by_avatar.values())), indent=1) + "\n"
+        )
         shutil.rmtree(masks, ignore_errors=True)
         folder.replace(out)  # also where ``out`` is an empty folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return FittedCapture(out, found, new_poses, by_avatar)
+    return FittedCapture(out, found, new_poses, tuple(by_avatar.values()))
 
 
-def _posed(
-    avatar: KnownAvatar, capture: Capture, options: DataConfig, clips: dict[Split, FittedClip]
-) -> tuple[AvatarPoses, ...]:
-    """Give the clips the poses in which the avatar has their silhouettes; return what came out, clip by clip."""
-    found: list[AvatarPoses] = []
-    for split, clip in clips.items():
-        found.append(posed_by_avatar(avatar, capture.splits[split], options, clip))
-        clips[split] = found[-1].clip
-    return tuple(found)
-
-
-def _write_bodies(out: Path, capture: Capture, clips: Mapping[Split, FittedClip], betas: Tensor) -> None:
-    """Write the clips, rows named by their frame numbers."""
-    for split, found in clips.items():
-        path = out / f"body_{split}.npz"
-        write_body(path, found.clip, betas.numpy(), capture.world_offset, found.frames, capture.fps)
-
-
-def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, FittedClip]) -> None:
-    """Write the images and cameras of all splits."""
+def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, CapturedMotion]) -> None:
     full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
     for split, views in capture.splits.items():
         if views:
@@ -171,8 +237,7 @@ def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: 
     return side_by_side(sheets, _COLUMNS)
 
 
-def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: tuple[AvatarPoses, ...]) -> dict[str, object]:
-    """Return the report as JSON values."""
+def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[AvatarPoses]) -> dict[str, object]:
     fit, chosen = found.fit, found.chosen
     turns = np.degrees(fit.shared.turns.norm(dim=1).double().numpy())
     lens: dict[str, object] = {} if found.lens is None else {"lens": {**vars(found.lens)}}
@@ -194,3 +259,56 @@ def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: tuple[Avata
         "betas": [round(beta, 4) for beta in fit.betas.tolist()],
         "turns_degrees": {name: round(float(turn), 2) for name, turn in zip(JOINT_NAMES, turns, strict=True) if turn},
     }
+
+
+KEYPOINTS = "keypoints"
+"""Folder of a capture with key points of its images, as OpenPose writes them."""
+_LARGEST = 100_000_000
+"""Files of a capture larger than this many bytes, such as videos, are not what it says about bodies and cameras."""
+
+
+def with_fitted_body(
+    data: DataConfig,
+    *,
+    only_if_needed: bool = False,
+    say: Callable[[str], None] = print,
+    report: ReportProgress = report_nothing,
+) -> DataConfig:
+    """Return the options with a fit of the free template to the capture; the same capture is fitted once.
+
+    Nothing is fitted where ``data.body`` names a fit, where the capture itself holds one, or without silhouettes.
+    ``only_if_needed``: nothing is fitted where the capture has body parameters. Raises DyngsError: neither body
+    parameters nor silhouettes.
+    """
+    if data.body is not None:
+        return data
+    capture = read_capture(data)
+    if capture.body is not None and (only_if_needed or capture.body["train"].shape_space == "anny"):
+        return data
+    if not capture.has_alpha:
+        if capture.body is None:
+            raise DyngsError(
+                f"{data.root}: has neither silhouettes nor body parameters, so no person can be found; add masks of "
+                "the person (docs/person.md)"
+            )
+        say(f"{data.root}: no silhouettes, so the body parameters are taken as given")
+        return data
+    folder = cache_folder("bodies") / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}"
+    if folder.is_dir():
+        say(f"body:    the fit of before, in {folder}")
+    else:
+        say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder}")
+        points = data.root / KEYPOINTS
+        given = FitInputs(points if points.is_dir() else None)
+        say(write_fitted_capture(data, folder, report, given, with_images=False).summary())
+    return data.model_copy(update={"body": folder})
+
+
+def _digest(data: DataConfig) -> str:
+    """Return a digest of the capture's files (names, sizes, times of change) and of the options of reading it."""
+    root = data.root.resolve()
+    with reading(root):
+        files = sorted(path for path in root.rglob("*") if path.is_file() and path.stat().st_size < _LARGEST)
+    options = data.model_dump(mode="json", include={"format", "frames", "times", "frames_per_second", "test_every"})
+    chosen = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]
+    return f"{digest_of(root, files)}{chosen}"

@@ -14,10 +14,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.joints3d import Joints3D, read_joints
 from dyngs.human.fit.lens_fit import LensFit
-from dyngs.human.template.body_reader import read_body
-from dyngs.human.template.load import default_template
 
 _LOOKED_AT, _PRESENT = 128, 0.2
 """Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""
@@ -33,24 +30,15 @@ class KnownAvatar:
 
 @dataclass(frozen=True)
 class FitInputs:
-    """What is given beside the capture; everything may be None.
+    """What is given beside the capture; everything may be None."""
 
-    Attributes:
-        keypoints: folder or file of 2D key points.
-        masks: folder of masks, white = the person.
-        background: image of the place without the person, or a folder of one for each camera.
-        joints: file or folder of 3D joints or posed vertices, see ``read_joints``.
-        body: body file whose vertices these are; None: the free template.
-        person: capture or run of the same person, whose shape is kept.
-        avatar: of the same person, if that run has one: its silhouette decides the poses in the end.
-    """
-
-    keypoints: Path | None = None
-    masks: Path | None = None
-    background: Path | None = None
-    joints: Path | None = None
-    body: Path | None = None
-    person: Path | None = None
+    keypoints: Path | None = None  # folder or file of 2D key points
+    masks: Path | None = None  # folder of masks, white = the person
+    background: Path | None = None  # image of the place without the person, or a folder of one for each camera
+    joints: Path | None = None  # file or folder of 3D joints or posed vertices, see ``read_joints``
+    body: Path | None = None  # body file whose vertices these are; None: the free template
+    person: Path | None = None  # capture or run of the same person, whose shape is kept
+    # of the same person, if that run has one: its silhouette decides the poses in the end
     avatar: KnownAvatar | None = None
 
 
@@ -66,14 +54,9 @@ def has_guessed_lens(capture: Capture) -> bool:
 def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = print) -> Capture:
     """Return a capture of a person with silhouettes.
 
-    Args:
-        options: ``root`` is a capture, or a video or a folder of images of one fixed camera.
-        given: masks are taken in place of those of the capture; without any the person is told from the background.
-        work: masks that are made are written to this folder.
-        say: is told in lines what was taken, and how good masks are.
-
-    Raises:
-        DyngsError: neither capture nor clip; no masks, and none that can be made.
+    ``root`` of the options is a capture, or a video or a folder of images of one fixed camera. Masks of ``given`` take
+    the place of those of the capture; without any the person is told from the background. Masks that are made are
+    written to the folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and none that can be made.
     """
     source = options.root
     if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
@@ -90,17 +73,6 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
     return _without_empty_frames(capture, options, say) if has_guessed_lens(capture) else capture
 
 
-def joints_of(capture: Capture, given: FitInputs) -> Joints3D | None:
-    """Return the 3D joints of the frames of a capture, None without any.
-
-    Raises:
-        DyngsError: see ``read_joints``.
-    """
-    if given.joints is None:
-        return None
-    return read_joints(given.joints, capture, default_template() if given.body is None else read_body(given.body))
-
-
 def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
     """Return the capture with the focal length that was found."""
     if lens is None or not lens.taken:
@@ -113,11 +85,7 @@ def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
 
 
 def _with_masks(capture: Capture, masks: Path) -> Capture:
-    """Return the capture with the masks of a folder as silhouettes.
-
-    Raises:
-        DyngsError: an image without one.
-    """
+    """Return the capture with the masks of a folder as silhouettes."""
     splits = {}
     for split, views in capture.splits.items():
         found = silhouettes_of(masks, [f"{view.name}{view.image_path.suffix}" for view in views])
@@ -126,11 +94,7 @@ def _with_masks(capture: Capture, masks: Path) -> Capture:
 
 
 def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[str], None]) -> Capture:
-    """Return the clip without the frames in which nobody is seen.
-
-    Raises:
-        DyngsError: nobody is seen in any.
-    """
+    """Return the clip without the frames in which nobody is seen."""
     views = capture.splits["train"]
     small = ImageLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
     areas = []
@@ -148,6 +112,5 @@ def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[
 
 
 def _first(views: tuple[View, ...], kept: tuple[View, ...]) -> str:
-    """Return the name of the first view that was left out."""
     names = {view.name for view in kept}
     return next(view.name for view in views if view.name not in names)

@@ -1,6 +1,6 @@
 """Fits of other programs as 3D joints: of our own ``.npz`` and ``.json``, of SAM 3D Body, and of posed vertices.
 
-Local letters: F frames, K joints of a format, J joints of SMPL-X, N vertices.
+Local letters: K joints of a format, N vertices.
 """
 
 from __future__ import annotations
@@ -21,37 +21,69 @@ from dyngs.files.json_files import read_json_object
 from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import read_arrays, read_npz
 from dyngs.files.pickles import read_pickle
-from dyngs.human.fit.joint_orders import ORDERS
-from dyngs.human.fit.keypoints import JOINTS, by_stem
-from dyngs.human.fit.vertex_joints import joints_of_vertices
+from dyngs.human.fit.keypoints import JOINTS, ORDERS, by_stem
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
 
+NUM_JOINTS = 22
+"""Joints of the body without hands and face, the same in SMPL, SMPL-H and SMPL-X."""
+NEAR = 0.5
+"""A vertex tells where a joint is if it follows that joint and its parent by this fraction at least."""
+
+
+def joints_of_vertices(where: Path, body: BodyTemplate, vertices: np.ndarray) -> np.ndarray:
+    """Return the joints (F, 22, 3) of posed vertices (F, N, 3) of a body with N vertices; NaN where they do not tell.
+
+    The vertices around a joint, which follow it or its parent, are moved from rest to the pose by the similarity that
+    fits them best (Umeyama 1991); so is the joint. Raises DyngsError: another number of vertices; names ``where``.
+    """
+    rest, joints = body.vertices.double().cpu().numpy(), body.joints.double().cpu().numpy()
+    if vertices.ndim != 3 or vertices.shape[1:] != rest.shape:
+        raise DyngsError(
+            f"{where}: 'vertices' has the shape {'x'.join(map(str, vertices.shape))}, the body {len(rest)} of them; "
+            "give the body file that they belong to (--body)"
+        )
+    weights = body.weights.double().cpu().numpy()
+    found = np.full((len(vertices), NUM_JOINTS, 3), np.nan)
+    for joint, parent in enumerate(body.parents[:NUM_JOINTS]):
+        own = weights[:, joint] + (weights[:, parent] if parent >= 0 else 0.0)
+        near = np.minimum(weights[:, joint], weights[:, parent]) if parent >= 0 else weights[:, joint]
+        rows = np.flatnonzero((own > NEAR) & (near > 0.05))
+        if len(rows) >= 4:
+            found[:, joint] = [_moved(rest[rows], posed[rows], joints[joint]) for posed in vertices]
+    return found
+
+
+def _moved(rest: np.ndarray, posed: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Return the point (3,) moved by the similarity that takes points (P, 3) from rest to where they are posed."""
+    if not np.isfinite(posed).all():
+        return np.full(3, np.nan)
+    middle, place = rest.mean(0), posed.mean(0)
+    u, s, v = np.linalg.svd((posed - place).T @ (rest - middle))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v)) or 1.0])
+    scale = (s * signs).sum() / max(float(((rest - middle) ** 2).sum()), 1e-12)
+    return place + scale * (u * signs) @ v @ (point - middle)
+
+
 Space = Literal["world", "camera"]
 INNER = 0.3
-"""Confidence of joints inside the trunk, whose places differ from model to model by centimetres, over that of limbs."""
+"""Confidence of joints inside the trunk, which differ from model to model by centimetres, over that of limbs."""
 _MHR, _MHR_JOINTS = "mhr70", 70
 _MOST_FRAMES, _FARTHEST = 100_000, 1e6
 _TURNED = (1.0, -1.0, -1.0)
 """From the axes of a camera of OpenGL, y up and looking along -z, to those of OpenCV."""
-
 Joints3D = dict[int, Tensor]
 """Frame number to (55, 4): place in the world of the cameras and confidence, 0 where a joint is not known."""
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Joints as a file has them.
+    """Joints as a file has them."""
 
-    Attributes:
-        joints: key of a frame (its number, or the name of an image) to (K, 4), with confidence.
-        order: name of their order, in ``ORDERS``.
-        space: of their axes: the capture's world, or OpenCV's camera of the image.
-    """
-
+    # key of a frame (its number, or the name of an image) to (K, 4), with confidence
     joints: Mapping[int | str, np.ndarray]
-    order: str
-    space: Space
+    order: str  # name of their order, in ``ORDERS``
+    space: Space  # of their axes: the capture's world, or OpenCV's camera of the image
 
 
 def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
@@ -61,15 +93,8 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
     numbers, else 0, 1, ...; ``order`` and ``space`` as text. ``.json``: an object of ``order``, ``space`` and
     ``joints``, which maps images or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body,
     ``IMAGE.npz`` with ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck
-    et al. (2018), whose vertices are those of SMPL.
-
-    Args:
-        path: file or folder.
-        capture: with frame numbers.
-        body: the template, for vertices.
-
-    Raises:
-        DyngsError: another layout, no frame of the capture, or no numbers; names the file.
+    et al. (2018), whose vertices are those of SMPL. ``body`` is the template, for vertices. Raises DyngsError: another
+    layout, no frame of the capture, or no numbers; names the file.
     """
     views = capture.splits["train"]
     with reading(path):
@@ -162,11 +187,7 @@ def _key(name: str) -> int | str:
 
 
 def _joints_of(where: str, value: object) -> np.ndarray:
-    """Return (K, 4) joints with confidence; where a joint holds what is not finite, 0.
-
-    Raises:
-        DyngsError: no numbers, or another shape.
-    """
+    """Return (K, 4) joints with confidence; where a joint holds what is not finite, 0."""
     array = float_array(value)
     if array is None or array.ndim != 2 or array.shape[1] not in (3, 4):
         raise DyngsError(f"{where}: joints must be lists of 3 or 4 numbers; export it again")
@@ -178,11 +199,7 @@ def _joints_of(where: str, value: object) -> np.ndarray:
 
 
 def _checked(path: Path, joints: Mapping[int | str, np.ndarray], order: object, space: object) -> _Found:
-    """Return what was found.
-
-    Raises:
-        DyngsError: an unknown order or space, or another number of joints than the order has.
-    """
+    """Return what was found."""
     count = len(next(iter(joints.values())))
     by_count = {len(names): name for name, names in ORDERS.items()}
     wanted = by_count.get(count, "") if order is None else str(order)
@@ -204,11 +221,7 @@ def _checked(path: Path, joints: Mapping[int | str, np.ndarray], order: object, 
 
 
 def _by_frame(path: Path, found: _Found, views: Sequence[View]) -> dict[int, tuple[np.ndarray, View]]:
-    """Return frame number to joints and the view that they are for.
-
-    Raises:
-        DyngsError: joints of a camera that cannot be told.
-    """
+    """Return frame number to joints and the view that they are for."""
     stems, named = by_stem(views), {view.name: view for view in views}
     first: dict[int, View] = {}
     for view in views:
@@ -228,13 +241,13 @@ def _by_frame(path: Path, found: _Found, views: Sequence[View]) -> dict[int, tup
 def _placed(found: _Found, joints: np.ndarray, view: View, offset: np.ndarray) -> Tensor:
     """Return the joints (55, 4) of a frame in the recentred world of the cameras."""
     placed = torch.zeros(len(JOINT_NAMES), 4, device="cpu")
-    places = joints[:, :3] - offset
+    positions = joints[:, :3] - offset
     if found.space == "camera":
         rotation, shift = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
-        places = (joints[:, :3] - shift) @ rotation
+        positions = (joints[:, :3] - shift) @ rotation
     for row, name in enumerate(ORDERS[found.order]):
         if name in JOINT_NAMES and joints[row, 3] > 0:
             confidence = min(joints[row, 3], 1.0) * (1.0 if name in JOINTS else INNER)
-            known = np.append(places[row], confidence)
+            known = np.append(positions[row], confidence)
             placed[JOINT_NAMES.index(name)] = torch.from_numpy(known).float()
     return placed

@@ -1,6 +1,6 @@
 """2D key points of a person in images, as detectors write them: OpenPose and COCO.
 
-Local letters: J joints of SMPL-X, K key points of a format, V views.
+Local letter: K key points of a format.
 """
 
 from __future__ import annotations
@@ -17,9 +17,48 @@ from dyngs.data.images.lens import undistorted_points
 from dyngs.errors import DyngsError, reading
 from dyngs.files.fields import numbers_of
 from dyngs.files.json_files import read_json_object
-from dyngs.human.fit.joint_orders import BODY_25, COCO, COCO_18
 from dyngs.human.template.joints import JOINT_NAMES
 
+COCO = (
+    *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
+    *("right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle"),
+    "right_ankle",
+)
+BODY_25 = (
+    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
+    *("pelvis", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye"),
+    "left_eye",
+)
+COCO_18 = (
+    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
+    *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "right_eye", "left_eye"),
+)
+_MARKED = ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+"""Joints that detectors place where those of a body are; necks, collars and toes are elsewhere."""
+
+
+def _marked(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+    """Return ``count`` names, those that are not joints of a body where they are marked, or not known, empty."""
+    kept = [name if name.partition("_")[2] in _MARKED else "" for name in names]
+    return (*kept, *[""] * (count - len(kept)))
+
+
+_GOLIATH = (
+    *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
+    *("right_elbow", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
+)
+_MHR = list(_marked(_GOLIATH, 70))
+_MHR[41], _MHR[62] = "right_wrist", "left_wrist"
+ORDERS: dict[str, tuple[str, ...]] = {
+    "coco17": _marked(COCO, 17),
+    "openpose25": _marked(BODY_25, 25),
+    "smpl": (*JOINT_NAMES[:22], "", ""),
+    "smplx_body": JOINT_NAMES[:22],
+    "smplx": JOINT_NAMES,
+    "mhr70": tuple(_MHR),
+}
+"""Orders of 3D joints by name; the number of joints tells them apart. Empty: a joint that is not used. ``mhr70`` is
+that of SAM 3D Body."""
 _SEEN = ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 """Joints that detectors mark where they are, on both sides. Nose and ears are no joints; necks and toes are marked
 elsewhere."""
@@ -31,7 +70,6 @@ _FARTHEST = 1e6
 """Key points further away, px, are taken for mistakes."""
 _ORDERS = {17: COCO, 133: COCO, 25: BODY_25, 18: COCO_18}
 """Number of key points of a format to the names of the first ones, as published."""
-
 Keypoints = dict[str, Tensor]
 """Name of a view to (55, 3): column, row and confidence of joints in its stored image, undistorted; confidence 0
 where a joint is not marked."""
@@ -41,11 +79,9 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     """Return the key points of the views: of a folder of OpenPose files, or of one COCO file.
 
     OpenPose: ``NAME_keypoints.json`` or ``NAME.json``, NAME being the image's name without suffix; ``people`` with
-    ``pose_keypoints_2d`` of 25 or 18 points. COCO: ``images`` (id, file_name) and
-    ``annotations`` (image_id, keypoints of 17 or 133 points). Of several people the most confident one is taken.
-
-    Raises:
-        DyngsError: a file that is neither, or no key points for any view.
+    ``pose_keypoints_2d`` of 25 or 18 points. COCO: ``images`` (id, file_name) and ``annotations`` (image_id, keypoints
+    of 17 or 133 points). Of several people the most confident one is taken. Raises DyngsError: a file that is neither,
+    or no key points for any view.
     """
     stems = by_stem(views)
     rows = _openpose(path, stems) if path.is_dir() else _coco(path, stems)
@@ -119,11 +155,7 @@ def _coco(file: Path, stems: Mapping[str, str]) -> dict[str, np.ndarray]:
 
 
 def _points(file: Path, key: str, value: object) -> np.ndarray:
-    """Return (K, 3) numbers of a list of column, row, confidence.
-
-    Raises:
-        DyngsError: another number of points than a known format has.
-    """
+    """Return (K, 3) numbers of a list of column, row, confidence."""
     points = numbers_of(f"{file}: '{key}'", value, None).reshape(-1)
     if len(points) % 3 or len(points) // 3 not in _ORDERS:
         known = ", ".join(map(str, sorted(_ORDERS)))
@@ -141,6 +173,6 @@ def _placed(view: View, points: np.ndarray) -> Tensor:
     for row, name in enumerate(_ORDERS[len(points)]):
         if name in JOINTS and points[row, 2] > 0:
             joints[JOINTS[name]] = torch.from_numpy(points[row])
-    places = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
-    near = (places.abs() < _FARTHEST).all(1, keepdim=True)  # false for NaN
-    return torch.cat([torch.where(near, places, 0.0), joints[:, 2:].clamp(0, 1) * near], dim=1).float()
+    positions = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
+    near = (positions.abs() < _FARTHEST).all(1, keepdim=True)  # false for NaN
+    return torch.cat([torch.where(near, positions, 0.0), joints[:, 2:].clamp(0, 1) * near], dim=1).float()

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 
 import torch
+from torch import Tensor
 
+from dyngs.config import DataConfig
 from dyngs.config.io import load_config
 from dyngs.data.body_frames import read_body_file
-from dyngs.data.capture import BodyFrames
+from dyngs.data.capture import BodyFrames, View
+from dyngs.data.loader import ImageLoader
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading
+from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.fit.inputs import KnownAvatar
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import rest_shape
+from dyngs.human.template.body_reader import rest_shape
 
 _BODY, _CONFIG = "body_train.npz", "config.yaml"
 
@@ -20,11 +30,8 @@ _BODY, _CONFIG = "body_train.npz", "config.yaml"
 def known_shape(path: Path) -> BodyFrames:
     """Return the body parameters of a person, of whom only the shape counts.
 
-    Args:
-        path: a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one.
-
-    Raises:
-        DyngsError: none of these, or a shape that is not of the free template.
+    ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one. Raises
+    DyngsError: none of these, or a shape that is not of the free template.
     """
     with reading(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
         folder = path
@@ -51,3 +58,110 @@ def shape_of(body: BodyTemplate, known: BodyFrames) -> torch.Tensor:
     given = torch.from_numpy(known.betas[: len(betas)]).float()
     betas[: len(given)] = given
     return betas
+
+
+LONGEST_SIDE = 320
+"""Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
+size, since its edges are those of its images."""
+CHECKED = 3
+"""Moments, at most, at which a view is left out to see what the fit is worth."""
+_FEWEST_VIEWS = 3
+"""Of a moment, so that one of them can be left out."""
+
+
+@dataclass(frozen=True)
+class AvatarPoses:
+    """Poses that an avatar found."""
+
+    clip: CapturedMotion  # of all frames; as it was where ``taken`` is false
+    before: float  # overlap of silhouettes (IoU) at some time steps, of the avatar
+    after: float
+    left_out: int  # number of views, which were left out of the fit, that this was measured on; 0: on those fitted to
+
+    @property
+    def taken(self) -> bool:
+        """Whether these poses are better than those before."""
+        return self.after > self.before
+
+    def summary(self) -> str:
+        """Return a line for people."""
+        where = f"{self.left_out} views left out of the fit" if self.left_out else "the views fitted to"
+        what = "taken" if self.taken else "not taken"
+        return (
+            f"poses by the silhouette of the person's avatar: {what}; overlap on {where} {self.before:.3f} -> "
+            f"{self.after:.3f}"
+        )
+
+
+def posed_by_avatar(
+    avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: CapturedMotion
+) -> AvatarPoses:
+    """Return the poses of a clip in which the avatar has the silhouettes of its images, where that is better.
+
+    The size is that of ``start``, or that of the clip of training where the silhouettes show that the world has the
+    same unit. Frames of ``start`` without an image keep their poses.
+    """
+    times = start.clip.times.tolist()
+    shown = [replace(x, time=times[start.rows[-1 if x.frame is None else x.frame]]) for x in views]
+    side = min(LONGEST_SIDE, options.longest_side or LONGEST_SIDE, avatar.longest_side or LONGEST_SIDE)
+    small = options.model_copy(update={"longest_side": side, "downscale": 1})
+    left_out, others = _left_out(shown)
+    tested, images = ImageLoader(left_out or others, small), ImageLoader(others, small)
+    scene = avatar.scene
+    players = [scene.playing(start.clip), scene.playing(_in_size(scene, start.clip))]
+    tried = [(_overlap(_fitted(player, images), tested), player) for player in players]
+    before, (after, best) = _overlap(players[0], tested), max(tried, key=lambda x: x[0])
+    clip = start.clip
+    if after > before:
+        found = _fitted(best, ImageLoader(shown, small)).played
+        clip = clip if found is None else _with_rows(best.played or clip, found)
+    return AvatarPoses(replace(start, clip=clip), before, after, len(left_out))
+
+
+def _in_size(avatar: HumanScene, clip: MotionClip) -> MotionClip:
+    """Return the clip of a person as large as in the clip of training, with the pelvis where it was."""
+    scale = torch.full_like(clip.scale, float(avatar.clip.scale.mean()))
+    return replace(clip, scale=scale, trans=clip.trans + (clip.scale - scale)[:, None] * avatar.skeleton.joints[0])
+
+
+def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:
+    nothing = player.gaussians.means.new_zeros(3)
+    return fitted_to_images(player, images, nothing, player.options, SILHOUETTES).scene
+
+
+def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
+    """Return one view of each of some moments, and the others of these moments to fit to.
+
+    Moments with too few views lose none.
+    """
+    groups: dict[float | None, list[View]] = {}
+    for view in views:
+        groups.setdefault(view.time, []).append(view)
+    enough = [group for group in groups.values() if len(group) >= _FEWEST_VIEWS]
+    some = enough or list(groups.values())
+    chosen = [some[i] for i in evenly_spaced(len(some), CHECKED)]
+    apart = [group[-1] for group in chosen] if enough else []
+    return apart, [view for group in chosen for view in group if view not in apart]
+
+
+@torch.no_grad()
+def _overlap(scene: HumanScene, images: ImageLoader) -> float:
+    """Return the mean intersection over union of the silhouettes of the person and of images."""
+    found = []
+    for image in (images[i] for i in range(len(images))):
+        drawn = scene.render(image.cameras, image.time, options=scene.options).alpha[0] > 0.5
+        truth = drawn if image.alpha is None else image.alpha > 0.5
+        found.append(float((drawn & truth).sum() / (drawn | truth).sum().clamp_min(1)))
+    return fmean(found)
+
+
+def _with_rows(clip: MotionClip, found: MotionClip) -> MotionClip:
+    """Return the clip with the rows of ``found`` at the times that are in both."""
+    rows = torch.searchsorted(clip.times, found.times).clamp_max(len(clip) - 1)
+
+    def put(before: Tensor, after: Tensor) -> Tensor:
+        return before.index_copy(0, rows, after.to(before))
+
+    return MotionClip(
+        clip.times, put(clip.poses, found.poses), put(clip.trans, found.trans), put(clip.scale, found.scale)
+    )

@@ -8,11 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import PosePrior
-from dyngs.human.fit.solve import Observations, Stage, frame_error, run_stage, with_lens
-from dyngs.human.fit.surface import Surface
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.fit.solve import Fitting, Observations, frame_error, with_lens
 
 EVERY = 4
 """Each so many-th frame is left out: of those only poses are fitted."""
@@ -22,19 +18,12 @@ GAIN = 0.01
 
 @dataclass(frozen=True)
 class LensFit:
-    """A focal length that was tried.
+    """A focal length that was tried."""
 
-    Attributes:
-        factor: on the guessed focal length.
-        distance: from the camera at which the size in the images is kept, in units of the world.
-        error: on the frames left out, with the focal length as guessed and as refined.
-        taken: the refined one is better.
-    """
-
-    factor: float
-    distance: float
-    error: tuple[float, float]
-    taken: bool
+    factor: float  # on the guessed focal length
+    distance: float  # from the camera at which the size in the images is kept, in units of the world
+    error: tuple[float, float]  # on the frames left out, with the focal length as guessed and as refined
+    taken: bool  # the refined one is better
 
     def summary(self) -> str:
         """Return a line for people."""
@@ -45,75 +34,46 @@ class LensFit:
         )
 
 
-@dataclass(frozen=True)
-class _Task:
-    """The frames of one camera, and how they are fitted."""
-
-    clip: MotionClip
-    surface: Surface
-    observed: Observations
-    expected: PosePrior
-    steps: int
-    tick: Callable[[], None]
-
-    def run(self, start: Parameters, learned: Sequence[str], rows: Sequence[int]) -> Parameters:
-        """Return the fit after a stage in which only ``rows`` are seen."""
-
-        def some(row: int) -> ObservedFrame | None:
-            return self.observed(row) if row in rows else None
-
-        stage = Stage(self.steps, 3, tuple(learned))
-        return run_stage(start, stage, self.clip, self.surface, some, self.expected, self.tick)
-
-    @torch.no_grad()
-    def error(self, learned: Parameters, rows: Sequence[int]) -> float:
-        """Return the mean error of frames."""
-        shown = [(row, seen) for row in rows if (seen := self.observed(row)) is not None]
-        errors = [float(frame_error(learned, self.clip, self.surface, row, seen)) for row, seen in shown]
-        return sum(errors) / max(len(errors), 1)
-
-
 def num_ticks(steps: int) -> int:
     """Return how often ``fit_lens`` calls ``tick`` where a stage has so many steps."""
     return 5 * steps
 
 
 def fit_lens(
+    fitting: Fitting,
     start: Parameters,
     shape: Sequence[str],
-    clip: MotionClip,
-    surface: Surface,
     observed: Observations,
-    expected: PosePrior,
     steps: int,
     tick: Callable[[], None] = lambda: None,
 ) -> tuple[Parameters, LensFit]:
     """Return the fit of shape, poses and focal length to the frames of one camera at the origin; ``start`` if it stays.
 
     Both are fitted to three of four frames, with the focal length as guessed and refined. Then shape and focal length
-    are kept, and poses of the other frames are fitted: where these agree better, the refined one is taken.
-
-    Args:
-        start: shape and poses that were found with the guessed focal length.
-        shape: names of what is the same in all frames.
-        clip: the given poses, F frames.
-        surface: of the template.
-        observed: observations of a row of the clip.
-        expected: of the poses.
-        steps: of a stage.
-        tick: called after every step.
+    are kept, and poses of the other frames are fitted: where these agree better, the refined one is taken. ``start``
+    was found with the guessed focal length; ``shape`` names what is the same in all frames.
     """
-    task = _Task(clip, surface, observed, expected, steps, tick)
-    rows = list(range(len(clip)))
+    rows = list(range(len(fitting.clip)))
     apart = rows[EVERY // 2 :: EVERY] or rows
     rest = [row for row in rows if row not in apart] or rows
     own = ("poses", "trans")
-    distance = float(-clip.trans[:, 2].mean())
-    guessed = task.run(start, (*shape, *own), rest)
-    refined = task.run(with_lens(start, distance), (*shape, *own, "log_focal"), rest)
-    both = [task.run(found, own, apart) for found in (guessed, refined)]
-    errors = (task.error(both[0], apart), task.error(both[1], apart))
+
+    def run(start: Parameters, learned: Sequence[str], seen: Sequence[int]) -> Parameters:
+        return fitting.run(start, learned, steps, lambda row: observed(row) if row in seen else None, tick)
+
+    distance = float(-fitting.clip.trans[:, 2].mean())
+    guessed = run(start, (*shape, *own), rest)
+    refined = run(with_lens(start, distance), (*shape, *own, "log_focal"), rest)
+    both = [run(found, own, apart) for found in (guessed, refined)]
+    errors = (_mean_error(fitting, both[0], observed, apart), _mean_error(fitting, both[1], observed, apart))
     taken = errors[1] < (1 - GAIN) * errors[0]
-    found = task.run(both[1], (*shape, *own, "log_focal"), rows) if taken else start
+    found = run(both[1], (*shape, *own, "log_focal"), rows) if taken else start
     last = found if taken else refined
     return found, LensFit(float(last["log_focal"].detach().exp()), distance, errors, taken)
+
+
+@torch.no_grad()
+def _mean_error(fitting: Fitting, learned: Parameters, observed: Observations, rows: Sequence[int]) -> float:
+    shown = [(row, seen) for row in rows if (seen := observed(row)) is not None]
+    errors = [float(frame_error(learned, fitting.clip, fitting.surface, row, seen)) for row, seen in shown]
+    return sum(errors) / max(len(errors), 1)

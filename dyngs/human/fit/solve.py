@@ -1,4 +1,4 @@
-"""The fit of a body to silhouettes and key points: few numbers for the whole clip first, then every frame's pose.
+"""The fit of a body to silhouettes and key points: few numbers for the full clip first, then every frame's pose.
 
 Rasterized silhouettes are differentiable, so that everything is found by Adam. Local letters: F frames, J joints, B
 shape parameters, P discs, V views, K key points.
@@ -8,27 +8,93 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
+from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
-from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import NUM_TURNED, PosePrior
-from dyngs.human.fit.surface import Surface, drawn_silhouettes
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface, drawn_silhouettes
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
-from dyngs.human.template.bone_shapes import NUM_BONE_SHAPES
+from dyngs.human.template.body import NUM_BONE_SHAPES
+from dyngs.human.template.joints import JOINT_NAMES
+
+NUM_TURNED = 22
+"""Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
+_GIVEN = 0.05
+"""Expected error of given poses, rad."""
+_LIMIT = 3.0
+"""Standard deviations of usual poses beyond which joints would be dislocated."""
+_LEAST = 8.0
+"""Least spread, degrees: a few clips do not show how far a joint can go."""
+_DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "hip": ((-11, 1, -6), (23, 14, 7)),
+    "knee": ((26, 0, 1), (22, 1, 0)),
+    "ankle": ((-1, 27, -12), (13, 8, 6)),
+    "spine1": ((7, 0, 0), (7, 2, 3)),
+    "spine2": ((5, 0, 0), (7, 6, 10)),
+    "spine3": ((-2, 0, 0), (3, 1, 2)),
+    "neck": ((-12, 0, 0), (4, 17, 10)),
+    "head": ((-1, 0, 0), (11, 5, 4)),
+    "collar": ((0, 1, -16), (0, 7, 10)),
+    "shoulder": ((16, -13, -49), (37, 20, 28)),
+    "elbow": ((-7, -40, 16), (5, 29, 13)),
+    "wrist": ((-4, -2, 10), (3, 11, 6)),
+}
+"""Axis-angle vectors of the left side, and their standard deviations; the right side is the mirror image."""
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Expected corrections of the poses of F frames, axis-angle, rad."""
+
+    centre: Tensor  # (F, 22, 3) mean
+    spread: Tensor  # (22, 3) standard deviation
+    limit: float = math.inf  # of these from the centre, beyond which nobody is expected to turn a joint
+
+
+def near_given(clip: MotionClip) -> PosePrior:
+    """Return the prior that poses are about those given."""
+    return PosePrior(torch.zeros_like(clip.poses[:, :NUM_TURNED]), torch.full_like(clip.poses[0, :NUM_TURNED], _GIVEN))
+
+
+def usual(clip: MotionClip) -> PosePrior:
+    """Return the prior that corrected poses are usual ones; rotations add as vectors, which holds for small ones."""
+    spread = usual_spread(NUM_TURNED).to(clip.poses)
+    return PosePrior(usual_pose(NUM_TURNED).to(clip.poses) - clip.poses[:, :NUM_TURNED], spread, _LIMIT)
+
+
+def usual_pose(joints: int) -> Tensor:
+    """Return the mean pose (joints, 3), axis-angle, rad; zero for joints that are not known."""
+    return _table(0, joints)
+
+
+def usual_spread(joints: int) -> Tensor:
+    """Return the standard deviations (joints, 3) about it, rad, at least 8 degrees."""
+    return _table(1, joints).abs().clamp_min(torch.deg2rad(torch.tensor(_LEAST, device="cpu")))
+
+
+def _table(which: int, joints: int) -> Tensor:
+    found = torch.zeros(joints, 3, device="cpu")
+    for row, name in enumerate(JOINT_NAMES[:joints]):
+        side, _, rest = name.partition("_")
+        degrees = _DEGREES.get(rest if side in ("left", "right") else name)
+        if degrees is not None:
+            mirrored = (1.0, -1.0, -1.0) if side == "right" else (1.0, 1.0, 1.0)
+            found[row] = torch.tensor([x * m for x, m in zip(degrees[which], mirrored, strict=True)], device="cpu")
+    return torch.deg2rad(found)
+
 
 LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e-3, "padding": 1e-3} | {
     "offset": 3e-3,
     "shift": 3e-3,
     "log_focal": 3e-2,
 }
-"""Learning rates at the first step; those of places per metre of the person's unit."""
+"""Learning rates at the first step; those of positions per metre of the person's unit."""
 LR_DECAY = 0.1
 BETAS_WEIGHT = BONES_WEIGHT = 1e-3
 """Of the mean squared shape parameter, whose unit is the spread among adults."""
@@ -47,25 +113,10 @@ FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
 """Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
-
-
+FRAMES = 3
+"""Frames drawn in each step."""
 Observations = Callable[[int], ObservedFrame | None]
 """Returns what is seen in a row of the clip."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage of a fit.
-
-    Attributes:
-        steps: of Adam.
-        frames: drawn in each step.
-        learned: names of what is learned.
-    """
-
-    steps: int
-    frames: int
-    learned: tuple[str, ...]
 
 
 def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
@@ -149,14 +200,14 @@ def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
     count = min(len(joints), marked.shape[1])
     local = joints[:count] @ cameras.cam_from_world[:, :3, :3].mT + cameras.cam_from_world[:, None, :3, 3]
     pixels = local @ cameras.intrinsics.mT
-    places = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
-    away = (places - marked[:, :count, :2]).square().sum(-1) / KEYPOINT**2
+    positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
+    away = (positions - marked[:, :count, :2]).square().sum(-1) / KEYPOINT**2
     weights = marked[:, :count, 2]
     return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
 
 
 def place_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
-    """Return the mean robust distance of joints (J, 3) from places (55, 4), see ``ObservedFrame``, as for key points.
+    """Return the mean robust distance of joints (J, 3) from positions (55, 4), as for key points.
 
     ``unit`` is the length of a metre of the person in the world.
     """
@@ -182,53 +233,54 @@ def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     return total + PADDING_WEIGHT * (learned["padding"] / PADDING).square().mean()
 
 
-def run_stage(
-    start: Parameters,
-    stage: Stage,
-    clip: MotionClip,
-    surface: Surface,
-    observed: Observations,
-    expected: PosePrior,
-    tick: Callable[[], None] = lambda: None,
-) -> Parameters:
-    """Return the fit after ``stage``; frames are taken in a fixed order that covers the clip evenly.
+@dataclass(frozen=True)
+class Fitting:
+    """Given poses of F frames, the template's surface, and the poses that are expected."""
 
-    Args:
-        start: of ``new_fit`` or of the stage before.
-        stage: what to learn.
-        clip: the given poses, F frames.
-        surface: of the template.
-        observed: observations of a row of the clip.
-        expected: of the poses.
-        tick: called after every step.
-    """
-    # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
-    learned = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
-    order = spread_order(len(clip))
-    for step in range(1, stage.steps + 1):
-        first = (step - 1) * stage.frames
-        rows = {order[(first + i) % len(order)] for i in range(stage.frames)}
-        loss = prior(learned, expected)
-        for row in sorted(rows):
-            seen = observed(row)
-            if seen is not None:
-                loss = loss + frame_error(learned, clip, surface, row, seen) / len(rows)
-        loss.backward()
-        _forget_others(learned, stage.learned)
-        learned.step(step, step / stage.steps)
-        tick()
-    return learned
+    clip: MotionClip
+    surface: Surface
+    expected: PosePrior
+
+    def run(
+        self,
+        start: Parameters,
+        learned: Sequence[str],
+        steps: int,
+        observed: Observations,
+        tick: Callable[[], None] = lambda: None,
+    ) -> Parameters:
+        """Return the fit ``start`` after ``steps`` of Adam on what is named; ``tick`` is called after each.
+
+        Frames are taken in a fixed order that covers the clip evenly.
+        """
+        # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
+        found = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
+        order = spread_order(len(self.clip))
+        for step in range(1, steps + 1):
+            rows = {order[((step - 1) * FRAMES + i) % len(order)] for i in range(FRAMES)}
+            loss = prior(found, self.expected)
+            for row in sorted(rows):
+                seen = observed(row)
+                if seen is not None:
+                    loss = loss + frame_error(found, self.clip, self.surface, row, seen) / len(rows)
+            loss.backward()
+            for name in found.values():
+                if name not in learned:
+                    found[name].grad = None
+            found.step(step, step / steps)
+            tick()
+        return found
 
 
 def frame_error(learned: Parameters, clip: MotionClip, surface: Surface, row: int, seen: ObservedFrame) -> Tensor:
     """Return the error of frame ``row``: of its silhouettes, and of its joints where they are marked."""
     error = silhouette_error(drawn_frame(learned, clip, surface, row, seen.cameras), seen)
     if seen.joints is not None:
-        places, cameras = posed_joints(learned, clip, surface, row), refined(seen.cameras, learned)
-        error = error + KEYPOINT_WEIGHT * keypoint_error(places, seen.joints, cameras)
-    if seen.places is not None:
+        positions, cameras = posed_joints(learned, clip, surface, row), refined(seen.cameras, learned)
+        error = error + KEYPOINT_WEIGHT * keypoint_error(positions, seen.joints, cameras)
+    if seen.positions is not None:
         unit = clip.scale[row] * learned["log_scale"][0].detach().exp()
-        error = error + PLACE_WEIGHT * place_error(posed_joints(learned, clip, surface, row), seen.places, unit)
+        error = error + PLACE_WEIGHT * place_error(posed_joints(learned, clip, surface, row), seen.positions, unit)
     return error
 
 
@@ -239,15 +291,46 @@ def drawn_frame(learned: Parameters, clip: MotionClip, surface: Surface, row: in
 
 
 def spread_order(count: int) -> list[int]:
-    """Return 0 .. count - 1 in an order whose every stretch is spread over the whole range."""
+    """Return 0 .. count - 1 in an order whose every stretch is spread over the full range."""
     stride = max(1, round(count * 0.618))
     while count > 1 and math.gcd(stride, count) != 1:
         stride += 1
     return [(i * stride) % count for i in range(count)]
 
 
-def _forget_others(learned: Parameters, names: Sequence[str]) -> None:
-    """Drop the gradients of everything but ``names``."""
-    for name in learned.values():
-        if name not in names:
-            learned[name].grad = None
+@dataclass(frozen=True)
+class BodyFit:
+    """A body fitted to a clip of F frames, as a correction of the poses that were given."""
+
+    betas: Tensor  # (B,) shape parameters of the template
+    shared: SharedCorrection  # turns of the joints and factor on the size, the same in all frames
+    offset: Tensor  # (3,) m, correction of the translation in the frame of the pelvis, the same in all frames
+    shift: Tensor  # (3,) the same in the frame of the world, in its unit
+    poses: Tensor  # (F, J, 3) axis-angle, rad, added to the turns per frame
+    trans: Tensor  # (F, 3) added to the given translations
+
+    def fitted(self, clip: MotionClip) -> MotionClip:
+        """Return the clip that was fitted, with its corrections."""
+        return self._moved(corrected_clip(self.shared, clip, self.poses, self.trans))
+
+    def applied(self, clip: MotionClip) -> MotionClip:
+        """Return another clip whose poses were given by the same means, with what holds for all frames."""
+        return self._moved(corrected_clip(self.shared, clip))
+
+    def _moved(self, turned: MotionClip) -> MotionClip:
+        roots = axis_angle_to_matrix(turned.poses[:, 0])
+        away = self.shift + turned.scale[:, None] * (roots @ self.offset[:, None])[..., 0]
+        return replace(turned, trans=turned.trans + away)
+
+
+def body_fit(learned: Parameters, joints: int) -> BodyFit:
+    """Return what was learned (``new_fit``) as a fit of a body of so many joints."""
+    values = learned.values()
+
+    def padded(turns: Tensor) -> Tensor:
+        blank = turns.new_zeros(*turns.shape[:-2], joints - turns.shape[-2], 3)
+        return torch.cat([turns, blank], dim=-2)
+
+    shared = SharedCorrection(padded(values["turns"]), float(values["log_scale"][0]))
+    positions = (values["offset"], values["shift"])
+    return BodyFit(values["betas"], shared, *positions, padded(values["poses"]), values["trans"])

@@ -1,36 +1,83 @@
-"""First poses of a person of whom only silhouettes are known: where they stand, how they face, frame after frame.
-
-Local letters: F frames, V views, J joints.
-"""
+"""First poses of a person of whom only silhouettes are known: where they stand, how they face, frame after frame."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.times import evenly_spaced
-from dyngs.human.fit.headings import (
-    MOST_ANCHORS,
-    NUM_HEADINGS,
-    angle_between,
-    heading,
-    likely_path,
-    roots_between,
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface
+from dyngs.human.fit.solve import (
+    NUM_TURNED,
+    Fitting,
+    Observations,
+    frame_error,
+    new_fit,
+    prior,
+    usual,
+    usual_pose,
 )
-from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import NUM_TURNED, usual, usual_pose
-from dyngs.human.fit.solve import Observations, Stage, frame_error, new_fit, prior, run_stage
-from dyngs.human.fit.surface import Surface
+from dyngs.human.fit.start import MOST_ANCHORS, NUM_HEADINGS, angle_between, heading, likely_path, roots_between
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
+
+NUM_HEADINGS = 8
+"""Directions that a person may face, all of which are tried in every anchor."""
+MOST_ANCHORS = 20
+"""Frames in which headings are tried."""
+CHANGE_WEIGHT = 0.01
+"""Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the square."""
+
+
+def likely_path(errors: Sequence[Sequence[float]], weight: float = CHANGE_WEIGHT) -> list[int]:
+    """Return the heading (A,) of each anchor for which errors (A, H) and changes of heading cost least in all.
+
+    Source: the algorithm of Viterbi, 1967.
+    """
+    costs = np.asarray(errors, dtype=np.float64)
+    count = costs.shape[1]
+    apart = np.abs(np.arange(count)[:, None] - np.arange(count))
+    change = weight * (np.minimum(apart, count - apart) * (8 / count)) ** 2
+    total, came_from = costs[0], []
+    for own in costs[1:]:
+        ways = total[:, None] + change
+        came_from.append(ways.argmin(0))
+        total = ways.min(0) + own
+    path = [int(total.argmin())]
+    for back in reversed(came_from):
+        path.append(int(back[path[-1]]))
+    return path[::-1]
+
+
+def roots_between(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
+    """Return rotations (count, 3) of the root, axis-angle, rad: those (A, 3) of the anchors, turned on between them.
+
+    Before the first anchor and after the last one they stay.
+    """
+    if len(anchors) == 1:
+        return roots.expand(count, 3).clone()
+    between = Slerp(np.asarray(anchors, dtype=np.float64), Rotation.from_rotvec(roots.numpy()))
+    rows = np.clip(np.arange(count, dtype=np.float64), anchors[0], anchors[-1])
+    return torch.from_numpy(between(rows).as_rotvec()).to(roots)
+
+
+def angle_between(a: Tensor, b: Tensor) -> float:
+    """Return the angle, rad, of the rotation from ``a`` (3,) to ``b`` (3,), both axis-angle."""
+    return float((Rotation.from_rotvec(a.numpy()).inv() * Rotation.from_rotvec(b.numpy())).magnitude())
+
+
+def heading(index: int) -> float:
+    """Return the angle about the vertical, rad, of the heading ``index``."""
+    return 2 * math.pi * index / NUM_HEADINGS
+
 
 STEPS = 40
 """Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of the one before."""
@@ -54,19 +101,16 @@ def first_poses(
     """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row) alone.
 
     In some frames, the anchors, every heading is tried; the likely path through them says which way the person faces
-    (``dyngs.human.fit.headings``). Each frame starts from the pose of the one before, and where that has left the path
-    from the heading of the path: single frames would rather be explained by a twisted body. Without key points the
-    path may be that of somebody who faces the other way: clips that start with the best headings of the first frame
-    and never look at the path are compared with it.
-
-    Raises:
-        ValueError: nobody is seen in the first frame.
+    (``dyngs.human.fit.start``). Each frame starts from the pose of the one before, and where that has left the path
+    from the heading of the path: single frames would rather be explained by a twisted body. Without key points the path
+    may be that of somebody who faces the other way: clips that start with the best headings of the first frame and
+    never look at the path are compared with it. Raises ValueError: nobody is seen in the first frame.
     """
     seen = observed(0)
     if seen is None:
         raise ValueError("nobody is seen in the first frame")
     standing, up = standing_clip(times, surface, observed), up_of(seen)
-    anchors = [row for row in anchors_of(len(times)) if observed(row) is not None]
+    anchors = [row for row in evenly_spaced(len(times), MOST_ANCHORS) if observed(row) is not None]
     tried = [_all_headings(standing, row, up, surface, observed, tick) for row in anchors]
     path = likely_path([[error for _, _, error in own] for own in tried])
     roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
@@ -82,14 +126,9 @@ def first_poses(
     return min(followed, key=lambda found: found[1])[0]
 
 
-def anchors_of(frames: int) -> list[int]:
-    """Return the frames of a clip of so many in which all headings are tried."""
-    return evenly_spaced(frames, MOST_ANCHORS)
-
-
 def num_ticks(frames: int, *, marked: bool) -> int:
     """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without key points."""
-    return NUM_HEADINGS * len(anchors_of(frames)) + (frames - 1) * (1 if marked else 1 + _WITHOUT_PATH)
+    return NUM_HEADINGS * len(evenly_spaced(frames, MOST_ANCHORS)) + (frames - 1) * (1 if marked else 1 + _WITHOUT_PATH)
 
 
 def _all_headings(
@@ -108,9 +147,9 @@ def _all_headings(
 
 def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
     """Return the clip with another pose (J, 3) and translation (3,) in a frame."""
-    poses, places = clip.poses.clone(), clip.trans.clone()
-    poses[row], places[row] = pose, trans
-    return replace(clip, poses=poses, trans=places)
+    poses, positions = clip.poses.clone(), clip.trans.clone()
+    poses[row], positions[row] = pose, trans
+    return replace(clip, poses=poses, trans=positions)
 
 
 def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> MotionClip:
@@ -118,21 +157,21 @@ def standing_clip(times: Tensor, surface: Surface, observed: Observations) -> Mo
 
     Where nobody is seen, the place is that of the frame before.
     """
-    joints, up, places, heights = surface.body.joints, torch.zeros(3, device="cpu"), [], []
+    joints, up, positions, heights = surface.body.joints, torch.zeros(3, device="cpu"), [], []
     for row in range(len(times)):
         seen = observed(row)
         if seen is None:
-            places.append(places[-1] if places else torch.zeros(3, device="cpu"))
+            positions.append(positions[-1] if positions else torch.zeros(3, device="cpu"))
             continue
         up = up if up.any() else up_of(seen)
         place, height = place_and_height(seen, up)
-        places.append(place)
+        positions.append(place)
         heights += [] if height is None else [height]
     upright = Rotation.align_vectors(up[None].numpy(), np.array([[0.0, 1.0, 0.0]]))[0]
     poses = usual_pose(len(joints)).to(joints).repeat(len(times), 1, 1)
     poses[:, 0] = torch.from_numpy(upright.as_rotvec()).to(poses)
     scale = float(np.median(heights)) / STATURE if heights else 1.0
-    trans = torch.stack(places) - scale * joints[0]  # the root turns about the pelvis
+    trans = torch.stack(positions) - scale * joints[0]  # the root turns about the pelvis
     return MotionClip(times, poses, trans, torch.full((len(times),), scale, device="cpu"))
 
 
@@ -237,13 +276,12 @@ def _found_from(
     ``levels`` are the factors by which what is seen is made smaller, one after the other.
     """
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
-    learned = new_fit(one, surface)
+    learned, fitting = new_fit(one, surface), Fitting(one, surface, usual(one))
     for level in levels:
         shown = seen.shrunk(level)
-        stage = Stage(STEPS, 1, ("poses", "trans"))
-        learned = run_stage(learned, stage, one, surface, lambda _, at=shown: at, usual(one))
+        learned = fitting.run(learned, ("poses", "trans"), STEPS, lambda _, at=shown: at)
     with torch.no_grad():
-        error = float(frame_error(learned, one, surface, 0, seen) + prior(learned, usual(one)))
+        error = float(frame_error(learned, one, surface, 0, seen) + prior(learned, fitting.expected))
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
     given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
     found = pose.clone()

@@ -1,6 +1,6 @@
 """Reader and writer of AMASS motion files, and of other ``.npz`` with the parameters of SMPL, SMPL-H and SMPL-X.
 
-Local letters: J joints, F frames, B shape parameters.
+Local letter: B shape parameters.
 """
 
 from __future__ import annotations
@@ -15,13 +15,8 @@ from dyngs.data.capture import ShapeSpace
 from dyngs.errors import DyngsError, reading
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.write import atomic_file
-from dyngs.human.motion.floor import place_on_floor
-from dyngs.human.motion.motion import (
-    Motion,
-    UpAxis,
-    require_frame_count,
-    require_frame_rate,
-)
+from dyngs.human.motion.motion import Motion, UpAxis, require_frame_count, require_frame_rate
+from dyngs.human.motion.placement import place_on_floor
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import SMPLX_ROWS
 
@@ -53,10 +48,8 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
 
     A file without ``scale`` and ``up_axis`` was made for SMPL, SMPL-H or SMPL-X (told by its width). Shape parameters
     that ``body`` lacks are left out. If ``body`` is of another family, all are set to zero and the lowest vertex of the
-    motion to y = 0, as the pelvis of the file's body is not known.
-
-    Raises:
-        DyngsError: names the file and what is missing or wrong.
+    motion to y = 0, as the pelvis of the file's body is not known. Raises DyngsError: names the file and what is
+    missing or wrong.
     """
     with reading(path):
         return _motion(path, _arrays(path), body, up)
@@ -65,10 +58,8 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
 def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") -> None:
     """Write the motion of 55 joints as an AMASS file of SMPL-X with ``up_axis`` y; reading it gives the same motion.
 
-    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as its model.
-
-    Raises:
-        DyngsError: the suffix is not ``.npz``, or the file cannot be written.
+    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as its model. Raises
+    DyngsError: the suffix is not ``.npz``, or the file cannot be written.
     """
     if path.suffix.lower() != ".npz":
         raise DyngsError(f"cannot write {path}: a motion is written as .npz")
@@ -89,7 +80,6 @@ def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") ->
 
 
 def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: UpAxis) -> Motion:
-    """Return the motion of the arrays, y up, fitted to ``body``."""
     poses, width = _poses(path, arrays)
     frames = len(poses)
     trans = _numbers(path, arrays, "trans")
@@ -165,7 +155,6 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
 
 
 def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Return poses (F, 165) joined from the parts of the body."""
     missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
     if missing:
         raise DyngsError(
@@ -196,7 +185,6 @@ def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _fps(path: Path, arrays: dict[str, np.ndarray]) -> float:
-    """Return the frames per second."""
     key = next((key for key in _RATES if key in arrays), "fps" if _ANY_AXES in arrays else _RATES[1])
     rate = _numbers(path, arrays, key)
     if rate.size != 1 or not rate.item() > 0:
@@ -255,5 +243,4 @@ def _pelvis(body: BodyTemplate, betas: np.ndarray) -> np.ndarray:
 
 
 def _got(value: np.ndarray) -> str:
-    """Return the shape in words."""
     return f"has {' x '.join(map(str, value.shape)) or 'one number'}"

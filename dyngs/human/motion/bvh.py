@@ -1,6 +1,6 @@
 """Reader of Biovision Hierarchy files (``.bvh``).
 
-Local letters: S joints of the file, F frames, C channels of all joints together.
+Local letters: S joints of the file, C channels of all joints together.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.errors import DyngsError, reading
 from dyngs.files.limits import require_at_most
-from dyngs.human.motion.motion import frame_chunks, require_frame_count, require_frame_rate
-from dyngs.human.motion.skeleton_motion import SkeletonMotion
+from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, require_frame_rate
 
 _END_SITE = -1
 _MOST_JOINTS = 4096
@@ -41,9 +40,7 @@ def read_bvh(path: Path) -> SkeletonMotion:
 
     The transform of a joint relative to its parent is T R: T from its position channels, or from OFFSET along axes
     without one, and R = R_1 R_2 R_3 from its rotations about single axes, in degrees, in the order of its channels.
-
-    Raises:
-        DyngsError: names the file and what is wrong with it.
+    Raises DyngsError: names the file and what is wrong with it.
     """
     with reading(path):
         hierarchy, rows = _halves(path)
@@ -137,7 +134,6 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
 
 
 def _offset(path: Path, name: str, words: list[str]) -> np.ndarray:
-    """Return the offset (3,) of a joint."""
     offset = _numbers(path, words)
     if len(offset) != 3:
         raise DyngsError(f"{path}: the OFFSET of '{name}' must be three numbers; export it again")

@@ -1,6 +1,6 @@
 """Reader of skeletal animations in glTF 2.0 files (``.glb``, ``.gltf``), and of VRM animations (``.vrma``).
 
-Local letters: S joints, F frames, K keys of a channel.
+Local letters: S joints, K keys of a channel.
 """
 
 from __future__ import annotations
@@ -12,14 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.errors import reading
+from dyngs.files.gltf import MOST_JOINTS, Animation, GltfFile
 from dyngs.files.limits import require_at_most
-from dyngs.human.motion.gltf_file import MOST_JOINTS, Animation, GltfFile
-from dyngs.human.motion.motion import frame_chunks, require_frame_count, sample_times
-from dyngs.human.motion.skeleton_motion import SkeletonMotion
+from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_frame_count, sample_times
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
-
-
 _VRM_THUMBS = {
     f"{side}Thumb{new}": f"{side}Thumb{old}"
     for side in ("left", "right")
@@ -61,16 +58,9 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
     The joints are those of the largest skin, and the rest pose is the bind pose, inverse(inverseBindMatrices), or
     without these the nodes without animation. A file without a skin, as Mixamo exports "without skin", has the nodes
     that are animated for joints, and must show a T-pose or an A-pose without animation. The world is that of the scene,
-    y up. The rotation of a joint is the product of those of its nodes: scale is left out.
-
-    Args:
-        path: of the file.
-        fps: frames per second.
-        clip: name of the animation; needed if several move the joints.
-
-    Raises:
-        DyngsError: no such animation, anything broken or not supported (sparse accessors, meshopt compression, mirrored
-            nodes); names the file.
+    y up. The rotation of a joint is the product of those of its nodes: scale is left out. ``clip`` names the animation,
+    where several move the joints. Raises DyngsError: no such animation, anything broken or not supported (sparse
+    accessors, meshopt compression, mirrored nodes); names the file.
     """
     with reading(path):
         file = GltfFile(path)
@@ -82,10 +72,7 @@ def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -
     """Read a VRM animation (``.vrma``, extension VRMC_vrm_animation 1.0): the bones have the names of VRM's humanoid.
 
     Without animation the nodes stand in a T-pose. The first animation counts unless ``clip`` names another. Expressions
-    and the gaze are left out.
-
-    Raises:
-        DyngsError: as ``read_gltf``, or the extension is missing.
+    and the gaze are left out. Raises DyngsError: as ``read_gltf``, or the extension is missing.
     """
     with reading(path):
         file = GltfFile(path)
@@ -113,7 +100,6 @@ def _skin(file: GltfFile) -> _Rig | None:
 
 
 def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
-    """Return the nodes that an animation turns or moves, and all below them."""
     nodes = file.document.nodes
     channels = _chosen(file, dict.fromkeys(range(len(nodes))), clip).channels
     moved = {c.target.node for c in channels if c.target.path in _KINDS and c.target.node is not None}
@@ -197,12 +183,10 @@ def _chosen(file: GltfFile, chain: dict[int, int | None], clip: str | None) -> A
 
 
 def _moving(file: GltfFile, chain: dict[int, int | None]) -> list[Animation]:
-    """Return the animations that move a node of the chain."""
     return [a for a in file.document.animations if any(c.target.node in chain for c in a.channels)]
 
 
 def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) -> dict[tuple[int, str], _Curve]:
-    """Return the animation curves of the nodes of the chain, by node and property."""
     curves: dict[tuple[int, str], _Curve] = {}
     for channel in animation.channels:
         node, kind = channel.target.node, channel.target.path
@@ -213,7 +197,7 @@ def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) 
         if file.document.nodes[node].matrix is not None:
             raise file.error(f"node {node} is animated but has a matrix; export it again")
         sampler = animation.samplers[channel.sampler]
-        times, values = file.numbers(sampler.input, "SCALAR")[:, 0], file.numbers(sampler.output, _KINDS[kind])
+        times, values = _finite(file, sampler.input, "SCALAR")[:, 0], _finite(file, sampler.output, _KINDS[kind])
         if len(values) != len(times) * (3 if sampler.interpolation == "CUBICSPLINE" else 1):
             raise file.error(f"a {kind} of node {node} has {len(times)} times but {len(values)} values")
         if (np.diff(times) < 0).any():
@@ -222,6 +206,13 @@ def _curves(file: GltfFile, animation: Animation, chain: dict[int, int | None]) 
     if not curves:
         raise file.error(f"the animation {animation.name[:30]!r} moves no joint; choose another")
     return curves
+
+
+def _finite(file: GltfFile, index: int, kind: str) -> np.ndarray:
+    values = file.numbers(index, kind)
+    if not (np.abs(values) < 1e9).all():
+        raise file.error(f"accessor {index} holds NaN or huge numbers; export it again")
+    return values
 
 
 def _world_transforms(
@@ -283,11 +274,7 @@ def _sampled(file: GltfFile, curve: _Curve, times: np.ndarray) -> np.ndarray:
 
 
 def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
-    """Return the rotations of quaternions (F, 4) xyzw of any length.
-
-    Raises:
-        DyngsError: one of them is zero.
-    """
+    """Return the rotations of quaternions (F, 4) xyzw of any length."""
     largest = np.abs(quats).max(axis=1, keepdims=True)
     if (largest == 0).any():
         raise file.error("a rotation is a quaternion of zeros; export it again")
@@ -296,7 +283,7 @@ def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
 
 def _bind_pose(file: GltfFile, index: int, joints: int) -> tuple[np.ndarray, np.ndarray]:
     """Return joints (S, 3) and rotations rest_from_joint (S, 3, 3) of the bind pose."""
-    matrices = file.numbers(index, "MAT4").reshape(-1, 4, 4).swapaxes(1, 2)[:joints]
+    matrices = _finite(file, index, "MAT4").reshape(-1, 4, 4).swapaxes(1, 2)[:joints]
     if len(matrices) < joints:
         raise file.error(f"has {len(matrices)} inverse bind matrices for {joints} joints; export it again")
     joint_from_rest = _rotation_of(file, matrices[:, :3, :3])

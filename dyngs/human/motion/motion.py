@@ -1,12 +1,11 @@
 """The motion of a body: pose parameters per frame, resampling, limits of its length.
 
-Local letters: J joints, F frames, B shape parameters.
+Local letter: B shape parameters.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -21,7 +20,6 @@ from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.state import fields_moved_to
 
 UpAxis = Literal["auto", "y", "z"]
-
 MAX_JOINT_POSES = 5_000_000
 """Limit on joints (at least 55) times frames of a motion: 90,909 frames, or 50 minutes at 30 frames per second."""
 _RATES = (1e-3, 1e5)
@@ -32,21 +30,13 @@ _CHUNK = 1024
 
 @dataclass(frozen=True)
 class Motion:
-    """Body parameters per frame; y up.
+    """Body parameters per frame; y up."""
 
-    Attributes:
-        poses: (F, J, 3) axis-angle relative to the parent joint, rad.
-        trans: (F, 3) m, added after skinning.
-        betas: (B,) shape parameters.
-        fps: frames per second.
-        scale: (F,) uniform scale of the template.
-    """
-
-    poses: Tensor
-    trans: Tensor
-    betas: Tensor
-    fps: float
-    scale: Tensor
+    poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
+    trans: Tensor  # (F, 3) m, added after skinning
+    betas: Tensor  # (B,) shape parameters
+    fps: float  # frames per second
+    scale: Tensor  # (F,) uniform scale of the template
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -62,10 +52,8 @@ class Motion:
     def resampled(self, fps: float) -> Motion:
         """Return the motion at ``fps`` frames per second, from the first frame to at most the last one.
 
-        Rotations are interpolated spherically the shorter way, all else linearly. Nothing is smoothed.
-
-        Raises:
-            DyngsError: ``fps`` is not a positive number, or gives more frames than ``MAX_JOINT_POSES`` allows.
+        Rotations are interpolated spherically the shorter way, all else linearly. Nothing is smoothed. Raises
+        DyngsError: ``fps`` is not a positive number, or gives more frames than ``MAX_JOINT_POSES`` allows.
         """
         most = allowed(MAX_JOINT_POSES) / len(JOINT_NAMES)
         if not len(self) * fps <= most * self.fps:
@@ -76,10 +64,11 @@ class Motion:
         times = sample_times(len(self) - 1, self.fps, fps)
         if fps == self.fps:
             return self
-        return concatenated([self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))])
+        parts = [self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))]
+        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
+        return replace(parts[0], **tensors)
 
     def _interpolated(self, times: np.ndarray, fps: float) -> Motion:
-        """Return the motion at ``times`` (F,), in units of its frames."""
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
         after = np.minimum(before + 1, len(self) - 1)
         fraction = torch.from_numpy(times - before).to(self.trans)
@@ -92,12 +81,6 @@ class Motion:
         return Motion(poses, linear(self.trans), self.betas, fps, linear(self.scale))
 
 
-def concatenated(parts: Sequence[Motion]) -> Motion:
-    """Return the motions one after the other: at least one, all of the same person and frame rate."""
-    whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in ("poses", "trans", "scale")}
-    return replace(parts[0], **whole)
-
-
 def frame_chunks(count: int) -> list[slice]:
     """Return slices of at most 1024 frames that cover ``count`` frames."""
     return [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
@@ -106,8 +89,7 @@ def frame_chunks(count: int) -> list[slice]:
 def require_frame_count(path: Path, frames: float, joints: int) -> None:
     """Check that the motion of a file fits into memory before it is allocated.
 
-    Raises:
-        DyngsError: it exceeds ``MAX_JOINT_POSES``.
+    Raises DyngsError: it exceeds ``MAX_JOINT_POSES``.
     """
     amount, most = frames * max(joints, len(JOINT_NAMES)), allowed(MAX_JOINT_POSES)
     if not amount <= most:
@@ -119,11 +101,7 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
 
 
 def require_frame_rate(path: Path, fps: float) -> float:
-    """Return ``fps`` if it is a plausible frame rate of a motion.
-
-    Raises:
-        DyngsError: it is not.
-    """
+    """Return ``fps`` if it is a plausible frame rate of a motion. Raises DyngsError: it is not."""
     if not _RATES[0] <= fps <= _RATES[1]:
         raise DyngsError(
             f"{path}: {fps:g} frames per second is not the rate of a motion ({_RATES[0]:g} to {_RATES[1]:g}); correct "
@@ -135,10 +113,8 @@ def require_frame_rate(path: Path, fps: float) -> float:
 def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
     """Return times (F,) in [0, last], in frames of ``from_fps``, that are 1 / ``fps`` seconds apart.
 
-    The last frame is included if it is missed by at most a thousandth of a frame.
-
-    Raises:
-        DyngsError: ``fps`` is not a positive number.
+    The last frame is included if it is missed by at most a thousandth of a frame. Raises DyngsError: ``fps`` is not a
+    positive number.
     """
     if not 0 < fps < math.inf:
         raise DyngsError(f"{fps:g} frames per second is not a frame rate; ask for 30 or the like")
@@ -162,10 +138,23 @@ def poses_for_joints(poses: Tensor, count: int) -> Tensor:
 
 
 def interpolate_rotations(before: Tensor, after: Tensor, fraction: np.ndarray) -> Tensor:
-    """Return axis-angle vectors (F, J, 3) at ``share`` (F,) of the way between two: R_a exp(s log(R_a^T R_b))."""
+    """Return axis-angle vectors (F, J, 3) at ``fraction`` (F,) of the way between two: R_a exp(s log(R_a^T R_b))."""
     from scipy.spatial.transform import Rotation
 
     start = Rotation.from_rotvec(before.reshape(-1, 3).double().cpu().numpy())
     turn = start.inv() * Rotation.from_rotvec(after.reshape(-1, 3).double().cpu().numpy())
     part = Rotation.from_rotvec(turn.as_rotvec() * np.repeat(fraction, before.shape[1])[:, None])
     return torch.from_numpy((start * part).as_rotvec()).to(before).reshape(before.shape)
+
+
+@dataclass(frozen=True)
+class SkeletonMotion:
+    """The motion of S joints of another skeleton than ours; float64, in any unit of length."""
+
+    path: Path  # of the file, for messages
+    names: tuple[str, ...]  # (S,) of the joints
+    rest: np.ndarray  # (S, 3) joints in the rest pose, in its own axes
+    rotations: np.ndarray  # (F, S, 3, 3) world_from_rest of each joint
+    positions: np.ndarray  # (F, S, 3) of the joints in the world
+    fps: float  # frames per second
+    world_is_y_up: bool  # whether the world is known to be y up; otherwise it has the axes of the rest pose

@@ -1,17 +1,18 @@
-"""Motion clips moved to the size, place, floor and up direction of a captured person.
-
-Local letters: F frames, J joints.
-"""
+"""Motion clips moved to the size, place, floor and up direction of a captured person."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import Motion, frame_chunks
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
+from dyngs.human.template.body import BodyTemplate
 
 _ALONG_AXIS = 0.87
 """Cosine of 30 degrees: how near to the up direction a world axis must be to replace it."""
@@ -21,13 +22,7 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
     """Return a clip of any person, y up and in metres, at the size and place of the person of ``like``.
 
     Its up axis becomes ``up_direction(like)``; the lowest joints of both clips are equally high, and their mean pelvis
-    positions lie on one vertical line.
-
-    Args:
-        clip: the clip to move.
-        like: the clip of training.
-        joints: (J, 3) at rest, m, to which both clips apply.
-        parents: (J,) of the joints.
+    positions lie on one vertical line. ``like`` is the clip of training; both apply to ``joints`` (J, 3) at rest, m.
     """
     up = up_direction(like)
     unit = like.scale.mean()
@@ -45,10 +40,7 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
 def upright(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
     """Return a clip in the world of the person of ``like`` turned about the origin so that y is up there.
 
-    Args:
-        clip: the clip to turn.
-        like: the clip of training, whose ``up_direction`` becomes y.
-        joints: (J, 3) at rest, m, to which the clip applies.
+    ``like`` is the clip of training, whose ``up_direction`` becomes y; ``joints`` (J, 3) are at rest, m.
     """
     rotation = _least_rotation(up_direction(like), joints.new_tensor([0.0, 1.0, 0.0]))
     roots = rotation @ axis_angle_to_matrix(clip.poses[:, 0])
@@ -91,7 +83,6 @@ def _least_rotation(start: Tensor, end: Tensor) -> Tensor:
 
 
 def _axis_angle(rotations: Tensor) -> Tensor:
-    """Return the axis-angle vectors (F, 3) of rotations (F, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     return torch.from_numpy(Rotation.from_matrix(rotations.double().cpu().numpy()).as_rotvec()).to(rotations)
@@ -101,3 +92,30 @@ def _joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) ->
     """Return the joints (F, J, 3) in the world."""
     moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints)
     return clip.scale[:, None, None] * moved + clip.trans[:, None]
+
+
+def place_on_floor(motion: Motion, body: BodyTemplate) -> Motion:
+    """Return the motion of 55 joints moved up or down as a whole, with its lowest vertex (mean shape) at y = 0.
+
+    Pose blend shapes, which are millimetres, are ignored.
+    """
+    lowest = _lowest_heights(motion.for_joints(len(body.joints)).poses, body) * motion.scale + motion.trans[:, 1]
+    trans = motion.trans.clone()
+    trans[:, 1] -= lowest.min()
+    return replace(motion, trans=trans)
+
+
+def _lowest_heights(poses: Tensor, body: BodyTemplate) -> Tensor:
+    """Return the smallest y (F,) of the vertices in poses (F, J, 3); only row y of the transforms is blended."""
+    vertex, joint = body.weights.nonzero(as_tuple=True)
+    points = torch.cat([body.vertices, torch.ones_like(body.vertices[:, :1])], dim=1)
+    values = (body.weights[vertex, joint][:, None] * points[vertex]).double().cpu().numpy()
+    columns = (4 * joint[:, None] + torch.arange(4, device=joint.device)).cpu().numpy()
+    rows = vertex.repeat_interleave(4).cpu().numpy()
+    height = csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(points), 4 * len(body.joints)))
+    lowest = []
+    for part in frame_chunks(len(poses)):
+        transforms = joint_transforms(body.joints, body.parents, axis_angle_to_matrix(poses[part]))
+        y_rows = transforms[:, :, 1].flatten(1).double().cpu().numpy()
+        lowest += [(height @ few.T).min(axis=0) for few in np.array_split(y_rows, range(64, len(y_rows), 64))]
+    return torch.from_numpy(np.concatenate(lowest)).to(poses)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from dyngs.errors import DyngsError, reading
@@ -13,56 +11,12 @@ from dyngs.human.motion.gltf import read_gltf, read_vrm_animation
 from dyngs.human.motion.motion import Motion, UpAxis
 from dyngs.human.motion.retarget import retarget
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 
-
-@dataclass(frozen=True)
-class _Request:
-    """A file to read, and the options of ``read_motion``."""
-
-    path: Path
-    body: BodyTemplate
-    fps: float | None
-    up: UpAxis
-    clip: str | None
-
-
-@dataclass(frozen=True)
-class _Format:
-    """A format of motion files, by suffix.
-
-    Attributes:
-        name: in messages.
-        read: returns the motion on the body of a request.
-        has_up_axis: whether ``up`` may be chosen.
-        has_clips: whether a file may hold several named motions.
-    """
-
-    name: str
-    read: Callable[[_Request], Motion]
-    has_up_axis: bool = False
-    has_clips: bool = False
-
-
-def _read_gltf(request: _Request) -> Motion:
-    """Return the motion of a glTF file, sampled at 30 frames per second unless asked otherwise."""
-    fps = 30.0 if request.fps is None else request.fps
-    return retarget(read_gltf(request.path, fps, request.clip), request.body)
-
-
-def _read_vrma(request: _Request) -> Motion:
-    """Return a VRM animation, sampled likewise."""
-    fps = 30.0 if request.fps is None else request.fps
-    return retarget(read_vrm_animation(request.path, fps, request.clip), request.body)
-
-
-_FORMATS = {
-    ".npz": _Format("an AMASS or SMPL-X .npz", lambda x: read_amass(x.path, x.body, x.up), has_up_axis=True),
-    ".bvh": _Format("a .bvh", lambda x: retarget(read_bvh(x.path), x.body)),
-    ".glb": _Format("a .glb", _read_gltf, has_clips=True),
-    ".gltf": _Format("a .gltf", _read_gltf, has_clips=True),
-    ".vrma": _Format("a .vrma", _read_vrma, has_clips=True),
-}
+_KINDS = {".npz": "an AMASS or SMPL-X .npz", ".bvh": "a .bvh", ".glb": "a .glb", ".gltf": "a .gltf", ".vrma": "a .vrma"}
+"""Names of the formats by suffix."""
+_GLTF_FPS = 30.0
+"""Frames per second at which glTF's curves are sampled unless another rate is requested."""
 
 
 def read_motion(
@@ -70,26 +24,26 @@ def read_motion(
 ) -> Motion:
     """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``, ``.gltf`` or ``.vrma``.
 
-    Args:
-        path: of the file.
-        body: the template to move; None: the default one. The motion of another skeleton is retargeted to it, with the
-            lowest vertex at y = 0.
-        fps: frames per second to resample to; None: those of the file, 30 for glTF.
-        up: the up axis of an ``.npz``; "auto": see ``dyngs.human.motion.amass.read_amass``.
-        clip: name of the animation of a glTF file; needed where there are several.
-
-    Raises:
-        DyngsError: names the file and what is wrong with it.
+    The motion of another skeleton is retargeted to ``body`` (None: the default template), with the lowest vertex at
+    y = 0. Without ``fps`` it has the frame rate of the file, 30 for glTF. ``up`` is the up axis of an ``.npz``, see
+    ``read_amass``; ``clip`` names the animation of a glTF file, where there are several. Raises DyngsError: names the
+    file and what is wrong with it.
     """
     path, suffix = Path(path), Path(path).suffix.lower()
-    form = _FORMATS.get(suffix)
-    if form is None:
-        *others, last = (known.name for known in _FORMATS.values())
+    if suffix not in _KINDS:
+        *others, last = _KINDS.values()
         raise DyngsError(f"{path}: unknown kind of motion; give {', '.join(others)} or {last}")
-    if up != "auto" and not form.has_up_axis:
+    if up != "auto" and suffix != ".npz":
         raise DyngsError(f"{path}: the up axis can only be chosen for an .npz; that of a {suffix} is known")
-    if clip is not None and not form.has_clips:
+    if clip is not None and suffix in (".npz", ".bvh"):
         raise DyngsError(f"{path}: a {suffix} holds one motion without a name; do not ask for '{clip}'")
+    body = default_template() if body is None else body
     with reading(path):
-        motion = form.read(_Request(path, default_template() if body is None else body, fps, up, clip))
+        if suffix == ".npz":
+            motion = read_amass(path, body, up)
+        elif suffix == ".bvh":
+            motion = retarget(read_bvh(path), body)
+        else:
+            read = read_vrm_animation if suffix == ".vrma" else read_gltf
+            motion = retarget(read(path, _GLTF_FPS if fps is None else fps, clip), body)
     return motion if fps is None else motion.resampled(fps)

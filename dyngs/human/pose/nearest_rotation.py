@@ -15,16 +15,12 @@ from dyngs.ops.quaternions import matrix_entries
 
 _ROOT_STEPS = 20
 """Limit on the steps of Laguerre's method: 2 to 4 suffice for nearly rigid blends, multiple roots need more."""
-
 _BLOCK = 8192
 """Matrices per block, so that intermediate results stay in the cache."""
-
 _AMBIGUOUS = 1e-6
 """Trace of the adjugate, for a matrix of unit size, below which the nearest rotation counts as ambiguous."""
-
 _STEEPEST = 1e4
 """Limit on the gradient by the matrix, in multiples of that by the rotation over 2 (s1 + s2 + s3)."""
-
 _TIE_BREAK = (1e-4, 0.7e-4, 0.4e-4)
 """Diagonal that is added where it is ambiguous, in favour of small rotations; unequal, to break all ties."""
 

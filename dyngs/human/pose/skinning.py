@@ -31,17 +31,11 @@ def axis_angle_to_matrix(poses: Tensor) -> Tensor:
 def joint_transforms(joints: Tensor, parents: tuple[int, ...], rotations: Tensor) -> Tensor:
     """Return the transforms ``posed_from_rest`` (..., J, 3, 4) of the joints; the identity in the rest pose.
 
-    A joint rotates its descendants about its rest position: A_j = A_parent(j) [R_j | J_j - R_j J_j], which is
-    [G_R | G_t - G_R J_j] of SMPL (Loper et al. 2015). Every round doubles the number of ancestors included
-    (pointer jumping), so that a chain of n joints takes log2(n) rounds instead of n.
-
-    Args:
-        joints: (..., J, 3) at rest.
-        parents: (J,) parent of each joint, -1 for a root; parents come before their children.
-        rotations: (..., J, 3, 3) of the joints, relative to their parents.
-
-    Raises:
-        ValueError: a parent that does not come before its child.
+    A joint rotates its descendants about its rest position: A_j = A_parent(j) [R_j | J_j - R_j J_j], which is [G_R |
+    G_t - G_R J_j] of SMPL (Loper et al. 2015). Every round doubles the number of ancestors included (pointer jumping),
+    so that a chain of n joints takes log2(n) rounds instead of n. ``joints`` (..., J, 3) are at rest; ``rotations``
+    (..., J, 3, 3) relative to the parents, which come before their children, -1 for a root. Raises ValueError: a parent
+    that does not come before its child.
     """
     check_tree(parents)
     shifts = joints[..., None] - rotations @ joints[..., None]
@@ -61,8 +55,7 @@ def joint_transforms(joints: Tensor, parents: tuple[int, ...], rotations: Tensor
 def check_tree(parents: tuple[int, ...]) -> None:
     """Check that every parent comes before its child, which excludes cycles.
 
-    Raises:
-        ValueError: names the first joint for which this does not hold.
+    Raises ValueError: names the first joint for which this does not hold.
     """
     for joint, parent in enumerate(parents):
         if not -1 <= parent < joint:

@@ -1,6 +1,6 @@
 """A captured person to predict: the template in the person's shape, its texels, and the choice of views.
 
-Local letters: P texels, K scaffolds, V views, M vertices.
+Local letters: P texels, K scaffolds.
 """
 
 from __future__ import annotations
@@ -8,61 +8,49 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.config import HumanModel
+from dyngs.config import HumanPredictorModel
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes
-from dyngs.human.avatar.subject import Subject
-from dyngs.human.motion.captured import captured_motion
-from dyngs.human.prediction.unseen import mirror_texels
+from dyngs.human.motion.clip import captured_motion
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import rest_shape
+from dyngs.human.template.body_reader import rest_shape
 from dyngs.human.template.mesh import vertex_normals
 
 
 @dataclass(frozen=True)
 class CapturedPerson:
-    """A person with images, as input of a prediction.
+    """A person with images, as input of a prediction."""
 
-    Attributes:
-        name: of the capture, for messages.
-        body: the template in the person's shape, without a shape space.
-        normals: (M, 3) unit normals of its vertices.
-        texels: P, of that shape.
-        mirror: (P,) index of the texel at the mirror image of each.
-        heights: (K,) of the scaffolds, m, ascending.
-        gaussians: K P grey discs, ordered by scaffold.
-        subject: skeleton, poses, and the anchors of ``gaussians``.
-        views: with images, in the order of the split ``train``.
-    """
-
-    name: str
-    body: BodyTemplate
-    normals: Tensor
-    texels: Texels
-    mirror: Tensor
-    heights: tuple[float, ...]
-    gaussians: Gaussians
-    subject: Subject
-    views: tuple[View, ...]
+    name: str  # of the capture, for messages
+    body: BodyTemplate  # the template in the person's shape, without a shape space
+    normals: Tensor  # (M, 3) unit normals of its vertices
+    texels: Texels  # P, of that shape
+    mirror: Tensor  # (P,) index of the texel at the mirror image of each
+    heights: tuple[float, ...]  # (K,) of the scaffolds, m, ascending
+    gaussians: Gaussians  # K P grey discs, ordered by scaffold
+    subject: Subject  # skeleton, poses, and the anchors of ``gaussians``
+    views: tuple[View, ...]  # with images, in the order of the split ``train``
 
     def pose_in(self, view: View) -> BodyPose:
         """Return the pose of the person in ``view``."""
-        footage = self.subject.footage
-        return frame_pose(footage.clip, footage.rows[-1 if view.frame is None else view.frame])
+        motion = self.subject.motion
+        return frame_pose(motion.clip, motion.rows[-1 if view.frame is None else view.frame])
 
 
-def captured_person(capture: Capture, model: HumanModel, body: BodyTemplate) -> CapturedPerson:
+def captured_person(capture: Capture, model: HumanPredictorModel, body: BodyTemplate) -> CapturedPerson:
     """Return the person of a capture, on the template ``body``.
 
-    Raises:
-        DyngsError: a capture without body parameters, without silhouettes, or a view without parameters.
+    Raises DyngsError: a capture without body parameters, without silhouettes, or a view without parameters.
     """
     if capture.body is None:
         raise DyngsError(f"{capture.root}: has no body parameters, which a prediction needs; see docs/human.md")
@@ -95,12 +83,8 @@ def spread_views(person: CapturedPerson, count: int, first: int | None = None) -
 
     The views are of one frame, the first with the most views, if it has enough; else of all frames. They maximize the
     mean over texels of the best view's cosine between normal and view direction, in the rest pose and without
-    occlusion; found greedily, then by exchanging one view after the other.
-
-    Args:
-        person: the captured person.
-        count: at least 1; all views if there are fewer.
-        first: a view that must be among them; its frame is then chosen.
+    occlusion; found greedily, then by exchanging one view after the other. All views if there are fewer than ``count``;
+    the view ``first`` must be among them, and its frame is chosen.
     """
     views = person.views
     frames = [view.frame for view in views]
@@ -126,8 +110,7 @@ def spread_views(person: CapturedPerson, count: int, first: int | None = None) -
 def named_views(person: CapturedPerson, names: Sequence[str]) -> list[int]:
     """Return the indices of the views with these names, or with images of these file names.
 
-    Raises:
-        DyngsError: an unknown name, or the same view twice.
+    Raises DyngsError: an unknown name, or the same view twice.
     """
     files = [view.image_path.name for view in person.views]
     known = {name: i for i, name in enumerate(files) if files.count(name) == 1}
@@ -162,3 +145,46 @@ def _direction(person: CapturedPerson, view: View) -> Tensor:
     center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
     pelvis = pose.scale * person.subject.skeleton.joints[0] + pose.trans
     return torch.nn.functional.normalize(pose.rotations[0].T @ (center - pelvis), dim=0)
+
+
+_NEAREST = 16
+"""Seen texels that an unseen one takes its colour from."""
+_TURN = 0.1
+"""Metres that count as much as a turn of the normal by 60 degrees."""
+_SOFT = 0.01
+"""Distance added, m, so that the very nearest texel does not decide alone."""
+_UNKNOWN = 0.5
+
+
+def mirror_texels(texels: Texels) -> Tensor:
+    """Return the index (P,) of the texel nearest to the mirror image of each one, at rest."""
+    positions = _positions(texels)
+    found = KDTree(positions).query(positions * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
+    return torch.from_numpy(np.asarray(found, dtype=np.int64)).to(texels.index.device)
+
+
+def colours_nearby(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
+    """Return ``rgb`` (P, 3) where ``seen`` (P,) is positive, elsewhere the mean of seen texels that are near at rest.
+
+    Weights fall with the squared distance, and grow with the cosine at which a texel is seen; normals count, too, so
+    that the sole is not coloured like the instep. 0.5 if nothing is seen.
+    """
+    is_seen = (seen > 0).cpu().numpy()
+    if not is_seen.any():
+        return torch.full_like(rgb, _UNKNOWN)
+    if is_seen.all():
+        return rgb
+    positions, known = _positions(texels), np.flatnonzero(is_seen)
+    count = min(_NEAREST, len(known))
+    found = KDTree(positions[known]).query(positions[~is_seen], k=count)
+    distance, near = (np.asarray(x).reshape(-1, count) for x in found)  # one neighbour comes without its axis
+    rows = torch.from_numpy(known[near.astype(np.int64)]).to(rgb.device)
+    weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT).square()
+    filled = rgb.clone()
+    filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(1) / weight.sum(1)[:, None]
+    return filled
+
+
+def _positions(texels: Texels) -> np.ndarray:
+    """Return the positions and scaled normals (P, 6) of the texels at rest, m."""
+    return torch.cat([texels.points, _TURN * texels.normals], dim=1).double().cpu().numpy()

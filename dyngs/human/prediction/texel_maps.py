@@ -3,7 +3,7 @@
 The images of a person become maps over the atlas (GHG, Kwon et al. 2024): each scaffold is rasterized as a mesh into
 each view, and a texel counts as seen where no part of that mesh is in front of it.
 
-Local letters: P texels, K scaffolds, M vertices.
+Local letters: P texels, K scaffolds.
 """
 
 from __future__ import annotations
@@ -21,52 +21,37 @@ from dyngs.data.loader import Image
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
-from dyngs.human.prediction.person import CapturedPerson
-from dyngs.human.prediction.unseen import colours_nearby
+from dyngs.human.prediction.person import CapturedPerson, colours_nearby
 from dyngs.human.template.atlas import Texels
 from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 
 _GRAZING = 0.15
 """Cosine below which a texel does not count as seen."""
-
 HULL_LIMIT = 0.06
 """Largest distance from the edge of a silhouette that is told apart, m."""
-
 _TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
 """Depth tolerance of the visibility test: in m, and in pixels along the surface."""
 
 
 @dataclass(frozen=True)
 class TexelMaps:
-    """Observations in a few images, per texel.
+    """Observations in a few images, per texel."""
 
-    Attributes:
-        rgb: (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel.
-        seen: (K, P) largest cosine between normal and view direction, 0 where a texel is hidden.
-        inside: (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the frame.
-        hull: (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m in the
-            body's size, at most ``HULL_LIMIT`` and at least its negative.
-        offsets: (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the pelvis.
-        nearby: (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby.
-        count: of the views.
-    """
-
-    rgb: Tensor
-    seen: Tensor
-    inside: Tensor
+    rgb: Tensor  # (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel
+    seen: Tensor  # (K, P) largest cosine between normal and view direction, 0 where a texel is hidden
+    inside: Tensor  # (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the frame
+    # (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m in the body's size,
+    # at most ``HULL_LIMIT`` and at least its negative
     hull: Tensor
+    # (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the pelvis
     offsets: Tensor
-    nearby: Tensor
-    count: int
+    nearby: Tensor  # (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby
+    count: int  # of the views
 
 
 @torch.no_grad()
 def observe_texels(person: CapturedPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
-    """Return the maps of at least one image, each with its body pose.
-
-    Raises:
-        ValueError: no image.
-    """
+    """Return the maps of at least one image, each with its body pose. Raises ValueError: no image."""
     shape, device = (len(person.heights), len(person.texels)), person.texels.points.device
     colour = torch.zeros(*shape, 3, device=device)
     weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))

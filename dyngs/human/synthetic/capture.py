@@ -2,7 +2,7 @@
 
 Images are rasterized with a depth buffer in numpy, independently of the rasterizer of Gaussians, as ground truth.
 
-Local letters: J joints, M vertices, T triangles, U vertices of the atlas, F frames, H fragments, S texels per side.
+Local letters: T triangles, U vertices of the atlas, H fragments, S texels per side.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from dyngs.human.synthetic.clothes import (
     texture_coordinates,
 )
 from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 
 _RADIUS = 3.5
@@ -41,47 +41,32 @@ _TARGET = np.array([0.0, 0.95, 0.0])
 
 
 @dataclass(frozen=True)
-class Light:
-    """A distant lamp and light from all sides.
+class Lamp:
+    """A distant lamp and light from all sides."""
 
-    Attributes:
-        towards: (3,) direction to the lamp, of any length.
-        ambient, diffuse: sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp.
-    """
-
-    towards: tuple[float, float, float] = (0.35, 0.75, 0.56)
+    towards: tuple[float, float, float] = (0.35, 0.75, 0.56)  # (3,) direction to the lamp, of any length
+    # sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp
     ambient: tuple[float, ...] = (0.6,)
     diffuse: tuple[float, ...] = (0.45,)
 
 
 @dataclass(frozen=True)
 class HumanOptions:
-    """Options of a synthetic capture of a person.
+    """Options of a synthetic capture of a person."""
 
-    Attributes:
-        size: width and height in pixels.
-        num_frames: frames of the walk, for the splits train and test.
-        num_new: frames of another motion, the split ``pose``; 0: no such split.
-        num_cameras: training cameras, on a ring around the person.
-        num_test: test cameras, each midway between two training cameras; 0: neither test nor ``pose``.
-        seed: of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes.
-        samples: per side of a pixel.
-        body_seed: of the person's body shape; None: the template's own.
-        light_seed: of the direction, strength and tint of the light; None: always the same.
-        clip_seed: of the clips, see ``dyngs.human.synthetic.clips.random_clip``; None: a walk, then a squat.
-        usual_clothes: left mostly as right, back as front and bare hands, instead of clothes that differ everywhere.
-    """
-
-    size: int = 128
-    num_frames: int = 12
-    num_new: int = 6
-    num_cameras: int = 8
-    num_test: int = 2
+    size: int = 128  # width and height in pixels
+    num_frames: int = 12  # frames of the walk, for the splits train and test
+    num_new: int = 6  # frames of another motion, the split ``pose``; 0: no such split
+    num_cameras: int = 8  # training cameras, on a ring around the person
+    num_test: int = 2  # test cameras, each midway between two training cameras; 0: neither test nor ``pose``
+    # of the outfit, see ``dyngs.human.synthetic.clothes.random_outfit``; the same seed gives the same bytes
     seed: int = 0
-    samples: int = 2
-    body_seed: int | None = None
-    light_seed: int | None = None
+    samples: int = 2  # per side of a pixel
+    body_seed: int | None = None  # of the person's body shape; None: the template's own
+    light_seed: int | None = None  # of the direction, strength and tint of the light; None: always the same
+    # of the clips, see ``dyngs.human.synthetic.clips.random_clip``; None: a walk, then a squat
     clip_seed: int | None = None
+    # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
     usual_clothes: bool = False
 
 
@@ -92,33 +77,23 @@ def varied(options: HumanOptions, seed: int) -> HumanOptions:
 
 @dataclass(frozen=True)
 class PosedMesh:
-    """A textured mesh in the world; float64, m.
+    """A textured mesh in the world; float64, m."""
 
-    Attributes:
-        vertices: (M, 3) in the world.
-        faces: (T, 3) int64, counter-clockwise from outside.
-        uv: (U, 2) in [0, 1]; row of the texture = (1 - v) * S.
-        uv_faces: (T, 3) int64 into ``uv``.
-        texture: (S, S, 3) sRGB values in [0, 1].
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray
-    uv_faces: np.ndarray
-    texture: np.ndarray
+    vertices: np.ndarray  # (M, 3) in the world
+    faces: np.ndarray  # (T, 3) int64, counter-clockwise from outside
+    uv: np.ndarray  # (U, 2) in [0, 1]; row of the texture = (1 - v) * S
+    uv_faces: np.ndarray  # (T, 3) int64 into ``uv``
+    texture: np.ndarray  # (S, S, 3) sRGB values in [0, 1]
 
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
     """Write images of a walking person in the layout that ``dyngs.data.readers.blender`` reads; returns ``out``.
 
-    Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m,
-    y up, floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``.
-    Clothes are offset from the template's surface; the person's size is the ``scale`` of the parameters. The split test
-    shows the frames of train from other cameras, ``pose`` another motion from these other cameras.
-
-    Raises:
-        DyngsError: options out of range, or ``out`` is not empty or cannot be written.
+    Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m, y up,
+    floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``. Clothes
+    are offset from the template's surface; the person's size is the ``scale`` of the parameters. The split test shows
+    the frames of train from other cameras, ``pose`` another motion from these other cameras. Raises DyngsError: options
+    out of range, or ``out`` is not empty or cannot be written.
     """
     if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
@@ -153,18 +128,18 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
     return replace(body, vertices=vertices, joints=joints), betas
 
 
-def random_light(seed: int | None) -> Light:
+def random_light(seed: int | None) -> Lamp:
     """Return the light of ``seed``, from any side and above, of which three quarters to all reach a white surface that
-    faces it; None: ``Light()``."""
+    faces it; None: ``Lamp()``."""
     if seed is None:
-        return Light()
+        return Lamp()
     make = np.random.default_rng([seed, 3])
     azimuth, height = make.uniform(-np.pi, np.pi), make.uniform(0.0, 1.2)
     diffuse = make.uniform(0.2, 0.6)
     ambient = make.uniform(0.75, 1.05) - diffuse
     tint = 1.0 + make.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
     red, green, blue = (float(diffuse * part) for part in tint)
-    return Light((float(np.sin(azimuth)), float(height), float(np.cos(azimuth))), (float(ambient),), (red, green, blue))
+    return Lamp((float(np.sin(azimuth)), float(height), float(np.cos(azimuth))), (float(ambient),), (red, green, blue))
 
 
 def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> Motion:
@@ -175,22 +150,14 @@ def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> 
 
 
 def render_mesh(
-    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Light = Light()
+    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Lamp = Lamp()
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
     Lambertian: the texture's value times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1; no shadows.
-    Alpha is the fraction of samples that hit the mesh, whose colours are averaged.
-
-    Args:
-        mesh: visible from both sides.
-        world_from_cam: (4, 4) OpenGL pose; square pixels, centred, ``CAMERA_ANGLE_X`` across.
-        size: width and height in pixels.
-        samples: per side of a pixel.
-        light: on the mesh.
-
-    Raises:
-        ValueError: the mesh reaches behind the camera.
+    Alpha is the fraction of samples that hit the mesh, whose colours are averaged. ``world_from_cam`` (4, 4) is an
+    OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X`` across. Raises ValueError: the mesh reaches behind the
+    camera.
     """
     rotation, center = world_from_cam[:3, :3], world_from_cam[:3, 3]
     x, up, back = ((mesh.vertices - center) @ rotation).T
@@ -259,12 +226,10 @@ def _look_at_target(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
 
 
 def _focal(size: int) -> float:
-    """Return the focal length in pixels."""
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments, light: Light) -> np.ndarray:
-    """Return the sRGB values (H, 3) of the fragments."""
+def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments, light: Lamp) -> np.ndarray:
     uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
     normal = normalized(interpolate(fragments.barycentric, normals[mesh.faces[fragments.faces]]))
     facing = np.maximum(normal @ normalized(np.array(light.towards)), 0.0)

@@ -1,7 +1,4 @@
-"""Clips of synthetic people: a walk, a squat, and random ones, chosen by a seed.
-
-Local letters: F frames.
-"""
+"""Clips of synthetic people: a walk, a squat, and random ones, chosen by a seed."""
 
 from __future__ import annotations
 
@@ -15,12 +12,9 @@ from dyngs.human.template.body import BodyTemplate, posed_vertices
 from dyngs.human.template.joints import JOINT_NAMES
 
 FPS = 12.0
-
 _Rotations = dict[str, np.ndarray]
 """Axis-angle vectors (F, 3) or (1, 3) by joint, rad."""
-
 _SIDES = (("left", 1.0), ("right", -1.0))
-
 _KEY_POSES = 4
 """Poses that a random clip passes through."""
 
@@ -71,7 +65,6 @@ def _walk(time: np.ndarray, extent: float, heading: float) -> _Rotations:
 
 
 def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
-    """Return the rotations of a squat, as ``_walk``."""
     depth = extent * (0.5 - 0.5 * np.cos(np.pi * time))
     rotations = {"spine1": _axis_angle(x=0.35 * depth), "head": _axis_angle(x=-0.3 * depth, z=0.2 * depth)}
     if heading:
@@ -88,7 +81,6 @@ def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
 
 
 def _dance(time: np.ndarray, make: np.random.Generator, heading: float) -> _Rotations:
-    """Return the rotations of a clip through random poses, as ``_walk``."""
 
     def between(low: float, high: float) -> np.ndarray:
         knots = make.uniform(low, high, _KEY_POSES)

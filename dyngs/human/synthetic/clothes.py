@@ -1,6 +1,6 @@
 """Clothes and hair of synthetic people: colours, patterns and cut, chosen by a seed.
 
-Local letters: M vertices, P points, U vertices of the atlas, S texels per side.
+Local letters: P points, U vertices of the atlas, S texels per side.
 """
 
 from __future__ import annotations
@@ -28,35 +28,24 @@ _PARTS = {
     "shoe": ("ankle", "foot"),
 }
 """The joints of each part of the body, without side and number."""
-
 _BELOW_KNEE = -0.36
 """Height at which shorts end in T-pose, m."""
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """Clothes and hair of a person in T-pose, and the person's size.
+    """Clothes and hair of a person in T-pose, and the person's size."""
 
-    Attributes:
-        palette: sRGB values (3,) by name of cloth or part of the body.
-        pitch: width of stripes and checks, relative to 0.05 m.
-        upright: whether the stripes on the front are vertical.
-        long_sleeves, long_legs: whether they reach the hands and shoes.
-        shirt, trousers, hair: largest offset from the skin, m.
-        folds: spatial frequency, radians per metre.
-        size: of the person, relative to the template.
-    """
-
-    palette: dict[str, np.ndarray]
-    pitch: float = 1.0
-    upright: bool = False
-    long_sleeves: bool = False
+    palette: dict[str, np.ndarray]  # sRGB values (3,) by name of cloth or part of the body
+    pitch: float = 1.0  # width of stripes and checks, relative to 0.05 m
+    upright: bool = False  # whether the stripes on the front are vertical
+    long_sleeves: bool = False  # whether sleeves and legs reach the hands and shoes
     long_legs: bool = True
-    shirt: float = 0.0
+    shirt: float = 0.0  # of these the largest offset from the skin, m
     trousers: float = 0.0
     hair: float = 0.0
-    folds: float = 20.0
-    size: float = 1.0
+    folds: float = 20.0  # spatial frequency, radians per metre
+    size: float = 1.0  # of the person, relative to the template
 
 
 def random_outfit(seed: int, is_usual: bool = False) -> Outfit:
@@ -96,15 +85,9 @@ def dress_body(body: BodyTemplate, outfit: Outfit) -> BodyTemplate:
 def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
     """Return the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64; left and right, front and back differ.
 
-    Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is correct.
-
-    Args:
-        body: a template in T-pose with texture coordinates and the 55 joints of SMPL-X.
-        outfit: clothes and hair.
-        resolution: S, texels per side.
-
-    Raises:
-        DyngsError: the template has no texture coordinates.
+    Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is correct. The
+    template is in T-pose, with texture coordinates and the 55 joints of SMPL-X; ``resolution`` is S. Raises DyngsError:
+    the template has no texture coordinates.
     """
     uv, uv_faces = texture_coordinates(body)
     columns, rows = texel_coordinates(uv, resolution)
@@ -124,8 +107,7 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
 def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
     """Return texture coordinates (U, 2), float64, and the triangles (T, 3) that index them.
 
-    Raises:
-        DyngsError: the template has none.
+    Raises DyngsError: the template has none.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")
@@ -138,7 +120,6 @@ def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.n
 
 
 def _left_eye(body: BodyTemplate) -> np.ndarray:
-    """Return the left eye (3,), m."""
     return body.joints[JOINT_NAMES.index("left_eye")].double().cpu().numpy()
 
 
@@ -164,7 +145,6 @@ def _cloth_offsets(vertices: np.ndarray, part_weights: np.ndarray, eye: np.ndarr
 
 
 def _smoothstep(x: np.ndarray) -> np.ndarray:
-    """Return the smoothstep of x: from 0 at 0 to 1 at 1."""
     x = x.clip(0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 

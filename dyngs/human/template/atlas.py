@@ -1,11 +1,10 @@
-"""Texels of a body template's texture atlas as points of its surface, and scaffolds of points above it.
+"""Texels of a body template's texture atlas as points of its surface.
 
-Local letters: T triangles, U vertices of the atlas, P texels, Q points of scaffolds.
+Local letters: T triangles, U vertices of the atlas, P texels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -21,28 +20,19 @@ _THINNEST = 1e-9
 
 @dataclass(frozen=True)
 class Texels:
-    """Surface attributes at rest of the P covered texels of an atlas, in row-major order of the atlas.
+    """Surface attributes at rest of the P covered texels of an atlas, in row-major order of the atlas."""
 
-    Attributes:
-        resolution: S, texels per side. The centre of row r, column c lies at u = (c + 0.5) / S, v = 1 - (r + 0.5) / S.
-        index: (P,) int64, r * S + c, ascending.
-        faces: (P,) int64 triangle of the template that covers the texel's centre.
-        barycentric: (P, 3) coordinates of the centre in that triangle, in [0, 1], rows sum to 1.
-        points: (P, 3) on the surface at rest, m.
-        frames: (P, 3, 3) rotations; columns are the tangent (along increasing u), the bitangent and the outward normal,
-            smooth over edges. In mirrored parts of an atlas the bitangent points along decreasing v.
-        weights: (P, J) skinning weights, rows sum to 1.
-        size: (P,) side of the texel on the surface, m: sqrt(area of the triangle / its area in the atlas) / S.
-    """
-
+    # S, texels per side. The centre of row r, column c lies at u = (c + 0.5) / S, v = 1 - (r + 0.5) / S.
     resolution: int
-    index: Tensor
-    faces: Tensor
-    barycentric: Tensor
-    points: Tensor
+    index: Tensor  # (P,) int64, r * S + c, ascending
+    faces: Tensor  # (P,) int64 triangle of the template that covers the texel's centre
+    barycentric: Tensor  # (P, 3) coordinates of the centre in that triangle, in [0, 1], rows sum to 1
+    points: Tensor  # (P, 3) on the surface at rest, m
+    # (P, 3, 3) rotations; columns are the tangent (along increasing u), the bitangent and the outward normal, smooth
+    # over edges. In mirrored parts of an atlas the bitangent points along decreasing v.
     frames: Tensor
-    weights: Tensor
-    size: Tensor
+    weights: Tensor  # (P, J) skinning weights, rows sum to 1
+    size: Tensor  # (P,) side of the texel on the surface, m: sqrt(area of the triangle / its area in the atlas) / S
 
     def __len__(self) -> int:
         return len(self.index)
@@ -58,42 +48,12 @@ class Texels:
         return self.frames[..., 2]
 
 
-@dataclass(frozen=True)
-class ScaffoldPoints:
-    """Points above the texels of an atlas, in any order and number: scaffolds for clothing and hair (GHG).
-
-    Attributes:
-        texel: (Q,) int64 rows of a ``Texels``.
-        height: (Q,) along the normal, m.
-    """
-
-    texel: Tensor
-    height: Tensor
-
-    def __len__(self) -> int:
-        return len(self.texel)
-
-    def select(self, index: Tensor) -> ScaffoldPoints:
-        """Return the points at ``index`` (long or bool)."""
-        return ScaffoldPoints(self.texel[index], self.height[index])
-
-    def points(self, texels: Texels) -> Tensor:
-        """Return the points (Q, 3) at rest, m: x + height * normal for the surface points x of ``texels``."""
-        return texels.points[self.texel] + self.height[:, None] * texels.normals[self.texel]
-
-
 def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = None) -> Texels:
     """Return the texels whose centres the atlas of ``body`` covers; of overlapping triangles the first one wins.
 
-    Triangles that are degenerate in the atlas or on the surface cover nothing. Not differentiable.
-
-    Args:
-        body: a template with texture coordinates.
-        resolution: S, texels per side, at least 1.
-        vertices: (M, 3) rest shape, m; None: that of the template.
-
-    Raises:
-        DyngsError: no texture coordinates, a resolution below 1, or ``vertices`` of a wrong shape or not finite.
+    Triangles that are degenerate in the atlas or on the surface cover nothing. Not differentiable. ``resolution`` is S,
+    texels per side; ``vertices`` (M, 3) the rest shape, m, None for that of the template. Raises DyngsError: no texture
+    coordinates, a resolution below 1, or ``vertices`` of a wrong shape or not finite.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas")
@@ -126,28 +86,11 @@ def atlas_texels(body: BodyTemplate, resolution: int, vertices: Tensor | None = 
     )
 
 
-def scaffold_points(texels: Texels, heights: Sequence[float]) -> ScaffoldPoints:
-    """Return points at all ``heights`` (m, along the normal) above all texels, one height after the other.
-
-    Raises:
-        DyngsError: no height, or one that is not finite.
-    """
-    levels = texels.points.new_tensor(heights)
-    if levels.numel() == 0 or not bool(levels.isfinite().all()):
-        raise DyngsError(f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}")
-    rows = torch.arange(len(texels), device=levels.device)
-    return ScaffoldPoints(rows.repeat(len(levels)), levels.repeat_interleave(len(texels)))
-
-
 def _rasterized(corners_uv: Tensor, usable: Tensor, resolution: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return the covered texels (P,), ascending, their triangles (P,) and barycentric coordinates (P, 3).
 
-    Exact along shared edges: both triangles compute an edge's sign from its ends in the same order.
-
-    Args:
-        corners_uv: (T, 3, 2 or 3) corners of the triangles in the atlas.
-        usable: (T,) which triangles may cover texels.
-        resolution: S, texels per side.
+    Exact along shared edges: both triangles compute an edge's sign from its ends in the same order. ``corners_uv`` are
+    (T, 3, 2 or 3), ``usable`` (T,) says which triangles may cover texels.
     """
     corners, triangles = corners_uv.cpu().numpy(), np.flatnonzero(usable.cpu().numpy())
     x, y = corners[triangles, :, 0] * resolution - 0.5, (1 - corners[triangles, :, 1]) * resolution - 0.5

@@ -1,12 +1,13 @@
 """Body templates of the SMPL family: rest mesh, shape space, joints, skinning weights, and posed vertices.
 
-Local letters: J joints, M vertices, T triangles, U UV vertices, F frames, B shape and E expression parameters.
+Local letters: T triangles, U UV vertices, B shape and E expression parameters.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from dyngs.human.pose.skinning import (
     check_tree,
     joint_transforms,
 )
+from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.state import fields_moved_to
 
 
@@ -26,35 +28,22 @@ class BodyTemplate:
     """A body template: rest mesh, shape space, joints and skinning weights.
 
     Metres, y up, facing +z, +x to the person's left; float32 unless converted.
-
-    Attributes:
-        name: the family of the joints: "anny", "smpl", "smplh" or "smplx".
-        vertices: (M, 3) at rest.
-        faces: (T, 3) long, counter-clockwise from outside.
-        uv: (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None.
-        uv_faces: (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with ``uv``.
-        weights: (M, J) skinning weights, rows sum to 1.
-        parents: (J,) parent of each joint, -1 for the root; parents come before their children.
-        joints: (J, 3) at rest, mean shape.
-        shape_dirs: (M, 3, B) metres per unit of the shape parameters, or None.
-        expression_dirs: (M, 3, E) metres per unit of the expression parameters, or None.
-        joint_shape_dirs: (J, 3, B) the same for the joints; None with ``shape_dirs``.
-        joint_expression_dirs: (J, 3, E) the same for the joints; None with ``expression_dirs``.
-        pose_dirs: (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or None.
     """
 
-    name: str
-    vertices: Tensor
-    faces: Tensor
-    uv: Tensor | None
+    name: str  # the family of the joints: "anny", "smpl", "smplh" or "smplx"
+    vertices: Tensor  # (M, 3) at rest
+    faces: Tensor  # (T, 3) long, counter-clockwise from outside
+    uv: Tensor | None  # (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None
+    # (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with ``uv``
     uv_faces: Tensor | None
-    weights: Tensor
-    parents: tuple[int, ...]
-    joints: Tensor
-    shape_dirs: Tensor | None = None
-    expression_dirs: Tensor | None = None
-    joint_shape_dirs: Tensor | None = None
-    joint_expression_dirs: Tensor | None = None
+    weights: Tensor  # (M, J) skinning weights, rows sum to 1
+    parents: tuple[int, ...]  # (J,) parent of each joint, -1 for the root; parents come before their children
+    joints: Tensor  # (J, 3) at rest, mean shape
+    shape_dirs: Tensor | None = None  # (M, 3, B) metres per unit of the shape parameters, or None
+    expression_dirs: Tensor | None = None  # (M, 3, E) metres per unit of the expression parameters, or None
+    joint_shape_dirs: Tensor | None = None  # (J, 3, B) the same for the joints; None with ``shape_dirs``
+    joint_expression_dirs: Tensor | None = None  # (J, 3, E) the same for the joints; None with ``expression_dirs``
+    # (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or None
     pose_dirs: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -93,15 +82,9 @@ class BodyTemplate:
 def apply_shape(body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape and expression parameters; differentiable.
 
-    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula.
-
-    Args:
-        body: the template.
-        betas: (..., B) shape parameters; missing ones are 0. None: the mean shape.
-        expression: (..., E) expression parameters, in the same way.
-
-    Raises:
-        DyngsError: a non-zero parameter that the template does not have.
+    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula. Of ``betas`` (...,
+    B) and ``expression`` (..., E) missing ones are 0; None: the mean. Raises DyngsError: a non-zero parameter that the
+    template does not have.
     """
     vertices, joints = body.vertices, body.joints
     for name, given, dirs, joint_dirs in (
@@ -134,17 +117,9 @@ def posed_vertices(
     """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et al. 2015).
 
     v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. The root rotates about the pelvis joint.
-
-    Args:
-        body: the template, in the same floating-point type as the other arguments.
-        poses: (F, J, 3) axis-angle relative to the parent joint, rad.
-        trans: (F, 3) m, added last.
-        betas: (B,) or (F, B) shape parameters, see ``shaped``.
-        expression: (E,) or (F, E) expression parameters.
-        scale: (F,) uniform scale of the template; None: 1.
-
-    Raises:
-        DyngsError: poses for another number of joints, or parameters that the template does not have.
+    ``poses`` (F, J, 3) are axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m, added last; ``betas`` (B,)
+    or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,) of the template. Raises DyngsError: poses for another
+    number of joints, or parameters that the template does not have.
     """
     if poses.ndim != 3 or tuple(poses.shape[1:]) != tuple(body.joints.shape):
         raise DyngsError(
@@ -167,3 +142,72 @@ def _blend_shape_offsets(directions: Tensor, parameters: Tensor) -> Tensor:
     """Return offsets (..., X, 3): the first n ``directions`` (X, 3, B), weighted by ``parameters`` (..., n)."""
     used = directions[..., : parameters.shape[-1]].flatten(0, 1)
     return (parameters @ used.T).unflatten(-1, (-1, 3))
+
+
+BONE_UNIT = 0.015
+"""Change of a bone vector by one unit of a direction, m: about the spread among adults of the same height."""
+SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
+"""Joints that exist on both sides."""
+MIDDLE = ("spine1", "spine2", "spine3", "neck", "head")
+"""Joints in the plane of symmetry."""
+NUM_BONE_SHAPES = 3 * len(SIDED) + 2 * len(MIDDLE)
+"""B: a bone vector has three coordinates, in the plane of symmetry two."""
+_NEAREST = 0.02
+"""Distance added to all distances when a vertex lies between several joints, m."""
+
+
+def bone_shapes(
+    vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions of the vertices (M, 3, B) and of the joints (J, 3, B), m per unit of a shape parameter.
+
+    Each moves one joint, or the same joint of both sides, in the frame of the rest pose, together with everything below
+    it. Vertices between two joints are stretched evenly; those beyond the last joint of a chain keep their shape.
+    ``vertices`` (M, 3) and the 55 ``joints`` (J, 3) of SMPL-X are at rest, +x to the left; ``weights`` are (M, J).
+    """
+    joint_dirs = _joint_directions(parents)
+    follow = _following(vertices, joints, parents, weights)
+    return np.einsum("mj,jkb->mkb", follow, joint_dirs, optimize=True), joint_dirs
+
+
+def _joint_directions(parents: tuple[int, ...]) -> np.ndarray:
+    """Return the directions (J, 3, B) of the joints, m."""
+    below = np.eye(len(parents))  # below[j, i]: joint j is i, or below it
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            below[joint] = np.maximum(below[joint], below[parent])
+    moves = []
+    for name in SIDED:
+        left, right = (below[:, JOINT_NAMES.index(f"{side}_{name}")] for side in ("left", "right"))
+        for axis, mirrored in enumerate((-1.0, 1.0, 1.0)):
+            moves.append(np.outer(left + mirrored * right, np.eye(3)[axis]))
+    for name in MIDDLE:
+        moves += [np.outer(below[:, JOINT_NAMES.index(name)], np.eye(3)[axis]) for axis in (1, 2)]
+    return BONE_UNIT * np.stack(moves, axis=-1)
+
+
+def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray) -> np.ndarray:
+    """Return fractions (M, J), rows sum to 1: by how much a vertex moves when a joint at rest does."""
+    follow = np.zeros_like(weights)
+    for joint in range(len(parents)):
+        rows = np.flatnonzero(weights[:, joint])
+        ends = [joint, *(child for child, parent in enumerate(parents) if parent == joint)]
+        bones = [child for child in ends[1:] if np.linalg.norm(joints[child] - joints[joint]) > 1e-6]
+        fraction = _along_bone(vertices[rows], joints[joint], joints[bones[0]]) if len(bones) == 1 else None
+        if fraction is not None:
+            follow[rows, joint] += weights[rows, joint] * (1 - fraction)
+            follow[rows, bones[0]] += weights[rows, joint] * fraction
+        elif len(bones) > 1 and len(bones) <= 3:  # pelvis, chest; the wrist has five fingers and moves as a whole
+            ends = [joint, *bones]
+            away = np.linalg.norm(vertices[rows, None] - joints[ends], axis=-1) + _NEAREST
+            parts = away**-2 / (away**-2).sum(1, keepdims=True)
+            follow[rows[:, None], np.array(ends)] += weights[rows, joint, None] * parts
+        else:
+            follow[rows, joint] += weights[rows, joint]
+    return follow
+
+
+def _along_bone(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the place (P,) of points (P, 3) along a bone: 0 at its start or before, 1 at its end or beyond."""
+    bone = end - start
+    return np.clip((points - start) @ bone / (bone @ bone), 0.0, 1.0)

@@ -1,10 +1,11 @@
 """Reader of body templates: SMPL, SMPL-H and SMPL-X in ``.npz`` or ``.pkl``, and the free template.
 
-Local letters: J joints, M vertices, T triangles, n any number.
+Local letters: T triangles, n any number.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,13 +14,101 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.errors import DyngsError, reading
+from dyngs.config import HumanModel
+from dyngs.data.capture import BodyFrames
+from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.pickles import read_pickle
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.bone_shapes import bone_shapes
-from dyngs.human.template.obj_uv import TextureCoordinates, read_obj, require_unit_square
+from dyngs.human.template.body import BodyTemplate, apply_shape, bone_shapes
+
+
+@dataclass(frozen=True)
+class TextureCoordinates:
+    """Texture coordinates (U, 2) in [0, 1] and the triangles (T, 3) that index them."""
+
+    uv: np.ndarray
+    faces: np.ndarray
+
+
+def require_unit_square(path: Path, uv: np.ndarray) -> np.ndarray:
+    """Return texture coordinates (U, 2), rounding errors clipped; raises DyngsError where they leave [0, 1]."""
+    outside = ~((uv > -1e-4) & (uv < 1 + 1e-4)).all(1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise DyngsError(
+            f"{path}: texture coordinate {row} is {uv[row, 0]:g} {uv[row, 1]:g}; they must lie in [0, 1], on one tile"
+        )
+    return uv.clip(0, 1)
+
+
+def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> TextureCoordinates:
+    """Read the texture coordinates of an ``.obj``, indexed by the corners of the triangles ``faces`` (T, 3).
+
+    Its triangles may come in any order, as ``f v/vt v/vt v/vt``; ``faces`` (T, 3) are those of the body with
+    ``num_vertices``. Raises DyngsError: the file cannot be read, or belongs to another body.
+    """
+    if path.exists() and not path.is_file():
+        raise DyngsError(f"{path}: is not a file; name the .obj made for this body")
+    try:
+        lines = io.StringIO(path.read_text("latin-1"))
+    except OSError as error:
+        raise DyngsError(f"{path}: cannot be read ({reason(error)})") from error
+    count, uv, corners = 0, [], []
+    for number, line in enumerate(lines, 1):
+        if count > num_vertices or len(corners) > len(faces) or len(uv) > 3 * len(faces):
+            break  # it belongs to another body, however long it is
+        kind, *words = line.split() or [""]
+        try:
+            if kind == "v":
+                count += 1
+            elif kind == "vt":
+                uv.append([float(words[0]), float(words[1])])
+            elif kind == "f":
+                one, two, three = words
+                corners.append([_parsed_corner(word, count, len(uv)) for word in (one, two, three)])
+        except (ValueError, IndexError):
+            raise DyngsError(
+                f"{path}, line {number}: {line.strip()[:60]!r} is not understood; texture coordinates are written "
+                "'vt u v', triangles 'f v/vt v/vt v/vt'"
+            ) from None
+    if count != num_vertices or len(corners) != len(faces):
+        raise DyngsError(
+            f"{path}: has {count} vertices and {len(corners)} triangles, the body has {num_vertices} and {len(faces)}; "
+            "give the .obj made for this body"
+        )
+    found = np.array(corners)
+    if found.min() < 0 or (found.max((0, 1)) >= (count, len(uv))).any():
+        raise DyngsError(f"{path}: a face names a vertex or texture coordinate that does not exist")
+    return TextureCoordinates(
+        require_unit_square(path, np.array(uv)), _matched(path, faces, found[..., 0], found[..., 1])
+    )
+
+
+def _parsed_corner(word: str, vertices: int, coordinates: int) -> tuple[int, int]:
+    """Return vertex and texture coordinate, from 0, of ``v/vt`` or ``v/vt/vn``; negative numbers count from the end."""
+    vertex, coordinate = (int(number) for number in word.split("/")[:2])
+    return (
+        vertex - 1 if vertex > 0 else vertices + vertex,
+        coordinate - 1 if coordinate > 0 else coordinates + coordinate,
+    )
+
+
+def _matched(path: Path, faces: np.ndarray, others: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return ``values`` (T, 3) of the corners of ``others``, reordered to the same triangles in ``faces``."""
+    here, there = np.argsort(faces, axis=1, kind="stable"), np.argsort(others, axis=1, kind="stable")
+    sorted_here, sorted_there = np.take_along_axis(faces, here, 1), np.take_along_axis(others, there, 1)
+    rows, other_rows = np.lexsort(sorted_here.T), np.lexsort(sorted_there.T)
+    differ = (sorted_here[rows] != sorted_there[other_rows]).any(1)
+    if differ.any():
+        odd = " ".join(str(v + 1) for v in others[other_rows[np.argmax(differ)]])
+        raise DyngsError(f"{path}: the body has no triangle of the vertices {odd}; give the .obj made for this body")
+    matched = np.empty_like(values)
+    ordered = np.empty_like(values)
+    ordered[rows] = np.take_along_axis(values, there, 1)[other_rows]
+    np.put_along_axis(matched, here, ordered, 1)
+    return matched
+
 
 _SMPL = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs", "posedirs")
 _TEMPLATE = ("v_template", "f", "weights_idx", "weights_val", "kintree_table", "J")
@@ -39,14 +128,8 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
 
     The number of joints (24, 52 or 55) tells SMPL, SMPL-H and SMPL-X apart. SMPL-X keeps shape and expression in one
     array: 300 and the rest, or 10 and 10. Only the keys that are needed are read. A file cannot run code: arrays of
-    Python objects are refused, and only numbers, text and arrays are read from a pickle.
-
-    Args:
-        path: of the file.
-        uv: an ``.obj`` with the triangles of the body, see ``dyngs.human.template.obj_uv``.
-
-    Raises:
-        DyngsError: names the file and what is missing or wrong.
+    Python objects are refused, and only numbers, text and arrays are read from a pickle. ``uv`` is an ``.obj`` with the
+    triangles of the body. Raises DyngsError: names the file and what is missing or wrong.
     """
     path = Path(path)
     if path.is_dir():
@@ -134,7 +217,6 @@ def _smpl_skin(arrays: _Arrays, vertices: np.ndarray, joints: int) -> tuple[np.n
 
 
 def _with_blend_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
-    """Return the template with the blend shapes of shape, expression and pose."""
     m, j = body.weights.shape
     directions = arrays.floats("shapedirs", (m, 3, None))
     pose_dirs = arrays.floats("posedirs", (m, 3, 9 * (j - 1)))
@@ -171,7 +253,6 @@ def _num_shapes(joints: int, directions: int) -> int:
 
 
 def _float(values: np.ndarray) -> Tensor:
-    """Return the values as a float32 tensor."""
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
@@ -218,7 +299,6 @@ def _parents(arrays: _Arrays) -> tuple[int, ...]:
 
 
 def _own_uv(arrays: _Arrays, triangles: int) -> TextureCoordinates | None:
-    """Return the texture coordinates of the body file itself; None without."""
     given = [key for key in _UV if key in arrays.values]
     if not given:
         return None
@@ -230,7 +310,6 @@ def _own_uv(arrays: _Arrays, triangles: int) -> TextureCoordinates | None:
 
 
 def _wanted(path: Path, present: Collection[object]) -> list[str]:
-    """Return the keys to read, of those ``present``."""
     needed = _TEMPLATE if "weights_idx" in present else _SMPL
     missing = [f"'{key}'" for key in needed if key not in present]
     if missing:
@@ -240,7 +319,6 @@ def _wanted(path: Path, present: Collection[object]) -> list[str]:
 
 
 def _read_pickle(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a pickle under the keys that are needed."""
     loaded = read_pickle(path)
     if not isinstance(loaded, dict):
         raise DyngsError(f"{path}: does not hold a dictionary; give a body file of SMPL, SMPL-H or SMPL-X")
@@ -249,3 +327,37 @@ def _read_pickle(path: Path) -> dict[str, np.ndarray]:
         if not isinstance(value, np.ndarray) or value.dtype.kind == "O":
             raise DyngsError(f"{path}: '{key}' is not an array of numbers; export it again")
     return found
+
+
+DEFAULT_TEMPLATE = Path(__file__).parent / "files" / "anny_smplx55.npz"
+"""The file of the free template that comes with the package."""
+
+
+def default_template() -> BodyTemplate:
+    """Read the free template of the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
+    return read_body(DEFAULT_TEMPLATE)
+
+
+def template_path(model: HumanModel) -> Path:
+    """Return the path of the body file that ``model`` names, or of the free template."""
+    return DEFAULT_TEMPLATE if model.body is None else model.body
+
+
+def load_template(model: HumanModel) -> BodyTemplate:
+    """Read the template that ``model`` names, or the free one. Raises DyngsError: the file cannot be read."""
+    if model.body is None and model.uv is None:
+        return default_template()
+    if model.body is None:
+        raise DyngsError(f"model.uv={model.uv} goes with model.body; the free template has its own texture coordinates")
+    return read_body(model.body, model.uv)
+
+
+def rest_shape(body: BodyTemplate, given: BodyFrames) -> tuple[Tensor, Tensor]:
+    """Return vertices (M, 3) and joints (J, 3) at rest in the shape of ``given``; what ``body`` lacks is ignored.
+
+    A template with another shape space than that of ``given`` stays as it is.
+    """
+    if (given.shape_space == "anny") != (body.name == "anny"):
+        return body.vertices, body.joints
+    with torch.no_grad():
+        return apply_shape(body, torch.from_numpy(given.betas).to(body.vertices)[: body.num_shapes])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 _FINGERS = tuple(f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3))
-
 JOINT_NAMES = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle"),
     *("spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder"),
@@ -12,7 +11,6 @@ JOINT_NAMES = (
     *(f"right_{name}" for name in _FINGERS),
 )
 """The 55 joints of SMPL-X, in its order."""
-
 SMPLX_ROWS = {55: tuple(range(55)), 52: (*range(22), *range(25, 55)), 24: tuple(range(22))}
 """By number of joints of a body (SMPL-X, SMPL-H, SMPL): the rows of ``JOINT_NAMES`` of its first joints.
 

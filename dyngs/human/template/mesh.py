@@ -13,27 +13,18 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Fragments:
-    """The visible triangle of H covered grid points, each point at most once.
+    """The visible triangle of H covered grid points, each point at most once."""
 
-    Attributes:
-        index: (H,) row * width + column.
-        faces: (H,) int64 triangle.
-        barycentric: (H, 3) coordinates on the triangle in space (perspective-correct), rows sum to 1.
-    """
-
-    index: np.ndarray
-    faces: np.ndarray
-    barycentric: np.ndarray
+    index: np.ndarray  # (H,) row * width + column
+    faces: np.ndarray  # (H,) int64 triangle
+    barycentric: np.ndarray  # (H, 3) coordinates on the triangle in space (perspective-correct), rows sum to 1
 
 
 def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     """Return the nearest triangle at every covered grid point (whole numbers of column and row).
 
-    Args:
-        corners: (T, 3, 3) column, row and inverse depth of the corners; inverse depth is linear in the image, and 1
-            without perspective. Triangles without area cover nothing; edges belong to both sides.
-        width: of the grid.
-        height: of the grid.
+    ``corners`` (T, 3, 3) are column, row and inverse depth, which is linear in the image, and 1 without perspective.
+    Triangles without area cover nothing; edges belong to both sides.
     """
     x, y, near = np.ascontiguousarray(corners.transpose(2, 1, 0))
     (x0, x1, x2), (y0, y1, y2) = x, y

@@ -13,7 +13,7 @@ from gltf_skins import SkinnedGlb
 from dyngs.export.rigged.body import body_mesh
 from dyngs.export.rigged.mesh_file import mesh_document
 from dyngs.export.rigged.skeleton import Rig, add_weights, animation_of, rig_of
-from dyngs.files.glb import GlbDocument
+from dyngs.files.gltf import GlbDocument
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.gltf import read_gltf

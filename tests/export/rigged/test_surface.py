@@ -6,7 +6,7 @@ import torch
 from bare_person import RESOLUTION, atlas, bare_scene, template
 
 from dyngs.export.rigged.body import anchor_normals
-from dyngs.export.rigged.surface import MARGINS, Surface, fitted_surface
+from dyngs.export.rigged.surface import MARGINS, FittedSurface, fitted_surface
 from dyngs.export.rigged.texture import bake_texels
 from dyngs.gaussians import Gaussians
 from dyngs.human.template.joints import JOINT_NAMES
@@ -16,7 +16,7 @@ NORMALS = anchor_normals(bare_scene().anchors, BODY, BODY.vertices)
 
 
 @torch.no_grad()
-def fitted(gaussians: Gaussians) -> Surface:
+def fitted(gaussians: Gaussians) -> FittedSurface:
     scene = bare_scene().with_gaussians(gaussians)
     samples = atlas(2 * RESOLUTION)
     return fitted_surface(gaussians, BODY, BODY.vertices, samples, bake_texels(scene, samples, NORMALS))

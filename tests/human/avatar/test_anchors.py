@@ -5,16 +5,31 @@ N Gaussians, J joints.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
+import pytest
 import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.anchors import Anchors, heaviest_joints, skinning_weights, texel_gaussians
+from dyngs.human.avatar.anchors import (
+    FINER,
+    Anchors,
+    heaviest_joints,
+    pixel_size,
+    skinning_weights,
+    surface_gaussians,
+    surface_texels,
+    texel_gaussians,
+)
+from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
+from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.ops.quaternions import rotation_matrices
 
 RESOLUTION = 48
@@ -77,3 +92,58 @@ def test_anchors_know_their_place_on_the_template() -> None:
     assert body.uv_faces is not None
     uv = (anchors.barycentric[..., None] * body.uv[body.uv_faces[anchors.face]]).sum(1)
     torch.testing.assert_close(anchors.uv, uv, rtol=0, atol=1e-5)
+
+
+FINE = 64
+
+
+def test_hands_and_feet_have_smaller_texels_of_the_same_surface_where_pixels_are_small() -> None:
+    body = default_template()
+    plain = atlas_texels(body, FINE)
+    coarse, fine = surface_texels(body, FINE, body.vertices, 0.002)
+    assert fine.resolution == FINER * coarse.resolution
+    parts = {JOINT_NAMES[i] for i in fine.weights.argmax(1).unique().tolist()}
+    assert {"left_wrist", "right_index3", "left_foot", "right_ankle"} <= parts
+    assert not parts & {"head", "spine3", "left_elbow", "left_knee", "left_eye"}
+    assert len(coarse) < len(plain)
+    areas = [float(sum(texels.size.square().sum() for texels in x)) for x in ((plain,), (coarse, fine))]
+    assert areas[1] == pytest.approx(areas[0], rel=0.03)
+    gaussians, anchors, normals = surface_gaussians([coarse, fine], 0)
+    assert len(gaussians) == len(anchors) == len(normals) == len(coarse) + len(fine)
+    assert torch.equal(anchors.points, torch.cat([coarse.points, fine.points]))
+    assert torch.equal(normals, torch.cat([coarse.normals, fine.normals]))
+
+
+def test_nothing_is_finer_where_a_texel_is_hardly_wider_than_a_pixel() -> None:
+    body = default_template()
+    (only,) = surface_texels(body, FINE, body.vertices, 0.05)
+    assert torch.equal(only.index, atlas_texels(body, FINE).index)
+
+
+def test_a_pixel_is_as_large_on_the_person_as_the_camera_is_far() -> None:
+    pose, clip = (
+        torch.eye(4),
+        MotionClip(torch.zeros(1, dtype=torch.float64), torch.zeros(1, 55, 3), torch.zeros(1, 3), torch.tensor([2.0])),
+    )
+    pose[2, 3] = 8.0
+    camera = Cameras(pose[None], torch.tensor([[[400.0, 0, 50], [0, 400.0, 50], [0, 0, 1]]]), 100, 100)
+    assert pixel_size([camera], clip, torch.zeros(3)) == pytest.approx(8.0 / 400 / 2)
+    assert pixel_size([], clip, torch.zeros(3)) == torch.inf
+
+
+def test_scaffolds_are_displaced_by_exactly_their_height() -> None:
+    body, heights = default_template(), (0.0, 0.01, 0.04)
+    texels = atlas_texels(body, 64, body.vertices)
+    _, anchors = texel_gaussians(texels, heights, 0)
+    for k, height in enumerate(heights):
+        rows = slice(k * len(texels), (k + 1) * len(texels))
+        assert anchors.height[rows].tolist() == pytest.approx([height] * len(texels))
+        apart = (anchors.points[rows] - texels.points).double()
+        torch.testing.assert_close(apart, height * texels.normals.double(), rtol=0, atol=2e-7)
+    assert torch.equal(anchors.points[: len(texels)], texels.points)
+
+
+@pytest.mark.parametrize("heights", [(), (0.0, math.nan), (math.inf,)])
+def test_heights_are_numbers(heights: tuple[float, ...]) -> None:
+    with pytest.raises(DyngsError, match="one or more finite numbers"):
+        texel_gaussians(atlas_texels(default_template(), 8), heights, 0)

@@ -10,20 +10,33 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from torch import Tensor
 
+from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.human.avatar.neighbours import linked_neighbours, nearest_neighbours
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.avatar.neighbours import (
+    filled,
+    linked_neighbours,
+    mirror_images,
+    nearest_neighbours,
+    sightings,
+    smoothed,
+    trust_in,
+)
 from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.body_reader import default_template, load_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template, load_template
 
 
 @settings(max_examples=40, deadline=None)
 @given(arrays(np.float64, st.tuples(st.integers(0, 12), st.just(3)), elements=st.integers(0, 3)), st.integers(1, 5))
-def test_neighbours_are_the_nearest_others(places: np.ndarray, count: int) -> None:
+def test_neighbours_are_the_nearest_others(positions: np.ndarray, count: int) -> None:
     """By all distances; on a grid, so that many points coincide and are equally far."""
-    points = torch.from_numpy(places)
+    points = torch.from_numpy(positions)
     found = nearest_neighbours(points, count)
     columns = max(0, min(count, len(points) - 1))
     assert found.shape == (len(points), columns)
@@ -72,3 +85,111 @@ def test_no_gaussian_of_an_arm_is_linked_to_the_trunk_or_of_a_finger_to_another(
     linked = parts[near[known]]
     assert bool(((linked == parts[known, None]) | (linked == 0)).all())
     assert float((near == torch.arange(len(near))[:, None]).float().mean()) < 0.02, "few lack neighbours"
+
+
+def sheet(width: int = 12, height: int = 10) -> tuple[Gaussians, Anchors]:
+    """A flat sheet in the x-y plane, symmetric about x = 0, with texels of 1 cm."""
+    x = (torch.arange(width) - (width - 1) / 2) * 0.01
+    points = torch.cartesian_prod(x, torch.arange(height) * 0.01, torch.zeros(1))
+    count = len(points)
+    size, joints = torch.full((count,), 0.01), torch.zeros(count, 1, dtype=torch.long)
+    anchors = Anchors(
+        points=points,
+        size=size,
+        joints=joints,
+        weights=torch.ones(count, 1),
+        face=joints[:, 0],
+        barycentric=torch.ones(count, 3) / 3,
+        uv=points[:, :2],
+        height=torch.zeros(count),
+    )
+    gaussians = Gaussians(
+        means=points.clone(),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), 0.005).log(),
+        logit_opacities=torch.full((count,), 2.0),
+        sh=torch.zeros(count, 1, 3),
+    )
+    return gaussians, anchors
+
+
+def one_part(count: int) -> Tensor:
+    return torch.ones(count, 1)
+
+
+def camera(distance: float = 1.0, size: int = 60, focal: float = 300.0) -> Cameras:
+    pose = torch.eye(4)
+    pose[2, 3] = distance
+    half = size / 2
+    return Cameras(pose[None], torch.tensor([[[focal, 0, half], [0, focal, half], [0, 0, 1]]]), size, size)
+
+
+def test_a_view_counts_as_about_one_whatever_its_size_and_what_is_behind_counts_nothing() -> None:
+    gaussians, anchors = sheet()
+    behind = gaussians.replace(means=gaussians.means + torch.tensor([0.0, 0.0, 0.05]))
+    rows = torch.arange(len(anchors)).repeat(2)
+    opaque = gaussians.select(rows).replace(
+        means=torch.cat([gaussians.means, behind.means]), logit_opacities=torch.full((len(rows),), 5.0)
+    )
+    sizes, count = anchors.size.repeat(2), len(anchors)
+    inner = (anchors.points[:, 0].abs() < 0.04) & (anchors.points[:, 1] > 0.02) & (anchors.points[:, 1] < 0.07)
+    for size, focal in ((60, 300.0), (240, 1200.0)):
+        seen = sightings([(opaque, camera(1.0, size, focal))], sizes, 1.0, RenderOptions())
+        assert 0.3 < float(seen[:count][inner].mean()) < 2.5
+        assert float(seen[count:][inner].max()) < 0.02
+    twice = sightings([(opaque, camera())] * 2, sizes, 1.0, RenderOptions())
+    torch.testing.assert_close(twice, 2 * sightings([(opaque, camera())], sizes, 1.0, RenderOptions()))
+
+
+def test_what_was_made_too_faint_to_be_drawn_is_left_as_it_is() -> None:
+    gaussians, anchors = sheet()
+    faint = gaussians.replace(logit_opacities=torch.full((len(anchors),), -9.0))
+    trust = trust_in(sightings([(faint, camera())], anchors.size, 1.0, RenderOptions()))
+    assert bool((trust == 1).all())
+
+
+def test_where_all_is_trusted_nothing_changes() -> None:
+    gaussians, anchors = sheet()
+    torch.manual_seed(0)
+    gaussians = gaussians.replace(sh=torch.randn(len(anchors), 1, 3), means=gaussians.means + 0.003)
+    new = filled(gaussians, anchors, one_part(len(anchors)), 0.0, torch.ones(len(anchors)))
+    torch.testing.assert_close(new["sh"], gaussians.sh, rtol=0, atol=2e-3)
+    torch.testing.assert_close(new["means"], gaussians.means)
+    torch.testing.assert_close(new["logit_opacities"], gaussians.logit_opacities)
+
+
+def test_the_unseen_half_of_a_symmetric_body_is_that_of_the_other_side() -> None:
+    gaussians, anchors = sheet()
+    torch.manual_seed(0)
+    right = anchors.points[:, 0] < 0
+    smooth = torch.stack([anchors.points[:, 1] * 5, anchors.points[:, 0].abs() * 8, 0 * right], dim=1)[:, None]
+    bulge = torch.stack([torch.sign(anchors.points[:, 0]), torch.ones_like(right), 2.0 * torch.ones_like(right)], dim=1)
+    true = gaussians.replace(sh=smooth, means=anchors.points + 0.004 * bulge)
+    spoilt = true.replace(
+        sh=torch.where(right[:, None, None], torch.randn(len(anchors), 1, 3), true.sh),
+        means=torch.where(right[:, None], anchors.points + 0.02 * torch.randn(len(anchors), 3), true.means),
+        logit_opacities=torch.where(right, -3.0, true.logit_opacities),
+    )
+    weights = torch.stack([right, ~right], dim=1).float()
+    new = filled(spoilt, anchors, weights, 0.0, (~right).float())
+    torch.testing.assert_close(new["means"], true.means)
+    torch.testing.assert_close(new["logit_opacities"], true.logit_opacities)
+    assert float((new["sh"] - true.sh).abs().max()) < 0.06, "colours are mixed a little with those around"
+    torch.testing.assert_close(new["sh"][~right], true.sh[~right], rtol=0, atol=2e-3)
+
+
+def test_without_a_seen_mirror_image_a_gap_is_filled_smoothly_and_from_its_own_part_only() -> None:
+    gaussians, anchors = sheet()
+    torch.manual_seed(0)
+    left, x = anchors.points[:, 0] > 0, anchors.points[:, 0]
+    gap = (x.abs() < 0.03) & (anchors.points[:, 1] > 0.02) & (anchors.points[:, 1] < 0.07)
+    colours = torch.where(left[:, None], torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
+    noisy = torch.where(gap[:, None], torch.randn(len(anchors), 3), colours)
+    weights = torch.stack([~left, left], dim=1).float()
+    found = smoothed(noisy, (~gap).float(), anchors, weights)
+    torch.testing.assert_close(found, colours, atol=1e-3, rtol=0)
+    _, is_image = mirror_images(anchors, 0.5)
+    assert not bool(is_image.any())
+    new = filled(gaussians.replace(sh=noisy[:, None]), anchors, weights, 0.5, (~gap).float())
+    torch.testing.assert_close(new["sh"][:, 0], colours, atol=1e-3, rtol=0)
+    torch.testing.assert_close(new["means"], gaussians.means)

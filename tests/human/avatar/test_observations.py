@@ -1,4 +1,4 @@
-"""Silhouettes and colours of places against what the images were painted with."""
+"""Colours of points against what the images were painted with."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human.avatar.observations import SurfacePoints, observe_points
+from dyngs.human.avatar.observations import observed_colours
 from dyngs.human.avatar.posing import BodyPose, Skeleton
 
 STILL = BodyPose(torch.eye(3)[None], torch.zeros(3), torch.tensor(1.0))
@@ -25,33 +25,32 @@ def image(rgb: tuple[float, float, float], half: float, with_alpha: bool = True,
     return Image("disc", cameras, alpha[..., None] * torch.tensor(rgb), alpha if with_alpha else None, None, 0.0, 0)
 
 
-def places(points: list[list[float]], normal: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> SurfacePoints:
-    count = len(points)
-    return SurfacePoints(torch.tensor(points), torch.tensor([normal]).repeat(count, 1), torch.ones(count, 1))
+def colours(
+    points: list[list[float]], *shown: tuple[Image, BodyPose], normal: tuple[float, float, float] = (0.0, 0.0, -1.0)
+) -> torch.Tensor:
+    """Observed colours of points on a body of one joint that all face one way."""
+    count, at_rest = len(points), torch.tensor(points)
+    normals, weights = torch.tensor([normal]).repeat(count, 1), torch.ones(count, 1)
+    return observed_colours(normals, weights, SKELETON, ((image, pose, at_rest) for image, pose in shown))
 
 
-def test_the_share_of_silhouettes_counts() -> None:
-    shown = [(image((1, 0, 0), half), STILL) for half in (0.5, 0.5, 0.1, 0.5)]
-    found = observe_points(places([[0.0, 0, 0], [0.3, 0, 0], [0.8, 0, 0], [50.0, 0, 0]]), SKELETON, shown)
-    assert found.inside.tolist() == [1.0, 0.75, 0.0, 1.0]
-
-
-def test_places_are_looked_up_in_the_pose_of_the_image() -> None:
+def test_positions_are_looked_up_in_the_pose_of_the_image() -> None:
     moved = BodyPose(torch.eye(3)[None], torch.tensor([-0.6, 0.0, 0.0]), torch.tensor(2.0))
-    found = observe_points(places([[0.3, 0, 0], [0.0, 0, 0]]), SKELETON, [(image((1, 0, 0), 0.3), moved)])
-    assert found.inside.tolist() == [1.0, 0.0]
+    found = colours([[0.3, 0, 0], [0.0, 0, 0]], (image((1, 0, 0), 0.3), moved))
+    torch.testing.assert_close(found, torch.tensor([[1.0, 0.0, 0.0], [0.5, 0.5, 0.5]]))
 
 
 def test_colours_are_those_of_the_cameras_in_front() -> None:
     shown = [(image((1.0, 0.2, 0.0), 0.5), STILL), (image((0.0, 0.0, 1.0), 0.5, turned=True), STILL)]
-    front = observe_points(places([[0.0, 0, 0]]), SKELETON, shown).rgb[0]
-    back = observe_points(places([[0.0, 0, 0]], (0.0, 0.0, 1.0)), SKELETON, shown).rgb[0]
-    torch.testing.assert_close(front, torch.tensor([1.0, 0.2, 0.0]))
-    torch.testing.assert_close(back, torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(colours([[0.0, 0, 0]], *shown)[0], torch.tensor([1.0, 0.2, 0.0]))
+    back = colours([[0.0, 0, 0]], *shown, normal=(0.0, 0.0, 1.0))
+    torch.testing.assert_close(back[0], torch.tensor([0.0, 0.0, 1.0]))
 
 
-def test_what_nobody_sees_is_grey_and_without_alpha_nothing_is_carved() -> None:
-    aside = observe_points(places([[0.0, 0, 0]], (1.0, 0.0, 0.0)), SKELETON, [(image((1, 0, 0), 0.5), STILL)])
-    torch.testing.assert_close(aside.rgb[0], torch.full((3,), 0.5))
-    opaque = observe_points(places([[0.8, 0, 0]]), SKELETON, [(image((1, 0, 0), 0.5, with_alpha=False), STILL)])
-    assert opaque.inside.tolist() == [1.0]
+def test_what_nobody_faces_is_grey_and_without_alpha_the_full_image_counts() -> None:
+    grey = torch.full((3,), 0.5)
+    aside = colours([[0.0, 0, 0]], (image((1, 0, 0), 0.5), STILL), normal=(1.0, 0.0, 0.0))
+    torch.testing.assert_close(aside[0], grey)
+    opaque, cut = image((1, 0, 0), 0.5, with_alpha=False), image((1, 0, 0), 0.5)
+    torch.testing.assert_close(colours([[0.8, 0, 0]], (opaque, STILL))[0], torch.zeros(3))
+    torch.testing.assert_close(colours([[0.8, 0, 0]], (cut, STILL))[0], grey)

@@ -15,24 +15,101 @@ import synthetic_bodies
 import torch
 from torch import Tensor
 
+from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, skinning_weights, texel_gaussians
 from dyngs.human.avatar.posing import (
+    TERMS,
     BodyPose,
+    Light,
     Skeleton,
-    learned_offsets,
+    difference_of_sides,
+    harmonics,
     pose_blend_shapes,
     pose_gaussians,
+    rest_normals,
     rest_offsets,
     rotate_sh,
 )
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.quaternions import rotation_matrices
+from tests.bare_person import atlas, bare_scene
+
+
+def from_the_left() -> Tensor:
+    """Twice as bright as even light where the surface faces +x, black where it faces -x; red only."""
+    factors = torch.zeros(TERMS, 3)
+    factors[0, 0] = 1.0
+    return factors
+
+
+def turned(angle: float) -> Tensor:
+    """A rotation about y."""
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def colours(sh: Tensor) -> Tensor:
+    return 0.5 + SH_C0 * sh[:, 0]
+
+
+def test_colours_follow_where_the_surface_faces() -> None:
+    albedo = torch.tensor([[0.4, 0.3, 0.2]])
+    sh = ((albedo - 0.5) / SH_C0)[:, None]
+    light = Light(torch.tensor([[2.0, 0, 0]]), from_the_left())
+    for angle in (0.0, 0.7, math.pi / 2, math.pi):
+        found = colours(light.on(sh, 3 * turned(angle)[None]))
+        expected = albedo * torch.tensor([1 + math.cos(angle), 1.0, 1.0])
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+
+
+def test_higher_harmonics_are_dimmed_with_the_colour() -> None:
+    sh = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(0))
+    light = Light(torch.tensor([[0.0, 1, 0]]).expand(5, 3), 0.3 * torch.ones(TERMS, 3))
+    found = light.on(sh, torch.eye(3).expand(5, 3, 3))
+    factor = 1 + 0.3 * harmonics(torch.tensor([[0.0, 1, 0]])).sum()
+    torch.testing.assert_close(found[:, 1:], factor * sh[:, 1:])
+    torch.testing.assert_close(colours(found), factor * colours(sh))
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    make = torch.Generator().manual_seed(1)
+    shapes = ((3, 1, 3), (3, 3, 3), (3, 3), (TERMS, 3))
+    values = [torch.randn(shape, generator=make, dtype=torch.float64).requires_grad_() for shape in shapes]
+    assert torch.autograd.gradcheck(lambda sh, linear, normals, light: Light(normals, light).on(sh, linear), values)
+
+
+def test_normals_of_the_first_gaussians_point_away_from_the_body() -> None:
+    texels = atlas()
+    gaussians, _ = texel_gaussians(texels, [0.0], 0)
+    torch.testing.assert_close(rest_normals(gaussians), texels.normals, atol=1e-5, rtol=0)
+
+
+def test_a_person_is_lit_in_the_world() -> None:
+    scene = bare_scene(light=True)
+    dark, _ = scene.in_frame(0)
+    scene.learned["light"].data.copy_(from_the_left())
+    lit, _ = scene.in_frame(0)
+    assert torch.equal(lit.means, dark.means)
+    ratio = colours(lit.sh) / colours(dark.sh)
+    torch.testing.assert_close(ratio[:, 1:], torch.ones_like(ratio[:, 1:]), atol=1e-5, rtol=0)
+    right, left = ratio[:, 0].topk(500, largest=False).indices, ratio[:, 0].topk(500).indices
+    middle = dark.means[:, 0].median()
+    assert dark.means[left, 0].median() > middle > dark.means[right, 0].median()
+
+
+def test_sides_of_other_colours_differ() -> None:
+    gaussians = bare_scene().gaussians.select(torch.arange(4))
+    sh = torch.tensor([0.1, 0.4, 0.4, 0.0])[:, None, None].expand(4, 1, 3) / SH_C0
+    images, known = torch.tensor([1, 0, 1, 2]), torch.tensor([True, True, True, False])
+    found = difference_of_sides(gaussians.replace(sh=sh), images, known)
+    torch.testing.assert_close(found, torch.tensor(3 * 2 * 0.09 / 4))
+
 
 RESOLUTION = 48
 LEFT_ELBOW, LEFT_WRIST = JOINT_NAMES.index("left_elbow"), JOINT_NAMES.index("left_wrist")
@@ -107,7 +184,7 @@ def ancestors(body: BodyTemplate, joint: int) -> set[int]:
 
 
 def test_a_mirrored_pose_mirrors_the_result() -> None:
-    """x -> -x: the two sides change places, and axis-angle vectors keep x only."""
+    """x -> -x: the two sides change positions, and axis-angle vectors keep x only."""
     body, _, _, _ = person()
     swapped = {"left": "right", "right": "left"}
     sides = (name.partition("_") for name in JOINT_NAMES)
@@ -146,21 +223,6 @@ def test_colours_turn_with_what_they_are_on() -> None:
     assert float((evaluate_harmonics(turned, eye, sh, radii, 1) - before).abs().max()) > 0.05
 
 
-def test_offsets_follow_the_bends_of_the_joints_that_count() -> None:
-    """At rest, and of the root alone, there are none; of one joint they are its weight times P vec(R - 1)."""
-    weights = torch.tensor([[0.25, 0.75, 0.0], [1.0, 0.0, 0.0]])
-    generator = torch.Generator().manual_seed(6)
-    directions = torch.randn(2, 27, generator=generator)
-    turns = torch.zeros(3, 3)
-    turns[0, 1], turns[1, 0], turns[2, 2] = 1.0, 0.7, -0.4
-    place = (torch.zeros(3), torch.tensor(1.0))
-    assert not learned_offsets(weights, BodyPose(axis_angle_to_matrix(torch.zeros(3, 3)), *place), directions).any()
-    found = learned_offsets(weights, BodyPose(axis_angle_to_matrix(turns), *place), directions)
-    bend = (axis_angle_to_matrix(turns[1]) - torch.eye(3)).flatten()
-    torch.testing.assert_close(found[0], 0.75 * directions[0].reshape(3, 9) @ bend)
-    assert not found[1].any()
-
-
 @cache
 def rigid_body() -> BodyTemplate:
     """A body of random triangles with SMPL's joints and pose blend shapes; each triangle follows one joint alone."""
@@ -191,7 +253,7 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
     weights, shapes = skinning_weights(anchors, 24), pose_blend_shapes(body)
     assert shapes is not None
-    offsets = rest_offsets(anchors, weights, posing, shapes, None)
+    offsets = rest_offsets(anchors, posing, shapes)
     found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets).means
     given = (poses[None], posing.trans[None], None, None, posing.scale[None])
     mesh, stiff = (posed_vertices(b, *given)[0] for b in (body, replace(body, pose_dirs=None)))
@@ -204,26 +266,21 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-6)
 
 
-def test_offsets_of_the_template_and_learned_ones_add_up_and_reach_the_pose() -> None:
+def test_offsets_of_the_template_reach_the_pose() -> None:
     body = rigid_body()
     _, anchors = texel_gaussians(atlas_texels(body, 16), (0.0, 0.02), 0)
-    weights, shapes = skinning_weights(anchors, 24), pose_blend_shapes(body)
-    assert shapes is not None
-    generator = torch.Generator().manual_seed(0)
-    dirs = 0.1 * torch.randn(len(anchors), 27, generator=generator)
+    shapes, generator = pose_blend_shapes(body), torch.Generator().manual_seed(0)
     poses = (0.5 * torch.randn(24, 3, generator=generator)).requires_grad_()
     posing = BodyPose(axis_angle_to_matrix(poses), torch.zeros(3), torch.tensor(1.0))
-    both = rest_offsets(anchors, weights, posing, shapes, dirs)
-    given, learned = shapes.offsets(anchors, posing.rotations), learned_offsets(weights, posing, dirs)
-    assert both is not None
-    torch.testing.assert_close(both, given + learned)
+    given = rest_offsets(anchors, posing, shapes)
+    assert given is not None
     half = len(anchors) // 2
     assert torch.equal(given[:half], given[half:]), "both scaffolds follow the skin beneath"
     given.sum().backward()
     assert poses.grad is not None
     assert not poses.grad[0].any(), "the root does not count"
     assert bool(poses.grad[1:].ne(0).any(1).all())
-    assert rest_offsets(anchors, weights, posing, None, None) is None
+    assert rest_offsets(anchors, posing, None) is None
     assert pose_blend_shapes(replace(body, pose_dirs=None)) is None
 
 

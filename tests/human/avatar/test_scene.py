@@ -15,15 +15,14 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose, correction_penalties
+from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.subject import Subject
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.captured import CapturedMotion
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 from dyngs.state import part_of, tensors_of
 from dyngs.static.rates import Rates
 
@@ -44,7 +43,7 @@ def stirred() -> HumanScene:
     gaussians, anchors = texel_gaussians(atlas_texels(body, 24), (0.0,), 0)
     gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1)))
     subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3)))
-    scene = HumanTraining(OPTIONS, subject.footage.frames, Rates(10)).first_scene(gaussians, subject)
+    scene = HumanTraining(OPTIONS, subject.motion.frames, Rates(10)).first_scene(gaussians, subject)
     generator = torch.Generator().manual_seed(2)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)
@@ -53,7 +52,7 @@ def stirred() -> HumanScene:
 
 def reloaded(scene: HumanScene) -> HumanScene:
     """The scene of what is stored of it."""
-    return HumanScene.restored(OPTIONS, scene.gaussians, part_of(tensors_of(scene.state()), "model"))
+    return HumanScene.restored(scene.gaussians, part_of(tensors_of(scene.state()), "model"))
 
 
 def seen(gaussians: Gaussians) -> Tensor:
@@ -123,7 +122,7 @@ def test_one_pose_is_posed_once_and_the_same_at_all_times() -> None:
 
 def test_penalties_pull_corrections_back() -> None:
     learned = stirred().learned
-    terms = correction_penalties(learned, OPTIONS)
+    terms = correction_penalties(learned)
     assert set(terms) == {"pose", "skinning weights"}
     torch.stack(list(terms.values())).sum().backward()
     for name in ("poses", "turns", "joints", "weights"):

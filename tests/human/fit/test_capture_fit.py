@@ -15,10 +15,10 @@ from dyngs.errors import DyngsError
 from dyngs.human.fit import start
 from dyngs.human.fit.capture_fit import GAIN, CaptureFit, FitEffort, fit_capture, simplest_of_the_best, split_views
 from dyngs.human.fit.clips import fitted_clips
-from dyngs.human.motion.captured import captured_motion
+from dyngs.human.motion.clip import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.load import default_template, rest_shape
+from dyngs.human.template.body_reader import default_template, rest_shape
 
 OPTIONS = HumanOptions(size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5)
 
@@ -115,7 +115,7 @@ def test_without_given_poses_every_frame_has_its_own(
     monkeypatch.setattr(start, "ARMS", ())
     capture, effort = wrong[1].replace(body=None), FitEffort(side=32, steps=1, visits=0)
     fit = fit_capture(capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort)
-    assert fit.from_silhouettes
+    assert fit.tried[0].name == "poses found frame by frame"
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.fit.fitted(fit.motion.clip).poses
     assert len({tuple(pose.flatten().tolist()) for pose in poses}) == 4

@@ -1,5 +1,7 @@
 """3D joints of other programs: each layout gives the joints that were written, and what is refused."""
 
+from __future__ import annotations
+
 import json
 import pickle
 from dataclasses import replace
@@ -11,12 +13,12 @@ import torch
 
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
-from dyngs.human.fit.joint_orders import ORDERS
 from dyngs.human.fit.joints3d import INNER, read_joints
+from dyngs.human.fit.keypoints import ORDERS
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 KNEE, SPINE = JOINT_NAMES.index("left_knee"), JOINT_NAMES.index("spine2")
 
@@ -75,8 +77,8 @@ def posed(body: BodyTemplate) -> tuple[torch.Tensor, torch.Tensor]:
     poses[0, KNEE, 0], poses[0, 0, 1], poses[0, 16, 2] = 0.8, 0.5, -0.6
     trans = torch.tensor([[0.3, 0.0, 1.0]])
     moves = joint_transforms(body.joints, body.parents, axis_angle_to_matrix(poses))[0]
-    places = (moves[..., :3] @ body.joints[..., None])[..., 0] + moves[..., 3] + trans
-    return posed_vertices(body, poses, trans, None, None), places[:22]
+    positions = (moves[..., :3] @ body.joints[..., None])[..., 0] + moves[..., 3] + trans
+    return posed_vertices(body, poses, trans, None, None), positions[:22]
 
 
 def test_joints_of_posed_vertices(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Key points of OpenPose and COCO: which joint of which view they are, and what is refused."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import replace
 from pathlib import Path

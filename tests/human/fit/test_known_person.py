@@ -1,15 +1,28 @@
 """The shape of a known person: where it is found, what it does to the template, and what is refused."""
 
+from __future__ import annotations
+
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from dyngs.build import assemble
+from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
+from dyngs.data.capture import View
 from dyngs.errors import DyngsError
-from dyngs.files.write import write_text
-from dyngs.human.fit.known_person import known_shape, shape_of, with_shape
-from dyngs.human.template.load import default_template
+from dyngs.files.write import write_image, write_text
+from dyngs.human.avatar import pose_fit
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.fit.inputs import KnownAvatar
+from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.motion.clip import CapturedMotion, MotionClip
+from dyngs.human.template.body_reader import default_template
+from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.training.trainer import Trainer
 
 
 def fitted(folder: Path, kind: str = "anny") -> Path:
@@ -42,3 +55,128 @@ def test_others_are_refused(tmp_path: Path) -> None:
         known_shape(tmp_path)
     with pytest.raises(DyngsError, match="of another template"):
         known_shape(fitted(tmp_path / "b", "smplx"))
+
+
+SIZE = 64
+TURNED = ("left_hip", "right_knee", "left_shoulder", "right_elbow")
+AWAY = torch.tensor([0.03, 0.0, 0.02])
+
+
+@pytest.fixture(scope="module")
+def avatar(person: Path) -> HumanScene:
+    """A person of a few hundred Gaussians, which was not trained."""
+    scene = new_trainer(person).scene
+    assert isinstance(scene, HumanScene)
+    return scene
+
+
+def new_trainer(person: Path) -> Trainer:
+    model = HumanModel(resolution=24, sh_degree=0)
+    train, run = TrainConfig(steps=10), RunConfig(threads=1)
+    return assemble(Config(data=DataConfig(root=person), model=model, optim=OptimConfig(), train=train, run=run))
+
+
+@pytest.fixture(scope="module")
+def views(avatar: HumanScene, person: Path, tmp_path_factory: pytest.TempPathFactory) -> list[View]:
+    """The avatar in two of the three frames of its clip from three cameras; its colours are noise."""
+    folder, found = tmp_path_factory.mktemp("drawn"), []
+    images = new_trainer(person).images
+    cameras = {tuple(p.cameras.cam_from_world.flatten().tolist()): p.cameras for p in images}
+    for frame, time in enumerate(avatar.times[:2]):
+        for i, camera in enumerate(cameras.values()):
+            larger = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None] * camera.intrinsics
+            with torch.no_grad():
+                drawn = avatar.render(replace(camera, intrinsics=larger, width=SIZE, height=SIZE), time)
+            image = torch.cat([torch.rand(SIZE, SIZE, 3), drawn.alpha[0].clamp(0, 1)[..., None]], 2)
+            path = folder / f"{frame}_{i}.png"
+            write_image(path, (image.numpy() * 255).round().astype(np.uint8))
+            pose, intrinsics = camera.cam_from_world[0].double().numpy(), larger[0].double().numpy()
+            found.append(View(path.stem, path, pose, intrinsics, SIZE, SIZE, camera_id=i, frame=frame))
+    return found
+
+
+def posed(avatar: HumanScene, views: list[View], clip: MotionClip) -> AvatarPoses:
+    start = CapturedMotion(clip, (0, 1, 2))
+    return posed_by_avatar(KnownAvatar(avatar, None), views, DataConfig(root=Path()), start)
+
+
+def turned(clip: MotionClip) -> MotionClip:
+    """The clip with some joints turned by 9 degrees about some axis, 36 mm from where it was."""
+    rows, poses = [JOINT_NAMES.index(name) for name in TURNED], clip.poses.clone()
+    away = torch.randn(len(clip), len(rows), 3, generator=torch.Generator().manual_seed(2))
+    poses[:, rows] += 0.15 * away / away.norm(dim=2, keepdim=True)
+    return replace(clip, poses=poses, trans=clip.trans + AWAY)
+
+
+def error(clip: MotionClip, truth: MotionClip) -> Tensor:
+    """Distances (3,) of the pelvis from where it is, m."""
+    return (clip.trans - truth.trans).norm(dim=1)
+
+
+def test_disturbed_poses_are_found_again(
+    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 4)
+    start = turned(avatar.clip)
+    found = posed(avatar, views, start)
+    assert found.taken
+    assert found.left_out == 2
+    assert found.after > found.before + 0.1
+    assert "taken; overlap on 2 views left out of the fit" in found.summary()
+    after = found.clip.clip
+    assert error(after, avatar.clip)[:2].max() < 0.025 < error(start, avatar.clip).min()
+    assert torch.equal(after.poses[2], start.poses[2]), "no image shows that frame"
+    assert torch.equal(after.times, start.times)
+
+
+def test_poses_that_fit_stay(avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    found = posed(avatar, views, avatar.clip)
+    assert found.before > 0.98
+    if not found.taken:
+        assert found.clip.clip is avatar.clip
+        assert "not taken" in found.summary()
+    assert error(found.clip.clip, avatar.clip).max() < 2e-3
+
+
+def test_worse_poses_are_not_taken(avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Left-out views that show somebody else (a person who stands still) decide against what the others ask for."""
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
+    start = replace(avatar.clip, trans=avatar.clip.trans + AWAY)
+    first = {view.frame: view for view in reversed(views)}
+    others = [view for view in views if view not in first.values()]
+    moved = [replace(view, cam_from_world=_shifted(view.cam_from_world, -AWAY)) for view in first.values()]
+    found = posed(avatar, [*others, *moved], start)
+    assert not found.taken
+    assert found.clip.clip is start
+    assert found.after <= found.before
+
+
+def _shifted(cam_from_world: np.ndarray, by: Tensor) -> np.ndarray:
+    """A camera that sees the world moved by ``by``."""
+    shift = np.eye(4)
+    shift[:3, 3] = by.numpy()
+    return cam_from_world @ shift
+
+
+def test_the_size_of_training_is_taken_where_it_fits(
+    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
+    clip, larger = avatar.clip, 1.1 * avatar.clip.scale
+    wrong = replace(clip, scale=larger, trans=clip.trans + (clip.scale - larger)[:, None] * avatar.skeleton.joints[0])
+    found = posed(avatar, views, wrong)
+    assert found.taken
+    torch.testing.assert_close(found.clip.clip.scale[:2], clip.scale[:2])
+
+
+def test_one_view_of_a_moment_only_moves_the_person(
+    avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
+    start = turned(avatar.clip)
+    found = posed(avatar, views[::3], start)
+    assert found.left_out == 0
+    assert "on the views fitted to" in found.summary()
+    torch.testing.assert_close(found.clip.clip.poses, start.poses, rtol=0, atol=1e-6)
+    assert not torch.equal(found.clip.clip.trans, start.trans)

@@ -4,13 +4,11 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.human.fit.lens_fit import fit_lens, num_ticks
-from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import near_given
-from dyngs.human.fit.solve import drawn_frame, new_fit, with_lens
-from dyngs.human.fit.surface import Surface, surface_of
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
+from dyngs.human.fit.solve import Fitting, drawn_frame, near_given, new_fit, with_lens
 from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 SIZE, FRAMES, STEPS, DISTANCE = 32, 4, 12, 2.2
 
@@ -38,8 +36,8 @@ def test_a_wrong_guess_is_corrected() -> None:
     surface, clip, seen = filmed(-0.3)
     ticks: list[int] = []
     start = new_fit(clip, surface)
-    args = (start, (), clip, surface, seen.__getitem__, near_given(clip), STEPS, lambda: ticks.append(1))
-    found, lens = fit_lens(*args)
+    fitting = Fitting(clip, surface, near_given(clip))
+    found, lens = fit_lens(fitting, start, (), seen.__getitem__, STEPS, lambda: ticks.append(1))
     assert lens.taken
     assert lens.error[1] < 0.8 * lens.error[0]
     assert 0.6 < lens.factor < 0.93
@@ -52,7 +50,7 @@ def test_a_wrong_guess_is_corrected() -> None:
 def test_where_the_guess_stays_nothing_is_fitted_again() -> None:
     surface, clip, seen = filmed(0.0)
     start = new_fit(clip, surface)
-    found, lens = fit_lens(start, (), clip, surface, seen.__getitem__, near_given(clip), STEPS)
+    found, lens = fit_lens(Fitting(clip, surface, near_given(clip)), start, (), seen.__getitem__, STEPS)
     assert not lens.taken
     assert found is start
     assert "the guess stays" in lens.summary()

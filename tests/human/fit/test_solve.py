@@ -1,5 +1,7 @@
 """Errors and stages of the fit: known values, and key points that lead a pose."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 
@@ -8,29 +10,29 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.fit.observed import ObservedFrame
-from dyngs.human.fit.pose_prior import PosePrior, near_given, usual
+from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import (
     KEYPOINT,
     LIMIT_WEIGHT,
     PLACE,
-    Stage,
+    Fitting,
+    PosePrior,
     drawn_frame,
     keypoint_error,
+    near_given,
     new_fit,
     place_error,
     posed_joints,
     prior,
     refined,
-    run_stage,
     silhouette_error,
     spread_order,
+    usual,
     with_lens,
 )
-from dyngs.human.fit.surface import Surface, surface_of
 from dyngs.human.motion.clip import MotionClip
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 SIZE = 32
 
@@ -57,9 +59,9 @@ def clip(elbow: float = 0.0) -> MotionClip:
 
 def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
     joints = torch.tensor([[0.0, 0.0, 0.0], [0.5, 1.0, 0.0]])
-    places = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])[None]
-    assert float(keypoint_error(joints, places, camera())) == pytest.approx(0, abs=1e-6)
-    moved = places.clone()
+    positions = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])[None]
+    assert float(keypoint_error(joints, positions, camera())) == pytest.approx(0, abs=1e-6)
+    moved = positions.clone()
     moved[0, 0, 0] += 3 * KEYPOINT
     assert float(keypoint_error(joints, moved, camera())) == pytest.approx((math.sqrt(10) - 1) / 2, rel=1e-4)
     moved[0, 0, 2] = 0
@@ -90,8 +92,8 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> No
     errors = []
     for joints in (None, marked):
         seen = ObservedFrame(view, alpha, torch.ones_like(alpha), joints)
-        stage = Stage(120, 1, ("poses",))
-        found = run_stage(new_fit(given, surface), stage, given, surface, lambda _, seen=seen: seen, near_given(given))
+        fitting = Fitting(given, surface, near_given(given))
+        found = fitting.run(new_fit(given, surface), ("poses",), 120, lambda _, seen=seen: seen)
         errors.append(float((posed_joints(found, given, surface, 0) - truth)[wrist].detach().norm()))
     assert errors[1] < 0.2, "the prior of given poses still pulls"
     assert errors[1] < 0.5 * errors[0]
@@ -108,7 +110,7 @@ def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     given, view = clip(), camera()
     alpha = torch.ones(1, SIZE, SIZE)
     seen, start = ObservedFrame(view, alpha, alpha), new_fit(given, surface)
-    found = run_stage(start, Stage(2, 1, ("betas",)), given, surface, lambda _: seen, near_given(given))
+    found = Fitting(given, surface, near_given(given)).run(start, ("betas",), 2, lambda _: seen)
     assert not any(value.any() for value in start.values().values()), "what was learned before stays as it is"
     changed = {name for name, value in found.values().items() if value.any()}
     assert changed == {"betas"}

@@ -126,7 +126,7 @@ def test_own_files_stay_where_they_are_on_any_body(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [24, 52, 55])
 def test_joints_of_every_width(tmp_path: Path, count: int) -> None:
-    """Fingers go to their places; the hands of SMPL are left out; what is not there does not turn."""
+    """Fingers go to their positions; the hands of SMPL are left out; what is not there does not turn."""
     arrays = numbers(count, up_axis="y")
     motion = read(tmp_path, arrays, count)
     assert motion.poses.shape == (FRAMES, 55, 3)

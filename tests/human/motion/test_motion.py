@@ -63,7 +63,7 @@ def test_every_nth_frame(frames: int, fps: float, step: int) -> None:
 
 
 def test_between_frames() -> None:
-    """A turn by 3 rad and back over the shorter way, at constant speed; places and scales on a line."""
+    """A turn by 3 rad and back over the shorter way, at constant speed; positions and scales on a line."""
     poses = torch.zeros(2, 55, 3)
     poses[:, 3, 2] = torch.tensor([3.0, -3.0])
     motion = Motion(poses, torch.tensor([[0.0, 0, 0], [4, 0, 0]]), torch.zeros(10), 1.0, torch.tensor([1.0, 2]))

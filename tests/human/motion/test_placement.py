@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from motion_files import random_motion, tiny_body
+from motion_files import (
+    pelvis_path,
+    random_motion,
+    slow_vertices,
+    tiny_body,
+)
 from torch import Tensor
 
 from dyngs.human.motion.clip import MotionClip, motion_clip
-from dyngs.human.motion.placement import place_like, rest_clip, up_direction, upright
+from dyngs.human.motion.placement import place_like, place_on_floor, rest_clip, up_direction, upright
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 
 
@@ -67,10 +74,21 @@ def test_upright_turns_a_world_whose_z_is_up() -> None:
     poses[:, 0] += torch.tensor([torch.pi / 2, 0, 0])
     clip = MotionClip(torch.linspace(0, 1, 4).double(), poses, torch.rand(4, 3), torch.full((4,), 0.5))
 
-    def places(x: MotionClip) -> torch.Tensor:
+    def positions(x: MotionClip) -> torch.Tensor:
         moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(x.poses)), joints)
         return x.scale[:, None, None] * moved + x.trans[:, None]
 
     turned = upright(clip, clip, joints)
-    torch.testing.assert_close(places(turned), places(clip) @ y_from_z.T, atol=1e-5, rtol=0)
+    torch.testing.assert_close(positions(turned), positions(clip) @ y_from_z.T, atol=1e-5, rtol=0)
     assert torch.equal(up_direction(turned), torch.tensor([0.0, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize("count", [24, 52, 55])
+def test_the_lowest_vertex_comes_to_the_floor(count: int) -> None:
+    body = tiny_body(count)
+    motion = replace(random_motion(), scale=torch.tensor([0.5, 1.0, 1.5, 2.0]))
+    landed = place_on_floor(motion, body)
+    assert slow_vertices(body, landed)[..., 1].min() == pytest.approx(0, abs=1e-6)
+    assert torch.equal(landed.trans[:, ::2], motion.trans[:, ::2])
+    rise = pelvis_path(body, landed) - pelvis_path(body, motion)
+    assert np.ptp(rise[:, 1]) < 1e-6

@@ -27,8 +27,8 @@ from dyngs.human.motion.motion import (
 )
 from dyngs.human.motion.read import read_motion
 from dyngs.human.template.body import posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 BODY = tiny_body()
 

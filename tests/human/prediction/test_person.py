@@ -12,7 +12,6 @@ from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.prediction.person import CapturedPerson, captured_person, named_views, spread_views
-from dyngs.training.prediction import human_options
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +63,6 @@ def test_a_sitter_has_a_disc_per_texel_and_scaffold(sitter: CapturedPerson) -> N
 def test_captures_without_a_body_or_silhouettes_are_refused(sitter: CapturedPerson, tmp_path: Path) -> None:
     capture = read_capture(DataConfig.model_validate({"root": people(tmp_path, (2,)) / "p2"}))
     with pytest.raises(DyngsError, match="no body parameters"):
-        captured_person(capture.replace(body=None), human_options(NET), body())
+        captured_person(capture.replace(body=None), NET, body())
     with pytest.raises(DyngsError, match="no silhouettes"):
-        captured_person(capture.replace(has_alpha=False), human_options(NET), body())
+        captured_person(capture.replace(has_alpha=False), NET, body())

@@ -13,20 +13,63 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import HumanModel
+from dyngs.config import HumanPredictorModel
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.loader import Image
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
-from dyngs.human.prediction.person import CapturedPerson, captured_person
-from dyngs.human.prediction.texel_maps import HULL_LIMIT, from_atlas, observe_texels, to_atlas
+from dyngs.human.prediction.person import CapturedPerson, captured_person, colours_nearby, mirror_texels
+from dyngs.human.prediction.texel_maps import (
+    HULL_LIMIT,
+    from_atlas,
+    observe_texels,
+    to_atlas,
+)
 from dyngs.human.synthetic.capture import PosedMesh, render_mesh
 from dyngs.human.synthetic.clothes import texel_coordinates, texture_coordinates
+from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import interpolate, rasterize
+
+
+@cache
+def texels() -> Texels:
+    body = default_template()
+    return atlas_texels(body, 64, body.vertices)
+
+
+def test_mirror_texels_lie_on_the_other_side() -> None:
+    """Within two widths of a texel (3 cm), and mirrored twice most come back to where they were."""
+    points = texels().points
+    mirror = mirror_texels(texels())
+    there = points[mirror] * torch.tensor([-1.0, 1.0, 1.0])
+    assert (there - points).norm(dim=1).quantile(0.95) < 0.06
+    assert (points[mirror[mirror]] - points).norm(dim=1).quantile(0.95) < 0.06
+
+
+def test_unseen_texels_take_colours_from_their_surroundings() -> None:
+    """The back of a person seen from the front: legs like legs, the chest like the chest; what is seen stays."""
+    points, normals = texels().points, texels().normals
+    seen = normals[:, 2].clamp_min(0)
+    rgb = torch.where((points[:, 1] > 0)[:, None], torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0]))
+    found = colours_nearby(texels(), rgb * (seen > 0)[:, None], seen)
+    assert torch.equal(found[seen > 0], rgb[seen > 0])
+    away = (seen == 0) & (points[:, 1].abs() > 0.15)
+    assert away.sum() > 100
+    assert ((found - rgb)[away].abs().amax(1) < 0.01).float().mean() > 0.99
+
+
+def test_few_or_no_seen_texels_are_enough() -> None:
+    rgb, none = torch.rand(len(texels()), 3), torch.zeros(len(texels()))
+    assert (colours_nearby(texels(), rgb, none) == 0.5).all()
+    one = none.clone()
+    one[7] = 1.0
+    torch.testing.assert_close(colours_nearby(texels(), rgb, one), rgb[7].expand_as(rgb))
+    assert torch.equal(colours_nearby(texels(), rgb, none + 1), rgb)
+
 
 SIZE = 96
 FRONT = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3.5], [0, 0, 0, 1]])
@@ -44,7 +87,7 @@ def sitter(poses: Tensor) -> CapturedPerson:
     view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
     frames = BodyFrames((0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1))
     capture = Capture(Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames})
-    return captured_person(capture, HumanModel(resolution=64, scaffold_heights=(0.0, 0.04)), body())
+    return captured_person(capture, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)), body())
 
 
 def arms_before_the_chest() -> Tensor:
@@ -57,15 +100,15 @@ def arms_before_the_chest() -> Tensor:
 
 
 def painted(colour_of: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-    """(256, 256, 3) texture by places (P, 3) of the T-pose and the joint (P,) that moves each."""
+    """(256, 256, 3) texture by positions (P, 3) of the T-pose and the joint (P,) that moves each."""
     uv, uv_faces = texture_coordinates(body())
     columns, rows = texel_coordinates(uv, 256)
     fragments = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], 256, 256)
     around = body().faces.numpy()[fragments.faces]
-    places = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
+    positions = interpolate(fragments.barycentric, body().vertices.double().numpy()[around])
     joints = interpolate(fragments.barycentric, body().weights.double().numpy()[around]).argmax(1)
     texture = np.full((256 * 256, 3), 0.5)
-    texture[fragments.index] = colour_of(places, joints)
+    texture[fragments.index] = colour_of(positions, joints)
     return texture.reshape(256, 256, 3)
 
 
@@ -125,7 +168,7 @@ def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
 
 def test_a_texel_has_the_colour_of_its_place() -> None:
     """A smooth colour over the body, from two sides; up to the light and half a pixel of its change."""
-    texture = painted(lambda places, _: 0.5 + 0.4 * np.sin(3 * places))
+    texture = painted(lambda positions, _: 0.5 + 0.4 * np.sin(3 * positions))
     aside = sitter(torch.zeros(55, 3))
     shown = [(image(torch.zeros(55, 3), texture, pose), posing(aside)) for pose in (FRONT, RIGHT)]
     maps = observe_texels(aside, shown)

@@ -1,4 +1,4 @@
-"""The synthetic person: visibility against brute-force ray casting, colours of known places, files and their reader."""
+"""The synthetic person: visibility against brute-force ray casting, known colours, files and their reader."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from dyngs.human.synthetic.capture import (
 from dyngs.human.synthetic.clips import squat, walk
 from dyngs.human.synthetic.clothes import dress_body, paint_texture, random_outfit
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 TINY = HumanOptions(size=24, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1)
 LIGHT = np.array([0.35, 0.75, 0.56]) / np.linalg.norm([0.35, 0.75, 0.56])
@@ -86,7 +86,7 @@ def pixels_of(world_from_cam: np.ndarray, points: np.ndarray, size: int) -> np.n
 
 
 def rays_of(world_from_cam: np.ndarray, size: int, samples: int) -> np.ndarray:
-    """((size samples)^2, 3) directions through the places of all pixels, row by row of these places."""
+    """((size samples)^2, 3) directions through the positions of all pixels, row by row of these positions."""
     n = size * samples
     x, y = np.meshgrid(*[((np.arange(n) + 0.5) / n - 0.5) * 2 * np.tan(0.5 * CAMERA_ANGLE_X)] * 2)
     return np.stack([x, -y, -np.ones_like(x)], axis=-1).reshape(-1, 3) @ world_from_cam[:3, :3].T
@@ -252,8 +252,8 @@ def test_another_seed_is_another_person_of_another_size(root: Path, tmp_path: Pa
     vertices = posed_vertices(exact, motion.poses.double(), motion.trans.double(), scale=motion.scale.double())
     for view in captured(other).splits["train"][:3]:
         is_person = pixels(view.image_path)[..., 3] == 255
-        places = seen_at(view, vertices[0].numpy())
-        for found, expected in zip(np.nonzero(is_person), places.T[::-1], strict=True):
+        positions = seen_at(view, vertices[0].numpy())
+        for found, expected in zip(np.nonzero(is_person), positions.T[::-1], strict=True):
             assert expected.min() - 0.5 <= found.min() + 0.5 <= expected.min() + 2  # pixels: centres are sampled
             assert expected.max() - 2 <= found.max() + 0.5 <= expected.max() + 0.5
     assert (pixels(root / "images/train/f000_c00.png") != pixels(other / "images/train/f000_c00.png")).any()
@@ -317,12 +317,12 @@ def test_the_parameters_pose_the_template_as_the_images_show_it(root: Path) -> N
             is_person = pixels(view.image_path)[..., 3] == 255
             column, row = seen_at(view, (exact.joints[0].numpy() + shift)[None])[0].astype(int)
             assert is_person[row, column]
-            places = seen_at(view, vertices)
+            positions = seen_at(view, vertices)
             rows_seen, columns_seen = np.nonzero(is_person)
-            for found, expected in ((columns_seen, places[:, 0]), (rows_seen, places[:, 1])):
+            for found, expected in ((columns_seen, positions[:, 0]), (rows_seen, positions[:, 1])):
                 assert expected.min() - 0.5 <= found.min() + 0.5 <= expected.min() + 2
                 assert expected.max() - 2 <= found.max() + 0.5 <= expected.max() + 0.5
-            hull = ConvexHull(places).equations
+            hull = ConvexHull(positions).equations
             centers = np.stack([columns_seen, rows_seen], axis=-1) + 0.5
             assert (centers @ hull[:, :2].T + hull[:, 2] <= 1e-9).all()
 

@@ -12,8 +12,8 @@ import torch
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.clips import random_clip, squat, walk
 from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 
 DANCE, OTHER = partial(random_clip, seed=1), partial(random_clip, seed=2)
 

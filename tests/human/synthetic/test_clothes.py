@@ -1,4 +1,4 @@
-"""Clothes of the synthetic person: colours of known places, and where the surface goes."""
+"""Clothes of the synthetic person: colours of known positions, and where the surface goes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 from dyngs.errors import DyngsError
 from dyngs.human.synthetic.clothes import Outfit, dress_body, paint_texture, random_outfit
 from dyngs.human.template.body import BodyTemplate
+from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.load import default_template
 from dyngs.human.template.mesh import vertex_normals
 
 
@@ -33,9 +33,9 @@ def test_the_texture_differs_by_seed_side_and_front() -> None:
     uv, uv_faces = body().uv, body().uv_faces
     assert uv is not None
     assert uv_faces is not None
-    places = np.zeros((len(vertices), 2))
-    places[body().faces.numpy().ravel()] = uv.numpy()[uv_faces.numpy().ravel()]
-    colors = texture()[((1 - places[:, 1]) * 512).astype(int), (places[:, 0] * 512).astype(int)]
+    positions = np.zeros((len(vertices), 2))
+    positions[body().faces.numpy().ravel()] = uv.numpy()[uv_faces.numpy().ravel()]
+    colors = texture()[((1 - positions[:, 1]) * 512).astype(int), (positions[:, 0] * 512).astype(int)]
     palm, sole = np.abs(vertices[:, 0]) > 0.83, vertices[:, 1] < -0.8
     for part in (palm, sole):
         left, right = (colors[part & (sign * vertices[:, 0] > 0)] for sign in (1, -1))

@@ -17,9 +17,9 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.atlas import Texels, atlas_texels, scaffold_points
+from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 
 NUM_JOINTS = 2
 
@@ -315,37 +315,6 @@ def test_squares_of_the_sizes_add_up_to_the_surface() -> None:
 
 
 # --- shells -----------------------------------------------------------------------------------------------------------
-
-
-def test_shells_are_displaced_by_exactly_their_height() -> None:
-    texels, heights = anny(64), (0.0, 0.01, 0.04)
-    places = scaffold_points(texels, heights)
-    count = len(texels)
-    assert len(places) == 3 * count
-    apart = (places.points(texels) - texels.points[places.texel]).double()
-    for k, height in enumerate(heights):
-        rows = slice(k * count, (k + 1) * count)
-        assert torch.equal(places.texel[rows], torch.arange(count))
-        assert places.height[rows].tolist() == pytest.approx([height] * count)
-        expected = height * texels.normals.double()
-        torch.testing.assert_close(apart[rows], expected, rtol=0, atol=2e-7)
-    assert torch.equal(places.points(texels)[:count], texels.points)
-
-
-def test_a_subset_of_places_stays_above_another_rest_shape() -> None:
-    texels = atlas_texels(square(), 4)
-    places = scaffold_points(texels, (0.0, 0.5)).select(torch.tensor([17, 3, 17]))
-    assert places.texel.tolist() == [1, 3, 1]
-    assert places.height.tolist() == [0.5, 0.0, 0.5]
-    raised = atlas_texels(square(), 4, vertices=square().vertices + torch.tensor([0.0, 0, 1]))
-    assert places.points(raised).tolist() == [[0.375, 0.875, 1.75], [0.875, 0.875, 1.25], [0.375, 0.875, 1.75]]
-    assert len(places.select(torch.tensor([True, False, True]))) == 2
-
-
-@pytest.mark.parametrize("heights", [(), (0.0, math.nan), (math.inf,)])
-def test_heights_are_numbers(heights: tuple[float, ...]) -> None:
-    with pytest.raises(DyngsError, match="one or more finite numbers"):
-        scaffold_points(atlas_texels(square(), 2), heights)
 
 
 # --- neighbours -------------------------------------------------------------------------------------------------------

@@ -7,15 +7,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
+from functools import lru_cache
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body import (
+    BONE_UNIT,
+    NUM_BONE_SHAPES,
+    SIDED,
+    BodyTemplate,
+    apply_shape,
+    bone_shapes,
+    posed_vertices,
+)
+from dyngs.human.template.body_reader import default_template
+from dyngs.human.template.joints import JOINT_NAMES
 
 LEFT_ELBOW, LEFT_WRIST, LEFT_FINGERS = 18, 20, range(25, 40)
 SIDES = {1: 2, 4: 5, 7: 8, 10: 11, 13: 14, 16: 17, 18: 19, 20: 21, 23: 24, **{i: i + 15 for i in range(25, 40)}}
@@ -259,3 +270,58 @@ def test_gradients(size: float) -> None:
 def test_parts_that_do_not_fit_each_other_are_refused(name: str, value: object) -> None:
     with pytest.raises(ValueError, match="must"):
         replace(tiny(), **{name: value})
+
+
+@lru_cache(maxsize=1)
+def bare_template() -> tuple[BodyTemplate, np.ndarray, np.ndarray]:
+    body = default_template()
+    arrays = (x.double().numpy() for x in (body.vertices, body.joints, body.weights))
+    vertices, joints, weights = arrays
+    return body, *bone_shapes(vertices, joints, body.parents, weights)
+
+
+def test_both_sides_move_as_mirror_images() -> None:
+    _, _, joints = bare_template()
+    for name in SIDED:
+        left, right = (joints[JOINT_NAMES.index(f"{side}_{name}")] for side in ("left", "right"))
+        assert np.array_equal(left * np.array([-1, 1, 1])[:, None], right)
+
+
+def test_a_bone_moves_all_that_is_below_it_and_nothing_else() -> None:
+    _, _, joints = bare_template()
+    knee = joints[:, :, 3 * SIDED.index("knee") + 1]
+    moved = {name for name, move in zip(JOINT_NAMES, knee, strict=True) if move.any()}
+    assert moved == {f"{side}_{name}" for side in ("left", "right") for name in ("knee", "ankle", "foot")}
+    assert knee[JOINT_NAMES.index("left_foot"), 1] == pytest.approx(BONE_UNIT)
+
+
+def test_the_pelvis_stays_where_it_is() -> None:
+    assert not bare_template()[2][0].any()
+
+
+def test_a_longer_shin_stretches_the_shin_and_carries_the_foot() -> None:
+    body, vertices, _ = bare_template()
+    ankle = vertices[:, 1, 3 * SIDED.index("ankle") + 1]
+    weights = body.weights.numpy()
+    foot, head, shin = (weights[:, JOINT_NAMES.index(name)] > 0.99 for name in ("left_foot", "head", "left_knee"))
+    assert ankle[foot] == pytest.approx(BONE_UNIT)
+    assert np.abs(ankle[head]).max() == 0
+    height = body.vertices.numpy()[shin, 1]
+    assert np.corrcoef(height, ankle[shin])[0, 1] < -0.99  # the lower, the more it moves
+
+
+def test_the_template_has_directions_of_shape_and_of_bones() -> None:
+    body, vertices, joints = bare_template()
+    assert body.shape_dirs is not None
+    assert body.joint_shape_dirs is not None
+    assert body.num_shapes == 10 + NUM_BONE_SHAPES
+    assert np.allclose(body.shape_dirs[..., 10:].numpy(), vertices, atol=1e-6)
+    assert np.allclose(body.joint_shape_dirs[..., 10:].numpy(), joints, atol=1e-6)
+
+
+def test_directions_of_shape_are_symmetric() -> None:
+    body, _, _ = bare_template()
+    assert body.joint_shape_dirs is not None
+    hips = (body.joint_shape_dirs[JOINT_NAMES.index(f"{side}_hip"), :, :10] for side in ("left", "right"))
+    left, right = (x.numpy() for x in hips)
+    assert np.allclose(left * np.array([-1, 1, 1])[:, None], right, atol=2e-5)

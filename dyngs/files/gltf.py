@@ -1,55 +1,45 @@
-"""The document of a glTF 2.0 file (``.glb``, ``.gltf``, ``.vrma``): nodes, skins, animations, numbers of accessors.
+"""glTF 2.0 (``.glb``, ``.gltf``, ``.vrma``): reader of untrusted documents and their numbers, writer of ``.glb``.
 
-Local letters: K elements of an accessor, D numbers of each.
+Only what meshes of points, skins and animations need is looked at. Local letters: K elements of an accessor, D numbers
+of each.
 """
 
 from __future__ import annotations
 
 import base64
 import binascii
+import json
+import struct
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PositiveInt, ValidationError
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, require_regular
 from dyngs.files.limits import require_at_most
 
-_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-
-
+_TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-
-
-_MOST_PARTS = 1 << 16
-"""Limit on nodes, accessors, channels and the like."""
-
-
+VERTICES, INDICES = 34962, 34963
+"""Uses of a buffer view in a mesh."""
 MOST_JOINTS = 4096
 """Limit on the joints of a skeleton."""
-
-
-_MOST_KEYS = 1 << 25
-"""Limit on the numbers of all curves: 100 joints with rotation, translation and scale in 30,000 keys."""
-
+_MOST_PARTS = 1 << 16
+"""Limit on nodes, accessors, channels and the like."""
+_MOST_DOCUMENT_BYTES = 1 << 24
+_MOST_NUMBERS = 1 << 25
+"""Limit on the numbers read of all accessors together, each of which may be named many times; a larger file may have
+four for each of its bytes. It is 100 joints with rotation, translation and scale in 30,000 keys."""
+_KEPT_NUMBERS = 1 << 20
+"""Numbers of an accessor up to which they are kept for the next time, as animations name the same times often."""
 
 _Number = Annotated[FiniteFloat, Field(ge=-1e9, le=1e9)]
-
-
 _Three = Annotated[tuple[_Number, ...], Field(min_length=3, max_length=3)]
-
-
 _Four = Annotated[tuple[_Number, ...], Field(min_length=4, max_length=4)]
-
-
 _Sixteen = Annotated[tuple[_Number, ...], Field(min_length=16, max_length=16)]
-
-
 _T = TypeVar("_T")
-
-
 _Parts = Annotated[tuple[_T, ...], Field(max_length=_MOST_PARTS)]
 
 
@@ -78,16 +68,31 @@ class _Accessor(_Part):
     type: str
     bufferView: NonNegativeInt | None = None
     byteOffset: NonNegativeInt = 0
+    normalized: bool = False
     sparse: object = None
 
 
 class Node(_Part):
     name: str = ""
     children: _Parts[NonNegativeInt] = ()
+    mesh: NonNegativeInt | None = None
     matrix: _Sixteen | None = None
     translation: _Three = (0.0, 0.0, 0.0)
     rotation: _Four = (0.0, 0.0, 0.0, 1.0)
     scale: _Three = (1.0, 1.0, 1.0)
+
+
+class _Scene(_Part):
+    nodes: _Parts[NonNegativeInt] = ()
+
+
+class Primitive(_Part):
+    attributes: dict[str, NonNegativeInt] = {}
+    extensions: dict[str, object] = {}
+
+
+class _Mesh(_Part):
+    primitives: _Parts[Primitive]
 
 
 class _Skin(_Part):
@@ -139,7 +144,10 @@ class _Asset(_Part):
 
 class _Document(_Part):
     asset: _Asset
+    scene: NonNegativeInt = 0
+    scenes: _Parts[_Scene] = ()
     nodes: _Parts[Node] = ()
+    meshes: _Parts[_Mesh] = ()
     skins: _Parts[_Skin] = ()
     animations: _Parts[Animation] = ()
     accessors: _Parts[_Accessor] = ()
@@ -149,7 +157,11 @@ class _Document(_Part):
 
 
 class GltfFile:
-    """The document of a file, and access to the numbers in its buffers."""
+    """The document of a file, and access to the numbers in its buffers.
+
+    Raises:
+        DyngsError: not glTF 2.0, or damaged.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -161,15 +173,15 @@ class GltfFile:
             where = ".".join(map(str, first["loc"])) or "JSON"
             raise self.error(f"{where}: {first['msg']:.100}; export it again") from None
         self._buffers: dict[str | None, bytes] = {}
-        self._read: dict[int, np.ndarray] = {}
-        self._keys = 0
+        self._kept: dict[tuple[int, type], np.ndarray] = {}
+        self._count = 0
 
     def error(self, problem: str) -> DyngsError:
         """Return the error to raise: one line that names the file."""
         return DyngsError(f"{self.path}: {problem}")
 
-    def numbers(self, index: int, kind: str) -> np.ndarray:
-        """Return the finite float64 numbers (K, D) of an accessor; integers, which only quaternions may be, unscaled.
+    def numbers(self, index: int, kind: str, dtype: type[np.floating] = np.float64) -> np.ndarray:
+        """Return the numbers (K, D) of an accessor, normalised integers in [-1, 1] or [0, 1]; NaN and infinities stay.
 
         Raises:
             DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
@@ -188,21 +200,23 @@ class GltfFile:
         if any("compression" in name for name in view.extensions):
             raise self.error(f"accessor {index} is compressed; export it without compression")
         data = memoryview(self._buffer(view.buffer))[view.byteOffset : view.byteOffset + view.byteLength]
-        dtype, width = np.dtype(_TYPES[accessor.componentType]), _WIDTHS[kind]
-        stride = view.byteStride or width * dtype.itemsize
-        needed = accessor.byteOffset + stride * (accessor.count - 1) + width * dtype.itemsize
+        stored, width = np.dtype("<" + _TYPES[accessor.componentType]), _WIDTHS[kind]
+        stride = view.byteStride or width * stored.itemsize
+        needed = accessor.byteOffset + stride * (accessor.count - 1) + width * stored.itemsize
         if len(data) < view.byteLength or len(data) < needed:
             raise self.error(f"accessor {index} lies outside its buffer; the file is cut off or broken")
-        self._keys += accessor.count * width
-        require_at_most(self.path, self._keys, _MOST_KEYS, "numbers of keys")
-        if index in self._read:
-            return self._read[index]
-        shape, strides = (accessor.count, width), (stride, dtype.itemsize)
-        with np.errstate(invalid="ignore"):  # NaN, which is refused below
-            values = np.ndarray(shape, dtype, data, accessor.byteOffset, strides).astype(np.float64)
-        if not (np.abs(values) < 1e9).all():
-            raise self.error(f"accessor {index} holds NaN or huge numbers; export it again")
-        self._read[index] = values
+        self._count += accessor.count * width
+        most = max(_MOST_NUMBERS, 4 * sum(map(len, self._buffers.values())))
+        require_at_most(self.path, self._count, most, "numbers")
+        if (index, dtype) in self._kept:
+            return self._kept[index, dtype]
+        found = np.ndarray((accessor.count, width), stored, data, accessor.byteOffset, (stride, stored.itemsize))
+        with np.errstate(invalid="ignore"):
+            values = found.astype(dtype)
+        if accessor.normalized and stored.kind in "iu":
+            values = np.maximum(values / np.iinfo(stored).max, -1)
+        if values.size <= _KEPT_NUMBERS:
+            self._kept[index, dtype] = values
         return values
 
     def _buffer(self, index: int) -> bytes:
@@ -235,8 +249,7 @@ class GltfFile:
 
 def _chunks(path: Path) -> tuple[bytes, bytes]:
     """Return the JSON chunk and the binary chunk of a ``.glb``; a ``.gltf`` is all JSON."""
-    if path.exists() and not path.is_file():
-        raise DyngsError(f"{path}: is not a file; name a .glb or a .gltf")
+    require_regular(path)
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -253,4 +266,64 @@ def _chunks(path: Path) -> tuple[bytes, bytes]:
         start += 8 + size
     if b"JSON" not in found:
         raise DyngsError(f"{path}: has no JSON chunk of glTF 2.0; export it again")
+    require_at_most(path, len(found[b"JSON"]), _MOST_DOCUMENT_BYTES, "bytes of JSON")
     return found[b"JSON"], found.get(b"BIN\0", b"")
+
+
+class GlbDocument:
+    """A glTF document to write, and its buffer.
+
+    Attributes:
+        json: the document; all parts but accessors, buffer views and buffers are added by the caller.
+    """
+
+    def __init__(self) -> None:
+        self.json: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dyngs"}}
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._data: list[bytes | np.ndarray] = []
+        self._size = 0
+
+    def add_numbers(self, values: np.ndarray, use: int | None = None, limits: bool = False) -> int:
+        """Add an accessor of (K, D) or (K,) numbers; return its index.
+
+        Args:
+            values: float32, uint8, uint16 or uint32, which stay as they are until the file is written; rows of several
+                numbers take a multiple of four bytes.
+            use: ``VERTICES`` or ``INDICES`` for those of a mesh.
+            limits: whether the smallest and the largest number of each column are stated.
+        """
+        rows = values.reshape(len(values), -1)
+        component = next(number for number, name in _TYPES.items() if name == f"{rows.dtype.kind}{rows.itemsize}")
+        accessor: dict[str, Any] = {"bufferView": self._add(rows, rows.nbytes, use), "componentType": component}
+        accessor |= {"count": len(rows), "type": {width: name for name, width in _WIDTHS.items()}[rows.shape[1]]}
+        if limits:
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def add_bytes(self, content: bytes) -> int:
+        """Add a buffer view; return its index."""
+        return self._add(content, len(content), None)
+
+    def _add(self, content: bytes | np.ndarray, size: int, use: int | None) -> int:
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": size}
+        self._views.append(view if use is None else view | {"target": use})
+        self._data.append(content)
+        self._size += size + -size % 4
+        return len(self._views) - 1
+
+    def write(self, path: Path) -> None:
+        """Write the file, not atomically."""
+        buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._size}]}
+        text = json.dumps(self.json | buffers, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        with open(path, "wb") as out:
+            out.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + self._size))
+            out.write(struct.pack("<I4s", len(text), b"JSON") + text)
+            out.write(struct.pack("<I4s", self._size, b"BIN\0"))
+            for part in self._data:
+                content = (
+                    part if isinstance(part, bytes) else part.astype(part.dtype.newbyteorder("<"), copy=False).tobytes()
+                )
+                out.write(content + b"\0" * (-len(content) % 4))

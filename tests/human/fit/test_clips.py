@@ -12,15 +12,13 @@ import torch
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.human.fit.capture_fit import RESOLUTION, Candidate, CaptureFit, FitEffort
-from dyngs.human.fit.clips import fitted_clips
-from dyngs.human.fit.new_clip import placed_clip
-from dyngs.human.fit.result import body_fit
-from dyngs.human.fit.solve import new_fit
-from dyngs.human.fit.surface import surface_of
-from dyngs.human.motion.captured import captured_motion
+from dyngs.human.fit.capture_fit import RESOLUTION, CaptureFit, FitEffort, TriedFit
+from dyngs.human.fit.clips import fitted_clips, placed_clip
+from dyngs.human.fit.silhouettes import surface_of
+from dyngs.human.fit.solve import body_fit, new_fit
+from dyngs.human.motion.clip import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.load import default_template
+from dyngs.human.template.body_reader import default_template
 
 OPTIONS = HumanOptions(size=96, num_frames=2, num_new=2, num_cameras=4, num_test=4, seed=0, samples=1)
 EFFORT = FitEffort(side=64, steps=40)
@@ -38,8 +36,8 @@ def as_given(capture: Capture) -> CaptureFit:
     assert capture.body is not None
     motion = captured_motion(capture.root, capture.body["train"], capture.splits["train"], body.joints)
     learned = new_fit(motion.clip, surface_of(body, RESOLUTION))
-    candidate = Candidate("the poses as given", learned, 0.9, (0.9, 0.9))
-    return CaptureFit(body_fit(learned, 55), motion, candidate, (candidate,), 0, from_silhouettes=False)
+    candidate = TriedFit("the poses as given", learned, 0.9, (0.9, 0.9))
+    return CaptureFit(body_fit(learned, 55), motion, candidate, (candidate,), 0)
 
 
 def moved(capture: Capture, away: np.ndarray) -> Capture:

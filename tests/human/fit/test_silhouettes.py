@@ -1,11 +1,13 @@
 """Squares around the person: the same person, seen by cameras that fit the squares."""
 
+from __future__ import annotations
+
 import pytest
 import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human.fit.observed import longest_box_side, observed_frame
+from dyngs.human.fit.silhouettes import longest_box_side, observed_frame
 
 
 def image(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Image:

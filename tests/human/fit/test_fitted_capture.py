@@ -1,5 +1,7 @@
 """The fit before training: when it runs, and that it runs once."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +10,8 @@ import pytest
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.human.fit import before_training
-from dyngs.human.fit.before_training import with_fitted_body
-from dyngs.human.fit.fitted_capture import write_fitted_capture
+from dyngs.human.fit import fitted_capture
+from dyngs.human.fit.fitted_capture import with_fitted_body, write_fitted_capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 
@@ -70,10 +71,10 @@ def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path
 
 def test_without_silhouettes_poses_are_taken_as_given(data: DataConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = read_capture(data).replace(has_alpha=False)
-    monkeypatch.setattr(before_training, "read_capture", lambda _: capture)
+    monkeypatch.setattr(fitted_capture, "read_capture", lambda _: capture)
     said: list[str] = []
     assert with_fitted_body(data, say=said.append) == data
     assert "taken as given" in said[0]
-    monkeypatch.setattr(before_training, "read_capture", lambda _: capture.replace(body=None))
+    monkeypatch.setattr(fitted_capture, "read_capture", lambda _: capture.replace(body=None))
     with pytest.raises(DyngsError, match="neither silhouettes nor body parameters"):
         with_fitted_body(data)
