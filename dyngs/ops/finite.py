@@ -9,21 +9,17 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import has_kernel, register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import has_kernel, launch, register
 
 
 def _count_nonfinite(x: Tensor) -> Tensor:
     count = x.new_zeros(1, dtype=torch.int32)
-    core_for(x).count_nonfinite(array(x), array(count), num_threads())
+    launch(x, "count_nonfinite", x, count, num_threads())
     return count[0].long()
 
 
-def _fake_count_nonfinite(x: Tensor) -> Tensor:
-    return x.new_empty((), dtype=torch.int64)
-
-
-count_nonfinite_op = register("count_nonfinite", _count_nonfinite, fake=_fake_count_nonfinite)
+count_nonfinite_op = register("count_nonfinite", _count_nonfinite)
 
 
 def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:

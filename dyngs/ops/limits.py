@@ -6,6 +6,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import core
+from dyngs.ops.registration import shapes_only
 
 MAX_SIDE: int = core.MAX_SIDE
 """px; float32 has no pixel centres beyond 2^23"""
@@ -34,7 +35,7 @@ def check_memory(size: int, what: str, like: Tensor) -> None:
     Raises:
         DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
     """
-    if size <= UNASKED or like.device.type != "cpu":
+    if shapes_only() or like.device.type != "cpu" or size <= UNASKED:
         return
     available = core.available_memory()
     if size > available:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from dyngs.ops.native import array, core_for, num_threads, writable
-from dyngs.ops.registration import register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import InPlace, launch, register
 
 
 def _add_offsets(
@@ -23,36 +23,13 @@ def _add_offsets(
     by_logit_opacities: Tensor | None,
     by_colors: Tensor | None,
 ) -> None:
+    gaussians = [InPlace(x) for x in (means, quats, log_scales, logit_opacities, sh)]
     offsets = (by_means, by_quats, by_log_scales, by_logit_opacities, by_colors)
-    core_for(means).add_offsets(
-        tuple(writable(x) for x in (means, quats, log_scales, logit_opacities, sh)),
-        None if rows is None else array(rows),
-        tuple(None if x is None else array(x) for x in offsets),
-        num_threads(),
-    )
-
-
-def _fake_add_offsets(
-    means: Tensor,
-    quats: Tensor,
-    log_scales: Tensor,
-    logit_opacities: Tensor,
-    sh: Tensor,
-    rows: Tensor | None,
-    by_means: Tensor,
-    by_quats: Tensor | None,
-    by_log_scales: Tensor | None,
-    by_logit_opacities: Tensor | None,
-    by_colors: Tensor | None,
-) -> None:
-    return None
+    launch(means, "add_offsets", gaussians, rows, offsets, num_threads())
 
 
 add_offsets_op = register(
-    "add_offsets_",
-    _add_offsets,
-    fake=_fake_add_offsets,
-    mutates=("means", "quats", "log_scales", "logit_opacities", "sh"),
+    "add_offsets_", _add_offsets, mutates=("means", "quats", "log_scales", "logit_opacities", "sh")
 )
 
 

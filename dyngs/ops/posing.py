@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, launch, register
 
 _KEPT = 12
 """Numbers per Gaussian that the forward pass keeps for the backward pass."""
@@ -24,17 +24,11 @@ _Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def _posing(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> _Results:
-    results = _fake_posing(means, quats, log_scales, weights, transforms)
-    *moved, blended, kept = results
-    rest = _arrays([means, quats, log_scales])
-    given = (rest, array(weights), array(transforms))
-    core_for(means).pose_forward(*given, _arrays(moved), array(blended), array(kept), num_threads())
-    return results
-
-
-def _fake_posing(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> _Results:
-    moved = (means.new_empty(means.shape), quats.new_empty(quats.shape), log_scales.new_empty(log_scales.shape))
-    return (*moved, transforms.new_empty(len(means), 3, 4), means.new_empty(len(means), _KEPT))
+    moved = means.new_empty(means.shape), quats.new_empty(quats.shape), log_scales.new_empty(log_scales.shape)
+    blended, kept = transforms.new_empty(means.shape[0], 3, 4), means.new_empty(means.shape[0], _KEPT)
+    rest = means, quats, log_scales
+    launch(means, "pose_forward", rest, weights, transforms, moved, blended, kept, num_threads())
+    return *moved, blended, kept
 
 
 def _posing_backward(
@@ -46,38 +40,16 @@ def _posing_backward(
     g_blended: Tensor | None,
     with_weights: bool,
 ) -> _Results:
-    found = _fake_posing_backward(rest, weights, transforms, posed, grads, g_blended, with_weights)
-    *by_rest, by_weights, by_transforms = found
-    *moved, blended, kept = posed
-    core_for(weights).pose_backward(
-        *(_arrays(rest), array(weights), array(transforms)),
-        (_arrays(moved), array(blended), array(kept)),
-        *(_arrays(grads), None if g_blended is None else array(g_blended)),
-        *(_arrays(by_rest), array(by_weights) if with_weights else None, array(by_transforms)),
-        num_threads(),
-    )
-    return found
-
-
-def _fake_posing_backward(
-    rest: list[Tensor],
-    weights: Tensor,
-    transforms: Tensor,
-    posed: list[Tensor],
-    grads: list[Tensor],
-    g_blended: Tensor | None,
-    with_weights: bool,
-) -> _Results:
-    means, quats, log_scales = (x.new_empty(x.shape) for x in rest)
+    means, quats, log_scales = by_rest = [x.new_empty(x.shape) for x in rest]
     by_weights = weights.new_empty(weights.shape if with_weights else (0,))
-    return means, quats, log_scales, by_weights, transforms.new_empty(transforms.shape)
+    by_transforms = transforms.new_empty(transforms.shape)
+    given = rest, weights, transforms, (posed[:3], *posed[3:]), grads, g_blended
+    results = by_rest, by_weights if with_weights else None, by_transforms
+    launch(weights, "pose_backward", *given, *results, num_threads())
+    return means, quats, log_scales, by_weights, by_transforms
 
 
-def _arrays(tensors: list[Tensor]) -> tuple[object, ...]:
-    return tuple(array(x) for x in tensors)
-
-
-posing_backward_op = register("posing_backward", _posing_backward, fake=_fake_posing_backward)
+posing_backward_op = register("posing_backward", _posing_backward)
 """Gradients by means, quaternions and log scales at rest, by the weights, empty unless asked for, and by transforms;
 ``posed`` is what ``posing_op`` returned, ``grads`` are the gradients by the first three of it."""
 
@@ -99,7 +71,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     return (*by_rest, by_weights if with_weights else None, by_transforms)
 
 
-posing_op = register("posing", _posing, fake=_fake_posing, gradient=Gradient(_save, _backward))
+posing_op = register("posing", _posing, gradient=Gradient(_save, _backward))
 """Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs (N, 12)."""
 
 

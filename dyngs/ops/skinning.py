@@ -12,58 +12,37 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, launch, register
 
 
 def _skinning(
     points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    offset, blended, weights = _fake_skinning(points, positions, radii, followed, motion, values)
-    nodes = tuple(array(x) for x in (positions, radii, motion, values))
-    outputs = (array(x) for x in (offset, blended, weights))
+    count, nodes = points.shape[0], (positions, radii, motion, values)
+    results = points.new_empty(count, 3), points.new_empty(count, values.shape[1]), points.new_empty(followed.shape)
     try:
-        core_for(points).skinning_forward(nodes, (array(points), array(followed)), *outputs, num_threads())
+        launch(points, "skinning_forward", nodes, (points, followed), *results, num_threads())
     except IndexError:
         raise DyngsError(
             f"blend_skinning: followed must be in [0, {len(positions)}), the nodes there are, "
             f"got {int(followed.min())} to {int(followed.max())}"
         ) from None
-    return offset, blended, weights
-
-
-def _fake_skinning(
-    points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    count = len(points)
-    return points.new_empty(count, 3), points.new_empty(count, values.shape[1]), points.new_empty(followed.shape)
+    return results
 
 
 def _skinning_backward(
     nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    g_points, g_motion, g_values = _fake_skinning_backward(nodes, points, followed, weights, grads, with_points)
-    core_for(points).skinning_backward(
-        tuple(array(x) for x in nodes),
-        (array(points), array(followed)),
-        tuple(array(x) for x in (*grads, weights)),
-        array(g_points) if with_points else None,
-        array(g_motion),
-        array(g_values),
-        num_threads(),
-    )
+    _, _, motion, values = nodes
+    g_points = points.new_empty(points.shape if with_points else (0,))
+    g_motion, g_values = points.new_empty(motion.shape), points.new_empty(values.shape)
+    results = g_points if with_points else None, g_motion, g_values
+    launch(points, "skinning_backward", nodes, (points, followed), (*grads, weights), *results, num_threads())
     return g_points, g_motion, g_values
 
 
-def _fake_skinning_backward(
-    nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    _, _, motion, values = nodes
-    g_points = points.new_empty(points.shape if with_points else (0,))
-    return g_points, points.new_empty(motion.shape), points.new_empty(values.shape)
-
-
-skinning_backward_op = register("skinning_backward", _skinning_backward, fake=_fake_skinning_backward)
+skinning_backward_op = register("skinning_backward", _skinning_backward)
 """Gradients by the points, empty unless asked for, and by motion and values of the nodes; ``nodes`` are positions,
 radii, motion and values, ``grads`` those by offsets and blended values."""
 
@@ -83,7 +62,7 @@ def _backward(ctx: Any, g_offset: Tensor, g_blended: Tensor, _: Tensor | None) -
     return g_points if with_points else None, None, None, None, g_motion, g_values
 
 
-skinning_op = register("skinning", _skinning, fake=_fake_skinning, gradient=Gradient(_save, _backward))
+skinning_op = register("skinning", _skinning, gradient=Gradient(_save, _backward))
 """Offsets (M, 3), blended values (M, D), and the weights (M, B) of the nodes."""
 
 
