@@ -20,7 +20,7 @@ from dyngs.budget.run import LimitedRun, stage
 from dyngs.config import Config
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.errors import DyngsError
-from dyngs.evaluate.temporal import Drawing
+from dyngs.evaluate.drawing import Drawing
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.metrics import flip, ssim
 from dyngs.ops.device import finish

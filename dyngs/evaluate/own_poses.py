@@ -18,7 +18,7 @@ import torch
 
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
-from dyngs.evaluate.temporal import Drawing
+from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.view_scores import PoseScores, means_of, score_views
 from dyngs.human.avatar.pose_comparison import IMAGES, SILHOUETTES, Comparison
 from dyngs.human.avatar.pose_fit import fitted_to_images

@@ -18,9 +18,10 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
+from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.own_poses import PoseRefinement, images_of_split, scores_from_own_poses
 from dyngs.evaluate.regions import RegionName, Regions
-from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
+from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, mean_of, means_of, score_views
 from dyngs.files.write import write_text
