@@ -58,11 +58,12 @@ from dyngs.runs.folder import (
 from dyngs.runs.lock import writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
+from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.extend import told, with_length
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible, shared
-from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.loop import Loop
 from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
