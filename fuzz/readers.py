@@ -279,9 +279,10 @@ def read_a_point(root: Path) -> object:
 
 def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
+    from dyngs.tradeoff.requirements import parse_requirements
+
     from dyngs.data.frame_selection import parse_frames
     from dyngs.output.camera_paths import parse_times
-    from dyngs.tradeoff.requirements import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.errors import DyngsError, printable, reading, reason, require_regular
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import read_json_object
 from dyngs.files.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
 from dyngs.storage.file import read_scene

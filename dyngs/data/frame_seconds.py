@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dyngs.errors import DyngsError
-from dyngs.files.fields import is_number
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import is_number, read_json_object
 from dyngs.files.write import write_text
 
 NAME = "times.json"

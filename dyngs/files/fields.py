@@ -1,17 +1,40 @@
-"""Checks of values in dictionaries from files: required keys, numbers, matrices."""
+"""JSON files and checks of values in dictionaries from files: required keys, numbers, matrices."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import inside
 
 LARGEST = 1e30
 """Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
+
+
+def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
+    """Read the JSON object in ``path``; a byte order mark is allowed.
+
+    Args:
+        what: text of the error for a file that holds anything else than an object.
+
+    Raises:
+        DyngsError: unreadable, broken JSON (with line and column), or no object.
+    """
+    with reading(path, "it must be a JSON file; copy or export it again"):
+        try:
+            fields = json.loads(inside(path).read_text(encoding="utf-8-sig"))
+        except json.JSONDecodeError as error:
+            where = f"{path}, line {error.lineno} column {error.colno}"
+            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{path}: {what}")
+    return fields
 
 
 def is_number(value: object) -> TypeGuard[int | float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,16 +18,12 @@ from dyngs.runs.log import LOG_NAME
 
 EXPORT_FOLDER = "export"
 """In a run folder: the run as one .dyngs file of at most ``budget.max_mb``."""
-FORMER_EXPORT_FOLDER = "small"
-"""Name of ``EXPORT_FOLDER`` in runs of earlier versions; nothing is written there."""
 STILL_FOLDER = "still"
 """In the folder of a run of a moving scene: the run of the static model that it is compared with."""
 ASKED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
 _BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER, BODY_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
-_OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
-"""Names of half-written checkpoints of earlier versions and of the library that wrote them."""
 
 
 def default_folder(name: str) -> Path:
@@ -243,20 +238,15 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
     """
     ours = set(_BEGUN)
     remove_leftovers(folder, ours.__contains__ if sole_writer else None)
-    checkpoints = folder / "checkpoints"
-    for inner in (checkpoints, folder / EXPORT_FOLDER, folder / FORMER_EXPORT_FOLDER):
+    for inner in (folder / "checkpoints", folder / EXPORT_FOLDER):
         if not inner.is_symlink():
             remove_leftovers(inner, (lambda _: True) if sole_writer else None)
-    if sole_writer and not checkpoints.is_symlink():
-        for path in checkpoints.glob(".*"):
-            if _OLD_LEFTOVER.fullmatch(path.name):
-                remove_quietly(path)
 
 
 def _found(folder: Path) -> list[str]:
     """Return the names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
     metrics = sorted(path.name for path in folder.glob("metrics*.json"))
-    names = [SCENE_FILE, EXPORT_FOLDER, FORMER_EXPORT_FOLDER, *metrics, *_BEGUN]
+    names = [SCENE_FILE, EXPORT_FOLDER, *metrics, *_BEGUN]
     found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
     checkpoints = folder / "checkpoints"
     is_taken = not checkpoints.is_dir() and (checkpoints.exists() or checkpoints.is_symlink())

@@ -17,7 +17,7 @@ from dyngs.data.geometry.poses import matrix_fault, pose_fault
 from dyngs.data.images.images import SUFFIXES, read_header, read_image
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import staying_within
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import read_json_object
 
 
 def problems_of(capture: Capture, deep: bool) -> list[str]:

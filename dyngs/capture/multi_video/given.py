@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dyngs.errors import DyngsError
-from dyngs.files.fields import first_few, is_number
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import first_few, is_number, read_json_object
 
 NAME = "videos.json"
 MAX_SECONDS = 86_400.0

@@ -17,8 +17,7 @@ from dyngs.data.readers.shared.camera_sequences import (
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import MAX_FPS
 from dyngs.errors import DyngsError
-from dyngs.files.fields import first_few, is_number, matrix_of
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import first_few, is_number, matrix_of, read_json_object
 
 CALIBRATION = "cameras.json"
 

@@ -14,8 +14,7 @@ from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
-from dyngs.files.fields import is_number
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import is_number, read_json_object
 from dyngs.files.numpy_files import read_npy
 
 

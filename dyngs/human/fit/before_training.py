@@ -11,7 +11,7 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
-from dyngs.files.cache import cache_folder
+from dyngs.files.temporary import cache_folder
 from dyngs.human.fit.fitted_capture import write_fit
 from dyngs.human.fit.inputs import FitInputs
 

@@ -16,8 +16,7 @@ from dyngs.data.geometry.intrinsics import MAX_SIDE, match_size, pinhole_matrix,
 from dyngs.data.geometry.poses import cam_from_opengl, checked_pose, repair_warning
 from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
 from dyngs.errors import DyngsError
-from dyngs.files.fields import is_number, matrix_of
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import is_number, matrix_of, read_json_object
 
 MAX_FPS = 1e6
 """Higher frame rates are taken for mistakes."""
