@@ -23,8 +23,8 @@ from dyngs.config import Config, DataConfig
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.report import split_views
+from dyngs.evaluate.view_scores import right_half_scores
 from dyngs.files.write import write_image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.gaussians.scene import render_options

@@ -27,8 +27,7 @@ from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.ops.device import deterministic, device_for
-from dyngs.ops.memory import keep_freed_memory
+from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
 from dyngs.prune.stage import PruneStage

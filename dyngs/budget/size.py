@@ -14,7 +14,7 @@ from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
 from dyngs.ops.device import CPU
-from dyngs.prune.selection import highest
+from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores, probe_images, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config

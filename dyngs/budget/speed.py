@@ -24,7 +24,7 @@ from dyngs.evaluate.drawing import Drawing
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.metrics import flip, ssim
 from dyngs.ops.device import finish
-from dyngs.prune.selection import highest
+from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores, training_quality
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE

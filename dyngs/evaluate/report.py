@@ -76,7 +76,7 @@ class EvalReport:
             ``dyngs.evaluate.regions``.
         moving_from: how it was found what moves, None where it was not.
         psnr_right, psnr_right_fitted: means of the PSNR of right halves, as the scene shows them, and after an affine
-            colour fitted on left halves, see ``dyngs.evaluate.half_fit``; None where a half has no pixel that counts.
+            colour fitted on left halves, see ``view_scores``; None where a half has no pixel that counts.
         track_error_px, track_within_5px, track_motion_px: see ``dyngs.evaluate.tracks``.
         psnr_own_poses: PSNR from poses refined on the images themselves, of cameras (``dyngs.evaluate.own_poses``)
             or of the body (``dyngs.human.avatar.pose_fit``); None where that was not asked for.

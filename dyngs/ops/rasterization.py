@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.limits import REMEDY, check_memory, check_size
+from dyngs.ops.checks import REMEDY, check_memory, check_number, check_size
 from dyngs.ops.native import num_threads
-from dyngs.ops.options import check_number
 from dyngs.ops.projection import Projection
 from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register
 

@@ -24,8 +24,7 @@ from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.metrics import psnr
 from dyngs.ops.transfer import sent
-from dyngs.prune.score import Importance, ScoringViews, importance
-from dyngs.prune.selection import highest
+from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.static.fixed import FixedDensifier
 from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
