@@ -206,10 +206,12 @@ def right_half_scores(image: Image, rendering: Rendering, background: Tensor) ->
     return HalfScores(psnr(rendering.rgb[0], truth, weights[1]), psnr(fitted, truth, weights[1]))
 
 
-def means_of(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the means of the metrics that exist for poses as given and for fitted ones."""
-    names = "psnr ssim lpips psnr_person ssim_person psnr_black ssim_black lpips_black"
-    return {name: mean_of([getattr(score, name) for score in scores]) for name in names.split()}
+_OF_POSES = ("psnr", "ssim", "lpips", "psnr_person", "ssim_person", "psnr_black", "ssim_black", "lpips_black")
+
+
+def means_of(scores: Sequence[ViewScore], names: Sequence[str] = _OF_POSES) -> dict[str, Any]:
+    """Return the means of metrics; by default those that exist for poses of the capture and for fitted ones."""
+    return {name: mean_of([getattr(score, name) for score in scores]) for name in names}
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
