@@ -66,12 +66,7 @@ class Cost:
 
 
 class CostMeter:
-    """Listener that measures what steps cost.
-
-    Args:
-        run: what is measured.
-        steps: of the whole run.
-    """
+    """Listener that measures what steps cost."""
 
     def __init__(self, run: LimitedRun, steps: int) -> None:
         self.run, self.steps, self.first = run, steps, run.trainer.num_gaussians

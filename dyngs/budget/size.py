@@ -90,9 +90,6 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
         trainer: at the end of its run; it is left as it is.
         run_dir: of the run.
         megabytes: 1e6 bytes.
-
-    Raises:
-        DyngsError: no way that was tried fits; the run itself is complete.
     """
     whole, scene, config = trainer.checkpoint(), trainer.scene.to(CPU), trainer.config  # files are made on the CPU
     images = probe_images(trainer)

@@ -86,22 +86,13 @@ class Measured:
 
 
 class SpeedLimit:
-    """Listener that keeps drawing fast enough.
-
-    Args:
-        run: what is limited.
-        fps: training views per second that it owes.
-    """
+    """Listener that keeps drawing fast enough."""
 
     def __init__(self, run: LimitedRun, fps: float) -> None:
         self.run, self.fps, self.found = run, fps, Measured()
 
     def begin(self) -> None:
-        """Measure what is possible, unless a checkpoint says it, and let the trainer add no more Gaussians than that.
-
-        Raises:
-            DyngsError: even a few Gaussians take too long; says what is possible.
-        """
+        """Measure what is possible, unless a checkpoint says it; the trainer may add no more Gaussians than that."""
         found, trainer = self.found, self.run.trainer
         if not found.base:
             scene = _few(trainer)

@@ -48,13 +48,7 @@ class Cost:
 
 
 def compared(folders: Sequence[Path], threads: int, device: torch.device = CPU) -> list[Cost]:
-    """Return the costs of runs on one capture; images are drawn in turn, so that machine load affects all.
-
-    Args:
-        folders: of runs, or of files that were exported from them; the capture is that of the first.
-        threads: to draw with.
-        device: draws.
-    """
+    """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all alike."""
     runs = [load_run(folder) for folder in folders]
     capture = read_capture(runs[0].config.data)
     has_test = bool(capture.splits.get("test"))

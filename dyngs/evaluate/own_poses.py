@@ -45,14 +45,7 @@ class PoseRefinement:
 
 
 def scores_from_own_poses(drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips) -> PoseRefinement:
-    """Return the scores of images from poses that were fitted to them; the scene stays as it is.
-
-    Args:
-        drawing: of the scene.
-        images: of a split.
-        size: of the scene, world units.
-        lpips: from ``load_lpips``.
-    """
+    """Return the scores of images from poses that were fitted to them; the scene stays as it is."""
     avatar = avatar_of(drawing.scene)
     if avatar is None:
         return PoseRefinement(psnr_from_own_poses(drawing, images, size))
@@ -73,13 +66,7 @@ def _person_scores(
 
 
 def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
-    """Return the mean PSNR, dB, of images from poses that were fitted to them; the scene stays as it is.
-
-    Args:
-        drawing: of the scene.
-        images: of a split.
-        size: of the scene, world units.
-    """
+    """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in world units."""
     scene, options, background = drawing.scene, drawing.options, drawing.background
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
@@ -95,9 +82,6 @@ def images_of_split(capture: Capture, views: Sequence[View], run_dir: Path, run:
 
     Images that were not trained on have the lens that they share with others, and the pose of a camera that stands
     still; all other poses are those of the capture.
-
-    Raises:
-        DyngsError: unreadable images, or a checkpoint of other views.
     """
     images = ImageLoader(views, run.config.data)
     found = found_corrections(run_dir, run, capture.splits["train"])

@@ -71,12 +71,7 @@ class Regions:
         self._has_alpha = False
 
     def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> RegionScores:
-        """Return the PSNR of a view's regions.
-
-        Args:
-            image: of the view.
-            rendered, truth: (H, W, 3) on the same background.
-        """
+        """Return the PSNR of a view's regions."""
         foreground, moves = foreground_of(image), self.moving(image)
         self._has_alpha |= foreground is not None
         inside = torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground

@@ -134,10 +134,6 @@ def evaluate_run(
         refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
             images themselves; always done for a run that refined its cameras.
         device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
-
-    Raises:
-        DyngsError: no such run or split, unreadable images, a render or metric that is not finite, unwritable folder,
-            poses of training views that are to be refined, no GPU that can be used.
     """
     draws_on = device_for(device)
     _require_untrained(run_dir, split, refine_poses)

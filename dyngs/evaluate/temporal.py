@@ -41,11 +41,7 @@ class TimeScore:
 
 
 def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Return ``times`` within [0, 1], and a line of warning where one was not.
-
-    Raises:
-        DyngsError: a time that is not finite.
-    """
+    """Return ``times`` within [0, 1], and a line of warning where one was not."""
     if not all(math.isfinite(t) for t in times):
         raise DyngsError(f"times must be finite numbers in [0, 1], got {', '.join(f'{t:g}' for t in times)}")
     inside = tuple(min(max(float(t), 0.0), 1.0) for t in times)
@@ -96,11 +92,6 @@ def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) 
 
     Over all neighbours in time of each pose that has several times; a mask leaves out what does not count in one of
     the two. Something that should move but does not has it, as has everything that flickers.
-
-    Args:
-        drawing: what is drawn.
-        loader: images of ``views``, in their order.
-        views: one split.
     """
     if all(view.time is None for view in views):
         return MetricValue(None, _NO_TIMES)

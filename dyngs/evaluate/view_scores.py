@@ -114,9 +114,6 @@ def score_views(
         background: (3,) colour behind both the truth and the render.
         lpips: from ``load_lpips``.
         regions: of the split of the images; None: they are not measured.
-
-    Raises:
-        DyngsError: a value that is not finite, naming the view.
     """
     scores: list[ViewScore] = []
     reasons: dict[str, str] = {}
@@ -159,14 +156,7 @@ def score_views(
 
 
 def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips: Lpips) -> dict[str, float | None]:
-    """Return the scores by their names in ``ViewScore``; none where nobody is to be seen.
-
-    Args:
-        image: the truth.
-        rendering: of its one view.
-        background: (3,) behind both.
-        lpips: from ``load_lpips``.
-    """
+    """Return the scores by their names in ``ViewScore``; none where nobody is to be seen."""
     box = person_box(image)
     if box is None:
         return {}
@@ -188,13 +178,7 @@ def person_box(image: Image) -> tuple[slice, slice] | None:
 
 
 def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> HalfScores:
-    """Return the scores of the right half of an image.
-
-    Args:
-        image: the truth.
-        rendering: of its one view.
-        background: (3,) behind both.
-    """
+    """Return the scores of the right half of an image."""
     truth = image.composite(background)
     left = torch.zeros_like(truth[..., 0])
     left[:, : left.shape[1] // 2] = 1

@@ -22,9 +22,6 @@ def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict
 
     Args:
         what: text of the error for a file that holds anything else than an object.
-
-    Raises:
-        DyngsError: unreadable, broken JSON (with line and column), or no object.
     """
     with reading(path, "it must be a JSON file; copy or export it again"):
         try:
@@ -43,11 +40,7 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 
 def matrix_of(where: str, key: str, value: object) -> np.ndarray:
-    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not checked.
-
-    Raises:
-        DyngsError: other things than numbers; ``where`` and ``key`` say which.
-    """
+    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not checked."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -55,11 +48,7 @@ def matrix_of(where: str, key: str, value: object) -> np.ndarray:
 
 
 def entry(where: object, fields: object, key: str) -> Any:
-    """Return ``fields[key]`` of a dictionary from a file.
-
-    Raises:
-        DyngsError: it is no dictionary or lacks the key; ``where`` says which file.
-    """
+    """Return ``fields[key]`` of a dictionary from a file."""
     if not isinstance(fields, dict):
         raise DyngsError(f"{where}: must be a dictionary with the key '{key}'; export it again")
     if key not in fields:
@@ -68,11 +57,7 @@ def entry(where: object, fields: object, key: str) -> Any:
 
 
 def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
-    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the file may differ.
-
-    Raises:
-        DyngsError: no numbers, or another number of them; ``where`` says which file.
-    """
+    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the file may differ."""
     array = float_array(value)
     fits = array is not None and (shape is None or array.size == math.prod(shape))
     if array is None or not fits or not (np.abs(array) <= LARGEST).all():

@@ -49,11 +49,7 @@ def read_pickle(path: Path) -> object:
 
 
 def read_pickled_array(path: Path) -> object:
-    """Read the Python object that ``numpy.save`` wrapped into a 0-dimensional array, as ``read_pickle`` does.
-
-    Raises:
-        DyngsError: the file is missing or damaged, or holds something else.
-    """
+    """Read the Python object that ``numpy.save`` wrapped into a 0-dimensional array, as ``read_pickle`` does."""
     array = _unpickled(path, is_array=True)
     if not isinstance(array, np.ndarray) or array.shape != () or array.dtype.kind != "O":
         raise DyngsError(f"{path}: must hold one dictionary, saved with numpy.save; export it again")
@@ -85,13 +81,7 @@ def _skip_array_header(file: BinaryIO) -> None:
 
 
 class Unpickler:
-    """State of reading one pickle from the position of ``file``.
-
-    Args:
-        path: file name, for messages.
-        file: binary file.
-        size: size of the file in bytes.
-    """
+    """State of reading one pickle from the position of ``file``."""
 
     def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
         self._path, self._file, self._size = path, file, size
@@ -103,12 +93,7 @@ class Unpickler:
         self._containers = self._number_keys = 0
 
     def load(self) -> object:
-        """Return the contents of the pickle: a tree that may share parts but never contains itself.
-
-        Raises:
-            DyngsError: it asks for more than ``dyngs.files.limits`` allows.
-            Exception: of any kind, for a file that is damaged or holds anything else.
-        """
+        """Return the contents of the pickle: a tree that may share parts but never contains itself."""
         while (code := self.read(1)) != b".":
             step = _STEPS.get(code)
             if step is None:
@@ -300,12 +285,7 @@ class Unpickler:
 
 
 def require_tree(where: Path, found: object, more: int = 0) -> None:
-    """Check that walking through the contents of a file ends soon.
-
-    Args:
-        where: the file.
-        found: containers and values.
-        more: entries that are allowed beside the usual number.
+    """Check that walking through the contents of a file ends soon; ``more`` than the usual number of entries may be.
 
     Raises:
         DyngsError: it has too many entries, shared ones counted at each occurrence.

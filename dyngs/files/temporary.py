@@ -29,11 +29,7 @@ def temporary_beside(path: Path) -> Path:
 
 
 def temporary_folder_beside(path: Path) -> Path:
-    """Create an empty temporary folder, to be renamed to ``path``; an earlier one of this process is replaced.
-
-    Raises:
-        DyngsError: it cannot be created.
-    """
+    """Create an empty temporary folder, to be renamed to ``path``; an earlier one of this process is replaced."""
     try:
         folder = temporary_beside(path)
         shutil.rmtree(folder, ignore_errors=True)
@@ -109,11 +105,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def cache_folder(kind: Literal["frames", "poses", "bodies"]) -> Path:
-    """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the system's cache of the user.
-
-    Args:
-        kind: frames of videos, or captures of photos and videos whose poses were estimated.
-    """
+    """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the user's cache."""
     chosen = os.environ.get(CACHE_VARIABLE, "")
     if chosen:
         return Path(chosen).expanduser().absolute() / kind

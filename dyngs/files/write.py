@@ -23,9 +23,6 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Args:
         path: file to write.
         durable: also wait until it is on disk, so that a power cut leaves the old file or the new one, complete.
-
-    Raises:
-        DyngsError: the folder cannot be made or the file cannot be written.
     """
     try:
         temporary = temporary_beside(path)
@@ -67,9 +64,6 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         path: ``.png`` or ``.jpg`` (8 bit), ``.exr`` (float32), or what else OpenImageIO writes.
         pixels: (H, W) or (H, W, C); uint8 as it is, or floats, which are clamped to [0, 1] for 8-bit formats. A fourth
             channel is alpha: straight for PNG, premultiplied for EXR, as these formats want it.
-
-    Raises:
-        DyngsError: unknown suffix, a full disk, and the like.
     """
     import OpenImageIO as oiio
 

@@ -26,22 +26,14 @@ REMEDY = "lower the resolution, the scales or the number of views"
 
 
 def check_number(name: str, value: object, low: float, high: float = LARGEST) -> None:
-    """Raise an error unless ``value`` is a number from ``low`` to ``high``.
-
-    Raises:
-        DyngsError: it is something else, or NaN.
-    """
+    """Raise an error unless ``value`` is a number from ``low`` to ``high``."""
     if not isinstance(value, (int, float)) or not low <= value <= high:
         upto = "" if high == math.inf else " and finite" if high == LARGEST else f" and at most {high:g}"
         raise DyngsError(f"{name} must be a number of at least {low:g}{upto}, got {value!r}")
 
 
 def check_near_and_far(near: object, far: object) -> None:
-    """Raise an error unless they are the limits of a range of depths; ``far`` may be infinite.
-
-    Raises:
-        DyngsError: a negative number or NaN, or ``far`` not beyond ``near``.
-    """
+    """Raise an error unless they are the limits of a range of depths; ``far`` may be infinite."""
     check_number("near", near, 0)
     check_number("far", far, 0, math.inf)
     if not far > near:  # pyright: ignore[reportOperatorIssue]
@@ -49,31 +41,19 @@ def check_near_and_far(near: object, far: object) -> None:
 
 
 def check_count(name: str, value: object, low: int, high: int) -> None:
-    """Raise an error unless ``value`` is a whole number from ``low`` to ``high``.
-
-    Raises:
-        DyngsError: it is something else.
-    """
+    """Raise an error unless ``value`` is a whole number from ``low`` to ``high``."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise DyngsError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Raise an error unless ``value`` is one of the ``choices``.
-
-    Raises:
-        DyngsError: it is not.
-    """
+    """Raise an error unless ``value`` is one of the ``choices``."""
     if not isinstance(value, str) or value not in choices:
         raise DyngsError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise an error unless images of this size can be drawn.
-
-    Raises:
-        DyngsError: a side below 1 or above ``MAX_SIDE``.
-    """
+    """Raise an error unless images of this size can be drawn."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise DyngsError(f"render refused: an image of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px")
 
@@ -104,11 +84,7 @@ count_nonfinite_op = register("count_nonfinite", _count_nonfinite)
 
 
 def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
-    """Raise an error unless every element of the ``tensors`` (float32 or float64) is finite.
-
-    Raises:
-        DyngsError: naming the tensor, how many elements and how many rows are not finite, and the ``remedy``.
-    """
+    """Raise an error unless every element of the ``tensors`` (float32 or float64) is finite."""
     for name, x in tensors.items():
         native = has_kernel("count_nonfinite", x.device)
         count = int(count_nonfinite_op(x.detach()) if native else (~x.isfinite()).sum())

@@ -26,11 +26,7 @@ _BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, whic
 
 
 def device_for(choice: str) -> torch.device:
-    """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a GPU where one can be used, else the CPU.
-
-    Raises:
-        DyngsError: ``cuda`` where no GPU can be used, in one line with the reason and what to do; or another choice.
-    """
+    """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a GPU where one can be used, else the CPU."""
     check_choice("device", choice, CHOICES)
     if choice == "cpu":
         return CPU

@@ -24,9 +24,6 @@ class ProjectionOptions:
         alpha_min: pixels with less alpha are not drawn; sets the extent of a splat.
         radius_clip: splats with no larger half extent are culled, px.
         antialiased: the extent uses the compensated opacity.
-
-    Raises:
-        DyngsError: a negative number or NaN, or ``far`` not beyond ``near``.
     """
 
     eps2d: float = 0.3

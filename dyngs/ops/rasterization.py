@@ -39,9 +39,6 @@ class BlendOptions:
         absgrad: also sum the absolute gradients of the 2D means into the probe.
         max_entries: refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more than
             memory holds, at 20 bytes each.
-
-    Raises:
-        DyngsError: numbers out of [0, 1] or NaN, an ``alpha_max`` that float32 cannot tell from 1, a negative count.
     """
 
     alpha_min: float = 1 / 255
@@ -81,11 +78,7 @@ class TileEntries:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
 
     def check(self, device: torch.device) -> None:
-        """Raise an error unless the tensors are what the kernels take; those check lengths and indices themselves.
-
-        Raises:
-            DyngsError: another dtype, device or number of axes.
-        """
+        """Raise an error unless the tensors are what the kernels take; those check lengths and indices themselves."""
         for name, x in vars(self).items():
             dtype = torch.int64 if name == "tile_offsets" else torch.int32
             if x.dtype != dtype or x.ndim != 1 or x.device != device:

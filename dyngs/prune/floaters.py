@@ -35,12 +35,7 @@ FEWEST_VIEWS, MOST = 20, 0.01
 
 
 class FloaterRemoval:
-    """Listener that removes floaters when training ends, if that is asked for; static scenes only.
-
-    Args:
-        loop: of the run.
-        trainer: returns the trainer of its scene, which may be another one later.
-    """
+    """Listener that removes floaters when training ends, if that is asked for; static scenes only."""
 
     def __init__(self, loop: Loop, trainer: Callable[[], Trainer]) -> None:
         self._loop, self._trainer = loop, trainer

@@ -62,12 +62,7 @@ class Pruned:
 
 
 class PruneStage:
-    """Listener that prunes when training ends and fine-tuning begins.
-
-    Args:
-        loop: of the run.
-        trainer: returns the trainer of its scene, which may be another one later.
-    """
+    """Listener that prunes when training ends and fine-tuning begins."""
 
     def __init__(self, loop: Loop, trainer: Callable[[], Trainer]) -> None:
         self._loop, self._trainer = loop, trainer

@@ -46,11 +46,7 @@ def render_options_of(variant: Variant, model: SceneModel) -> RenderOptions:
 
 
 def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> Quality:
-    """Return mean metrics over images, each rendered at its own time.
-
-    Raises:
-        DyngsError: a render holds NaN or Inf.
-    """
+    """Return mean metrics over images, each rendered at its own time."""
     psnrs, ssims, distances = [], [], []
     for image in images:
         rendered, truth = drawing.image(image.cameras, image.time), image.composite(drawing.background)

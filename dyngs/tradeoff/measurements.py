@@ -73,11 +73,7 @@ _SHORTEST = 1e-9
 
 
 def read_measurement(path: Path) -> Measurement:
-    """Read a measurement from its JSON file.
-
-    Raises:
-        DyngsError: the file holds something else.
-    """
+    """Read a measurement from its JSON file."""
     with reading(path, "it is no measurement of a variant: remove it to have it measured again"):
         require_regular(path)
         stored = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite, parse_constant=_finite)
@@ -103,11 +99,7 @@ def _finite(text: str) -> float:
 
 
 def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
-    """Return which points are on the Pareto front: no other is as good in all goals and better in one.
-
-    Args:
-        goals: values of each point, all to be maximised.
-    """
+    """Return which points are on the Pareto front: no other is as good in all goals and better in one."""
     return [not any(_dominates(other, own) for other in goals) for own in goals]
 
 

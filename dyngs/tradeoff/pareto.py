@@ -46,12 +46,7 @@ def slope(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
 
 
 def exchange_rates(base: Measurement, measurements: Iterable[Measurement]) -> list[ExchangeRate]:
-    """Return the exchange rate of each setting, from the variants that change it alone, in order of appearance.
-
-    Args:
-        base: the run itself.
-        measurements: of any variants.
-    """
+    """Return the exchange rate of each setting, from the variants that change it alone, in order of appearance."""
     groups: dict[str, list[Measurement]] = {}
     for m in measurements:
         if m.variant.setting not in ("", SEVERAL):

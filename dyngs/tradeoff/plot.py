@@ -28,10 +28,7 @@ def plot(rows: Sequence[TableRow]) -> Figure:
     """Return two panels, PSNR against speed and against size, and a legend.
 
     A thin line joins the run with the values of one setting in their order; the thick grey line is the Pareto front of
-    the two axes. Values that are not positive are left out of the logarithmic axes.
-
-    Args:
-        rows: the run itself first.
+    the two axes. Values that are not positive are left out of the logarithmic axes. The run itself comes first.
     """
     from matplotlib import colormaps
     from matplotlib.figure import Figure

@@ -51,11 +51,7 @@ EXCHANGE_HEAD = (
 def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
     """Write ``tradeoff.csv``, ``.json`` and ``.html``, with matplotlib ``.svg`` and ``.png``, too; return their paths.
 
-    The page needs no other files and no network.
-
-    Args:
-        out: output folder.
-        measurements: with speed, the run itself first.
+    The page needs no other files and no network. ``measurements`` have speeds, the run itself comes first.
     """
     rows, rates = table_rows(measurements), exchange_rates(measurements[0], measurements)
     figure = plot(rows) if can_plot() else None

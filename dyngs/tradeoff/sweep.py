@@ -87,11 +87,7 @@ class ProcessGroup:
 
     @staticmethod
     def from_environment() -> ProcessGroup:
-        """Return the group that ``torchrun`` describes in environment variables; a single process without it.
-
-        Raises:
-            DyngsError: one of the variables is not a number.
-        """
+        """Return the group that ``torchrun`` describes in environment variables; a single process without it."""
         numbers = numbers_of_torchrun()
         return SINGLE_PROCESS if numbers is None else ProcessGroup(*numbers)
 
@@ -135,13 +131,7 @@ def sweep(
 ) -> list[Measurement]:
     """Return the measurements of all variants, the run itself first.
 
-    Each is kept as a file in ``runs.out / "points"`` and not made again.
-
-    Args:
-        runs: the run and the folder for its variants.
-        plan: what to measure.
-        log: called with a line per measurement.
-        group: processes that call this together.
+    Each is kept as a file in ``runs.out / "points"`` and not made again; ``log`` is called with a line per measurement.
 
     Raises:
         DyngsError: no such run or split, or the folder holds measurements of another run.
@@ -238,11 +228,7 @@ class _Session:
 
 
 def _require_same_source(runs: VariantRuns, plan: Plan, *, is_first: bool) -> None:
-    """Compare the checkpoint and split with those of earlier measurements in the folder; rank 0 notes them.
-
-    Raises:
-        DyngsError: they differ.
-    """
+    """Compare the checkpoint and split with those of earlier measurements in the folder; rank 0 notes them."""
     newest = checkpoint_paths(runs.run_dir)[-1]
     source = {
         "run": str(runs.run_dir.absolute()),

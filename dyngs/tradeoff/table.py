@@ -60,11 +60,7 @@ class TableRow:
 
 
 def table_rows(measurements: Sequence[Measurement]) -> list[TableRow]:
-    """Return a row per variant whose speed was measured, in their order.
-
-    Args:
-        measurements: the run itself first.
-    """
+    """Return a row per variant whose speed was measured, in their order: the run itself first."""
     base = measurements[0].speed
     fps = 0.0 if base is None else 1e3 / base.ms.median
     return [
@@ -119,20 +115,12 @@ class Goal:
 
 
 def parse_requirements(text: str) -> tuple[Requirement, ...]:
-    """Return the conditions of a list such as ``psnr>=30,fps>=20,mb<=5``.
-
-    Raises:
-        DyngsError: a part is not a condition, with what is allowed.
-    """
+    """Return the conditions of a list such as ``psnr>=30,fps>=20,mb<=5``."""
     return tuple(_requirement(part) for part in text.split(","))
 
 
 def parse_goal(name: str, *, smallest: bool) -> Goal:
-    """Return the goal of ``--minimize`` or ``--maximize``.
-
-    Raises:
-        DyngsError: an unknown metric.
-    """
+    """Return the goal of ``--minimize`` or ``--maximize``."""
     if name not in METRICS:
         option = "--minimize" if smallest else "--maximize"
         raise DyngsError(f"{option} {name}: no such metric; there are {', '.join(METRICS)}")
@@ -140,11 +128,7 @@ def parse_goal(name: str, *, smallest: bool) -> Goal:
 
 
 def choose(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: Goal) -> TableRow:
-    """Return the best row among those that meet all requirements; of equally good ones that with the higher PSNR.
-
-    Raises:
-        DyngsError: no row meets them; it names the requirements that are too strict and the values that exist.
-    """
+    """Return the best row among those that meet all requirements; of equally good ones that with the higher PSNR."""
     fitting = [row for row in rows if all(r.is_met(row) for r in requirements)]
     if not fitting:
         raise DyngsError(_explanation(rows, requirements, goal))
