@@ -20,7 +20,7 @@ from dyngs.data.true_tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.own_poses import PoseRefinement, images_of_split, scores_from_own_poses
-from dyngs.evaluate.regions import RegionName, Regions
+from dyngs.evaluate.regions import REGION_METRICS, Regions
 from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
@@ -33,13 +33,6 @@ from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.training.background import evaluation_background
 from dyngs.training.views import training_cameras
-
-REGION_METRICS: dict[str, RegionName] = {
-    "psnr_foreground": "foreground",
-    "psnr_moving": "moving",
-    "psnr_static": "still",
-}
-"""Metrics of regions: their names, and the regions."""
 
 
 @dataclass(frozen=True)
@@ -155,26 +148,18 @@ def evaluate_run(
         fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips) if asked else PoseRefinement()
     report = EvalReport(
         split=split,
-        num_views=len(scores),
-        width=scores[0].width,
-        height=scores[0].height,
         background=background,
         lpips_net=lpips_net,
-        fps=1 / median(score.render_seconds for score in scores),
-        deform_fraction=median(score.deform_seconds / score.render_seconds for score in scores),
-        psnr_per_time=psnr_per_time((score.time, score.psnr) for score in scores),
         moving_from=regions.moving_from,
         notes=_notes(run, scores),
-        per_view=tuple(scores),
         psnr_own_poses=fitted.psnr,
         own_poses=fitted.to_images,
         silhouette_poses=fitted.to_silhouettes,
-        flicker=temporal["flicker"].value,
-        flicker_error=temporal["flicker_error"].value,
+        **{name: metric.value for name, metric in temporal.items()},
         track_error_px=tracks.error_px,
         track_within_5px=tracks.within_5px,
         track_motion_px=tracks.motion_px,
-        **_means(scores),
+        **_of_views(scores),
         **_facts(run_dir, run, scene),
     )
     reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason is not None}
@@ -205,9 +190,18 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _means(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the means of all metrics: those of regions over the views that have one, others over all or none."""
-    means = means_of(scores) | means_of(scores, ("flip", "psnr_right", "psnr_right_fitted"))
+def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
+    """Return the fields of a report on views: means of regions are over those that have one, others over all or none."""
+    means: dict[str, Any] = {
+        "num_views": len(scores),
+        "width": scores[0].width,
+        "height": scores[0].height,
+        "fps": 1 / median(score.render_seconds for score in scores),
+        "deform_fraction": median(score.deform_seconds / score.render_seconds for score in scores),
+        "psnr_per_time": psnr_per_time((score.time, score.psnr) for score in scores),
+        "per_view": tuple(scores),
+    }
+    means |= means_of(scores) | means_of(scores, ("flip", "psnr_right", "psnr_right_fitted"))
     for metric in REGION_METRICS:
         known = [value for value in (getattr(score, metric) for score in scores) if value is not None]
         means[metric] = fmean(known) if known else None
@@ -216,7 +210,7 @@ def _means(scores: Sequence[ViewScore]) -> dict[str, Any]:
 
 def _reasons(report: EvalReport, regions: Regions, tracks: TrackScores) -> dict[str, str]:
     """Return why there are no values of parts of the images, and no errors of tracks, by the metric."""
-    reasons = {metric: regions.reason(x) for metric, x in REGION_METRICS.items() if getattr(report, metric) is None}
+    reasons = {metric: regions.reason(metric) for metric in REGION_METRICS if getattr(report, metric) is None}
     if report.psnr_right is None:
         reasons |= dict.fromkeys(("psnr_right", "psnr_right_fitted"), "half a view has no pixel that counts")
     return reasons if tracks.reason is None else reasons | {"track_error_px": tracks.reason}

@@ -23,7 +23,7 @@ from torch import Tensor
 from dyngs.data.images.silhouettes import silhouette_box
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.evaluate.regions import Regions, RegionScores
+from dyngs.evaluate.regions import Regions
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.gaussians.rendering import Rendering, RenderOptions
 from dyngs.gaussians.scene import Scene
@@ -84,19 +84,6 @@ class PoseScores:
     per_view: tuple[ViewScore, ...]
 
 
-@dataclass(frozen=True)
-class HalfScores:
-    """PSNR of the right half of an image, dB; None where a half has no pixel that counts.
-
-    Attributes:
-        plain: as the scene shows it.
-        fitted: after an affine colour that was fitted on the left half.
-    """
-
-    plain: float | None
-    fitted: float | None
-
-
 def score_views(
     scene: Scene,
     images: Iterable[Image],
@@ -126,8 +113,8 @@ def score_views(
             raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
         truth, mask = image.composite(background), image.mask
         people = {} if avatar_of(scene) is None else person_scores(image, rendering, background, lpips)
-        parts = RegionScores() if regions is None else regions.scores(image, rendered, truth)
-        halves = right_half_scores(image, rendering, background)
+        parts = right_half_scores(image, rendering, background)
+        parts |= {} if regions is None else regions.scores(image, rendered, truth)
         optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
         for name, metric in optional.items():
             if metric.reason is not None:
@@ -143,11 +130,7 @@ def score_views(
             render_seconds=seconds,
             deform_seconds=deform_seconds,
             time=image.time,
-            psnr_foreground=parts.foreground,
-            psnr_moving=parts.moving,
-            psnr_static=parts.still,
-            psnr_right=halves.plain,
-            psnr_right_fitted=halves.fitted,
+            **parts,
             **people,
         )
         _require_finite(score, mask)
@@ -177,17 +160,23 @@ def person_box(image: Image) -> tuple[slice, slice] | None:
     return None if image.alpha is None else silhouette_box(image.alpha)
 
 
-def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> HalfScores:
-    """Return the scores of the right half of an image."""
+def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float | None]:
+    """Return ``psnr_right`` and ``psnr_right_fitted``, dB; None where a half of the image has no pixel that counts.
+
+    That is the PSNR of the right half as the scene shows it, and after an affine colour fitted on the left half.
+    """
     truth = image.composite(background)
     left = torch.zeros_like(truth[..., 0])
     left[:, : left.shape[1] // 2] = 1
     weights = [part if image.mask is None else part * image.mask for part in (left, 1 - left)]
     if not all(bool((weight > 0).any()) for weight in weights):
-        return HalfScores(None, None)
+        return {"psnr_right": None, "psnr_right_fitted": None}
     affine = fitted_affine([(image, rendering)], background, left)
     fitted = recoloured(affine, image, rendering, background)
-    return HalfScores(psnr(rendering.rgb[0], truth, weights[1]), psnr(fitted, truth, weights[1]))
+    return {
+        "psnr_right": psnr(rendering.rgb[0], truth, weights[1]),
+        "psnr_right_fitted": psnr(fitted, truth, weights[1]),
+    }
 
 
 _OF_POSES = ("psnr", "ssim", "lpips", "psnr_person", "ssim_person", "psnr_black", "ssim_black", "lpips_black")

@@ -32,6 +32,17 @@ def check_number(name: str, value: object, low: float, high: float = LARGEST) ->
         raise DyngsError(f"{name} must be a number of at least {low:g}{upto}, got {value!r}")
 
 
+def check_tensors(op: str, tensors: Mapping[str, tuple[Tensor, tuple[int, ...]]]) -> None:
+    """Raise an error unless the ``tensors`` of ``op`` have these shapes, are floating point and on one device."""
+    first, device = next((name, x.device) for name, (x, _) in tensors.items())
+    for name, (x, shape) in tensors.items():
+        if tuple(x.shape) != shape:
+            raise DyngsError(f"{op}: {name} must be {shape}, got {tuple(x.shape)}")
+        if not x.is_floating_point() or x.device != device:
+            wanted = f"floating point on {device} like the {first}"
+            raise DyngsError(f"{op}: {name} must be {wanted}, got {x.dtype} on {x.device}")
+
+
 def check_near_and_far(near: object, far: object) -> None:
     """Raise an error unless they are the limits of a range of depths; ``far`` may be infinite."""
     check_number("near", near, 0)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
+from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, launch, register
 
@@ -118,14 +119,9 @@ def pose_by_joints(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Te
 
 
 def _check(inputs: dict[str, Tensor]) -> None:
-    weights, device = inputs["weights"], inputs["means"].device
+    weights = inputs["weights"]
     if weights.ndim != 2:
         raise DyngsError(f"pose_by_joints: weights must be (N, J), got {tuple(weights.shape)}")
     count, joints = weights.shape
     wanted = {"means": (count, 3), "quats": (count, 4), "log_scales": (count, 3), "transforms": (joints, 3, 4)}
-    for name, x in inputs.items():
-        if tuple(x.shape) != wanted.get(name, x.shape):
-            raise DyngsError(f"pose_by_joints: {name} must be {wanted[name]}, got {tuple(x.shape)}")
-        if not x.is_floating_point() or x.device != device:
-            like = f"floating point on {device} like the means"
-            raise DyngsError(f"pose_by_joints: {name} must be {like}, got {x.dtype} on {x.device}")
+    check_tensors("pose_by_joints", {name: (x, wanted.get(name, tuple(x.shape))) for name, x in inputs.items()})

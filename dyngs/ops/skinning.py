@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
+from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, InPlace, launch, register
 
@@ -107,12 +108,7 @@ def _check(points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, m
         "motion": (motion, (nodes, 7)),
         "values": (values, (nodes, *values.shape[1:2])) if values.ndim == 2 else (values, (nodes, -1)),
     }
-    for name, (tensor, shape) in expected.items():
-        if tuple(tensor.shape) != shape:
-            raise DyngsError(f"blend_skinning: {name} must be {shape}, got {tuple(tensor.shape)}")
-        if not tensor.is_floating_point() or tensor.device != points.device:
-            wanted = f"floating point on {points.device} like the points"
-            raise DyngsError(f"blend_skinning: {name} must be {wanted}, got {tensor.dtype} on {tensor.device}")
+    check_tensors("blend_skinning", expected)
     if followed.dtype != torch.int64 or followed.device != points.device:
         wanted = f"int64 on {points.device} like the points"
         raise DyngsError(f"blend_skinning: followed must be {wanted}, got {followed.dtype} on {followed.device}")

@@ -131,10 +131,10 @@ def test_exposure_does_not_count() -> None:
     image, rendering = image_and_rendering()
     brighter = replace(image, rgb_premultiplied=1.4 * image.rgb_premultiplied + 0.02)
     found = right_half_scores(brighter, rendering, BLACK)
-    assert found.plain is not None
-    assert found.fitted is not None
-    assert found.plain < 20
-    assert found.fitted > 50
+    assert found["psnr_right"] is not None
+    assert found["psnr_right_fitted"] is not None
+    assert found["psnr_right"] < 20
+    assert found["psnr_right_fitted"] > 50
 
 
 def test_errors_in_the_right_half_count_though_the_left_half_is_perfect() -> None:
@@ -142,8 +142,8 @@ def test_errors_in_the_right_half_count_though_the_left_half_is_perfect() -> Non
     wrong = image.rgb_premultiplied.clone()
     wrong[:, 40:] = 1.4 * wrong[:, 40:]
     found = right_half_scores(replace(image, rgb_premultiplied=wrong), rendering, BLACK)
-    assert found.fitted is not None
-    assert found.fitted < 25
+    assert found["psnr_right_fitted"] is not None
+    assert found["psnr_right_fitted"] < 25
 
 
 def test_only_the_right_half_is_scored() -> None:
@@ -151,9 +151,9 @@ def test_only_the_right_half_is_scored() -> None:
     noisy = image.rgb_premultiplied.clone()
     noisy[:, :40] += 0.1 * torch.randn(60, 40, 3, generator=torch.Generator().manual_seed(1))
     found = right_half_scores(replace(image, rgb_premultiplied=noisy), rendering, BLACK)
-    assert found.plain == 100
-    assert found.fitted is not None
-    assert found.fitted > 35
+    assert found["psnr_right"] == 100
+    assert found["psnr_right_fitted"] is not None
+    assert found["psnr_right_fitted"] > 35
 
 
 def test_a_half_without_pixels_has_no_score() -> None:
@@ -161,7 +161,7 @@ def test_a_half_without_pixels_has_no_score() -> None:
     mask = torch.ones(60, 80)
     mask[:, :40] = 0
     found = right_half_scores(replace(image, mask=mask), rendering, BLACK)
-    assert (found.plain, found.fitted) == (None, None)
+    assert (found["psnr_right"], found["psnr_right_fitted"]) == (None, None)
 
 
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20, 6], [0, 0, 1]]]), 20, 12)
