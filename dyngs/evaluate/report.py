@@ -191,7 +191,7 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
 
 
 def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the fields of a report on views: means of regions are over those that have one, others over all or none."""
+    """Return the fields of a report on views; means of regions are over the views that have one, others over all."""
     means: dict[str, Any] = {
         "num_views": len(scores),
         "width": scores[0].width,
