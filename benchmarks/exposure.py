@@ -23,8 +23,8 @@ from dyngs.config import Config, DataConfig
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.report import split_views
+from dyngs.evaluate.view_scores import right_half_scores
 from dyngs.files.write import write_image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.gaussians.scene import render_options
@@ -71,7 +71,12 @@ def scores(run: Path) -> list[str]:
     plain = [psnr(r.rgb[0], p.composite(background), p.mask) for p, r in shown]
     fitted = [psnr(recoloured(one, p, r, background), p.composite(background), p.mask) for p, r in shown]
     halves = [right_half_scores(p, r, background) for p, r in shown]
-    means = [fmean(plain), fmean(fitted), fmean(x.plain or 0.0 for x in halves), fmean(x.fitted or 0.0 for x in halves)]
+    means = [
+        fmean(plain),
+        fmean(fitted),
+        fmean(x["psnr_right"] or 0.0 for x in halves),
+        fmean(x["psnr_right_fitted"] or 0.0 for x in halves),
+    ]
     return [config.train.exposure, *(f"{mean:.2f}" for mean in means)]
 
 

@@ -44,6 +44,14 @@ class Cameras:
         """Return the camera at ``index`` as a batch of one."""
         return Cameras(self.cam_from_world[index][None], self.intrinsics[index][None], self.width, self.height)
 
+    def scaled(self, factor: float) -> Cameras:
+        """Return the same cameras with width and height times ``factor``, rounded to whole pixels."""
+        if factor == 1:
+            return self
+        width, height = (max(1, round(factor * side)) for side in (self.width, self.height))
+        factors = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
+        return Cameras(self.cam_from_world, factors[:, None] * self.intrinsics, width, height)
+
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Cameras:
         """Return the same cameras on another device or in another precision."""
         pose, intrinsics = (

@@ -15,9 +15,8 @@ from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import check_focal_lengths
-from dyngs.ops.finite import check_finite
+from dyngs.ops.checks import LARGEST_COUNT, check_choice, check_count, check_finite, check_near_and_far, check_number
 from dyngs.ops.harmonics import evaluate_harmonics
-from dyngs.ops.options import LARGEST_COUNT, check_choice, check_count, check_near_and_far, check_number
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import MAX_CHANNELS, TILE, BlendOptions, TileEntries, bin_tiles, rasterize
 

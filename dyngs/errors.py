@@ -28,13 +28,6 @@ def reading(path: str | os.PathLike[str], advice: str = "copy or export it again
     For the readers of files from others: their parsers raise more kinds of errors than anybody can list. A DyngsError
     passes as it is. What the file has no part in belongs outside the block, because a fault of our own would be blamed
     on the file there (``dyngs --debug`` shows the cause).
-
-    Args:
-        path: what is being read, for the message.
-        advice: what the user can do about a file that is not as it should be.
-
-    Raises:
-        DyngsError: instead of any other Exception.
     """
     where = os.fspath(path)
     try:
@@ -58,11 +51,7 @@ def require_name(text: str) -> None:
 
 
 def require_regular(path: str | os.PathLike[str]) -> None:
-    """Nothing, if ``path`` is a file, a folder or not there: what reads a pipe or a device may never end.
-
-    Raises:
-        DyngsError: it is anything else.
-    """
+    """Nothing, if ``path`` is a file, a folder or not there: what reads a pipe or a device may never end."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):

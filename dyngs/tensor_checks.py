@@ -14,11 +14,7 @@ REAL = torch.float32
 
 
 def require_tensor(name: str, x: Tensor, shape: Sequence[int | None], dtype: torch.dtype | None = REAL) -> Tensor:
-    """Return ``x`` if it has this shape (None: any size) and dtype (None: any floating point), and is finite.
-
-    Raises:
-        ValueError: names it, and says what it is.
-    """
+    """Return ``x`` if it has this shape (None: any size) and dtype (None: any floating point), and is finite."""
     fits = len(x.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, x.shape, strict=True))
     if not fits or (x.dtype != dtype if dtype is not None else not x.is_floating_point()):
         sizes = ", ".join("any" if n is None else str(n) for n in shape)

@@ -281,7 +281,7 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.output.camera_paths import parse_times
-    from dyngs.tradeoff.requirements import parse_requirements
+    from dyngs.tradeoff.table import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.budget.run import LimitedRun
+from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message
-from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
 
 

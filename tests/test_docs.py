@@ -165,7 +165,7 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times, presets."""
     from dyngs.output.camera_paths import parse_times
     from dyngs.output.render_job import path_file
-    from dyngs.tradeoff.requirements import parse_goal, parse_requirements
+    from dyngs.tradeoff.table import parse_goal, parse_requirements
     from dyngs.tradeoff.variants import parse_variations
 
     for word in command.words:

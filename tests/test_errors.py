@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.errors import DyngsError, printable, reading, reason, require_regular
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import read_json_object
 from dyngs.files.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
 from dyngs.storage.file import read_scene
@@ -79,7 +79,7 @@ def test_no_message_can_steer_a_terminal() -> None:
 def test_what_the_command_line_quotes_is_short(text: str) -> None:
     from dyngs.data.times import parse_frames
     from dyngs.output.camera_paths import parse_times
-    from dyngs.tradeoff.requirements import parse_requirements
+    from dyngs.tradeoff.table import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
 
     for parse in (parse_frames, parse_times, parse_requirements, lambda word: parse_variations([word], trains=True)):

@@ -31,7 +31,7 @@ MANY_PARAMETERS = {
 }
 """Functions that may take more parameters, each with its reason."""
 
-HEAVY = ("pycolmap", "trimesh", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips")
+HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips", "matplotlib")
 WITHOUT_MIRROR = {
     "test_devices.py": "about all that poses an avatar",
     "test_emulated_gpu.py": "about all ops at once, on another core",

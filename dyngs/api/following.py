@@ -20,8 +20,7 @@ from safetensors.torch import load, save
 from dyngs.build import build
 from dyngs.config import Config
 from dyngs.errors import DyngsError
-from dyngs.ops.device import deterministic, device_for
-from dyngs.ops.memory import keep_freed_memory
+from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.interrupt import Interrupts

@@ -20,8 +20,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
-from dyngs.ops.device import deterministic, device_for
-from dyngs.ops.memory import keep_freed_memory
+from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Limit, Search, Stored
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at

@@ -27,8 +27,7 @@ from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.ops.device import deterministic, device_for
-from dyngs.ops.memory import keep_freed_memory
+from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
 from dyngs.prune.stage import PruneStage
@@ -58,11 +57,12 @@ from dyngs.runs.folder import (
 from dyngs.runs.lock import writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
+from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.extend import told, with_length
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible, shared
-from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.loop import Loop
 from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer

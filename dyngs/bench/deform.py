@@ -95,11 +95,7 @@ def synthetic_load(folder: Path, num_gaussians: int, moving_fraction: float, kin
 
 
 def bench_deform(load: DeformLoad, threads: int, rounds: int) -> DeformReport:
-    """Measure step times of the three variants, interleaved so that other load affects them alike.
-
-    Raises:
-        DyngsError: the capture of the run is missing.
-    """
+    """Measure step times of the three variants, interleaved so that other load affects them alike."""
     with kernel_threads(threads):
         trainers = {name: _trainer(load, name) for name in VARIANTS}
         samples: dict[str, list[float]] = {name: [] for name in VARIANTS}

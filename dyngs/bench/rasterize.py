@@ -102,11 +102,7 @@ class RasterizeReport:
 
 
 def garden_workload(path: Path) -> Workload:
-    """Read the workload of gsplat's benchmark: points within 2 units of the origin with random shapes, first camera.
-
-    Raises:
-        DyngsError: the file is missing or holds something else.
-    """
+    """Read the workload of gsplat's benchmark: points within 2 units of the origin with random shapes, first camera."""
     keys = ("means3d", "colors", "viewmats", "Ks", "width", "height")
     data = read_arrays(path, lambda names: [key for key in keys if key in names])
     with reading(path, "give a workload of gsplat's benchmark"):

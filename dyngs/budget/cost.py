@@ -1,6 +1,6 @@
 """The cost of a run of all its steps, by what was measured in one that ``train.minutes`` made shorter: a preview.
 
-A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.runs.remaining``); how
+A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.training.clock``); how
 fast this machine is at that was measured in every step. Gaussians are added at certain steps, about equally many each
 time. How far that was from whole runs: docs/budget.md.
 """
@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from statistics import fmean, median
 
 from dyngs.budget.run import LimitedRun
-from dyngs.budget.time import with_steps
 from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.runs.remaining import FIXED, MOTION, PER_GAUSSIAN, PER_MEGAPIXEL
+from dyngs.training.clock import cost_between, full_pixels, step_cost, with_steps
 from dyngs.training.events import Event, StepDone
 from dyngs.training.memory import gaussian_bytes, num_changes, peak_memory
-from dyngs.training.schedule import growth_per_change, image_divisor, motion_begins_after, scaled
+from dyngs.training.schedule import growth_per_change, scaled
 
 SLOWER = 0.1
 """Power of the number of changes with which each adds fewer Gaussians."""
@@ -34,7 +33,6 @@ OUTLIER = 4.0
 """Steps that took so many times longer than usual did something else, too."""
 FIRST = 5
 """Steps at the start that are not counted."""
-SAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -68,12 +66,7 @@ class Cost:
 
 
 class CostMeter:
-    """Listener that measures what steps cost.
-
-    Args:
-        run: what is measured.
-        steps: of the whole run.
-    """
+    """Listener that measures what steps cost."""
 
     def __init__(self, run: LimitedRun, steps: int) -> None:
         self.run, self.steps, self.first = run, steps, run.trainer.num_gaussians
@@ -87,7 +80,7 @@ class CostMeter:
             case StepDone():
                 now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
                 config = self.run.trainer.config
-                self._pixels = height * width * image_divisor(config.train, event.step) ** 2
+                self._pixels = full_pixels(config, event.step, height * width)
                 if self._last is not None:
                     cost = step_cost(config, event.step, self._pixels, event.num_gaussians)
                     self._paces.append((now - self._last) / cost)
@@ -143,19 +136,9 @@ class CostMeter:
 
     def _whole(self, config: Config, count: float) -> float:
         """Return the cost of all steps of ``config``, whose Gaussians become ``count`` while they are added."""
-        steps, stop, total = config.train.steps, scaled(config.strategy.stop, config.train.steps), 0.0
-        for i in range(SAMPLES):
-            step = max(1, math.ceil(steps * (i + 0.5) / SAMPLES))
-            total += step_cost(config, step, self._pixels, self.first + (count - self.first) * min(step / stop, 1.0))
-        return total * steps / SAMPLES
-
-
-def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) -> float:
-    """Return the cost of ``step``, whose image has so many pixels at full size; only ratios mean something."""
-    begins = motion_begins_after(config, config.train.steps)
-    moving = MOTION if begins is not None and step > begins else 1.0
-    shown = 1e-6 * pixels / image_divisor(config.train, step) ** 2
-    return moving * (FIXED + PER_MEGAPIXEL * shown + PER_GAUSSIAN * num_gaussians)
+        steps, stop = config.train.steps, scaled(config.strategy.stop, config.train.steps)
+        more = count - self.first
+        return cost_between(config, 0, steps, self._pixels, lambda step: self.first + more * min(step / stop, 1.0))
 
 
 def _two_digits(x: float) -> str:

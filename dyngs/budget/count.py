@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
-from dyngs.prune.selection import highest
+from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE, most_gaussians

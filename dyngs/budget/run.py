@@ -70,11 +70,6 @@ def stage(config: Config, step: int, fraction: float = 0.0) -> int:
     """Return how many stages of removal a run has come to after ``step``; the last is its end.
 
     Where pruning follows training, its beginning is the first stage, and the others are fractions of it.
-
-    Args:
-        config: of the run.
-        step: done.
-        share: of its time that is used.
     """
     steps, total = config.train.steps, config.total_steps
     if step > steps:

@@ -14,11 +14,11 @@ from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
 from dyngs.ops.device import CPU
-from dyngs.prune.selection import highest
+from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores, probe_images, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER, FORMER_EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.storage.drawable import drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
@@ -74,9 +74,9 @@ class _File:
 
 
 def has_file(run_dir: Path) -> bool:
-    """Return whether a run has its file of limited size, also under the folder's former name."""
-    folders = (run_dir / EXPORT_FOLDER, run_dir / FORMER_EXPORT_FOLDER)
-    return any((folder / SCENE_FILE).is_file() and (folder / RESOLVED_NAME).is_file() for folder in folders)
+    """Return whether a run has its file of limited size."""
+    folder = run_dir / EXPORT_FOLDER
+    return (folder / SCENE_FILE).is_file() and (folder / RESOLVED_NAME).is_file()
 
 
 @torch.no_grad()
@@ -90,9 +90,6 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
         trainer: at the end of its run; it is left as it is.
         run_dir: of the run.
         megabytes: 1e6 bytes.
-
-    Raises:
-        DyngsError: no way that was tried fits; the run itself is complete.
     """
     whole, scene, config = trainer.checkpoint(), trainer.scene.to(CPU), trainer.config  # files are made on the CPU
     images = probe_images(trainer)

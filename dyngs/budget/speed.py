@@ -20,11 +20,11 @@ from dyngs.budget.run import LimitedRun, stage
 from dyngs.config import Config
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
-from dyngs.evaluate.temporal import Drawing
+from dyngs.evaluate.drawing import Drawing
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.metrics import flip, ssim
 from dyngs.ops.device import finish
-from dyngs.prune.selection import highest
+from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores, training_quality
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE
@@ -86,22 +86,13 @@ class Measured:
 
 
 class SpeedLimit:
-    """Listener that keeps drawing fast enough.
-
-    Args:
-        run: what is limited.
-        fps: training views per second that it owes.
-    """
+    """Listener that keeps drawing fast enough."""
 
     def __init__(self, run: LimitedRun, fps: float) -> None:
         self.run, self.fps, self.found = run, fps, Measured()
 
     def begin(self) -> None:
-        """Measure what is possible, unless a checkpoint says it, and let the trainer add no more Gaussians than that.
-
-        Raises:
-            DyngsError: even a few Gaussians take too long; says what is possible.
-        """
+        """Measure what is possible, unless a checkpoint says it; the trainer may add no more Gaussians than that."""
         found, trainer = self.found, self.run.trainer
         if not found.base:
             scene = _few(trainer)

@@ -1,7 +1,7 @@
 """``train.minutes``: how many steps fit into a time, measured before training and again while it goes on.
 
-Seconds per step are measured; how they go on is assumed: pixels take ``PIXEL_SHARE`` of a step, which later gets slower
-while Gaussians are added (``GROWTH``) and when motion begins (``MOTION``). Later fits correct what is wrong in this.
+Seconds per step are measured; how they go on is foreseen by ``dyngs.training.clock``. Later fits correct what is wrong
+in this.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from statistics import fmean
 
 from torch import Tensor
 
@@ -19,8 +18,9 @@ from dyngs.config import Config
 from dyngs.config.kinds import harmonics_measured_after
 from dyngs.errors import DyngsError
 from dyngs.runs.config_file import write_config
+from dyngs.training.clock import Forecast, with_steps
 from dyngs.training.events import Event, StepDone
-from dyngs.training.schedule import image_divisor, motion_begins_after, scaled
+from dyngs.training.schedule import motion_begins_after
 from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200
@@ -33,9 +33,6 @@ FITS = 20
 """Number of times over a run that the number of steps is adapted."""
 SMALLEST_CHANGE = 0.04
 """Smallest relative change of the number of steps for which the run is prepared again."""
-PIXEL_FRACTION = 0.7
-GROWTH, MOTION = 1.25, 2.0
-_SAMPLES = 64
 
 
 class Deadline:
@@ -67,21 +64,25 @@ class Deadline:
         self.refit_seconds, self.save_seconds = refit_seconds, 0.0
         self._save, self._on_refit = save, on_refit
         self._since: tuple[int, float] | None = None
+        self._forecast = Forecast(0, 0.0)
 
     def __call__(self, event: Event) -> None:
         """Go on, after a step, with as many steps as fit into the time; with none where it is over."""
         match event:
             case StepDone():
-                config, done = self.run.config, event.step
+                config, done, now = self.run.config, event.step, self.run.used
                 if done >= config.train.steps:
                     return
-                found = self.steps(config, done, self.run.used)
+                height, width = event.report.truth.shape[:2]
+                self._forecast.observe(config, done, now, event.num_gaussians, height * width)
+                found = self.steps(config, done, now)
                 if found != config.train.steps:
                     self._go_on(found, done)
 
-    def begin(self, done: int, now: float) -> None:
-        """Measure the rate from here on: after ``done`` steps, ``now`` seconds after the beginning."""
+    def _begin(self, done: int, now: float) -> None:
+        """Measure the pace from here on: after ``done`` steps, ``now`` seconds after the beginning."""
         self._since = done, now
+        self._forecast.restart(done, now, self.run.trainer.num_gaussians)
 
     def steps(self, config: Config, done: int, now: float) -> int:
         """Return how many steps the run should have after ``done`` in ``now`` seconds; ``done`` where the time is over.
@@ -91,7 +92,7 @@ class Deadline:
         """
         total, given, reserve = config.train.steps, self.run.given, self.run.reserve
         if self._since is None:
-            self.begin(done, now)
+            self._begin(done, now)
             return total
         since, then = self._since
         pace = (now - then) / max(done - since, 1)
@@ -99,9 +100,9 @@ class Deadline:
             return done
         if not self.fits or done - since < max(total // FITS, 10) or done >= total:
             return total
-        self.begin(done, now)
         left = AIM * given - now - self.refit_seconds - reserve
-        found = fitting_steps(config, done, pace, left, self.most_steps)
+        found = fitting_steps(self._forecast, config, done, left, self.most_steps)
+        self._begin(done, now)
         worth_it = left > 0 and abs(found - total) > SMALLEST_CHANGE * total
         return found if worth_it and same_phase(config, with_steps(config, found), done) else total
 
@@ -132,16 +133,11 @@ class Deadline:
             self._save()  # a resumed run goes on from here with the new schedules
             now = run.used
             self.refit_seconds, self.save_seconds = prepared - start, now - prepared
-            self.begin(done, now)
+            self._begin(done, now)
         else:
             run.trainer.config = with_steps(run.trainer.config, done)
         write_config(run.config, run.folder)
         run.loop.expect(run.config.total_steps)
-
-
-def with_steps(config: Config, steps: int) -> Config:
-    """Return ``config`` with another ``train.steps``, which all schedules follow."""
-    return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
 
 
 def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
@@ -161,17 +157,19 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
     prepared = time.perf_counter()
     for _ in range(min(PILOT_WARM_UP, wanted - 1)):
         pilot.step()
-    start, done = time.perf_counter(), pilot.done
+    done = pilot.done
+    forecast = Forecast(done, time.perf_counter(), pilot.num_gaussians)
     while pilot.done < min(done + PILOT_STEPS, wanted):
-        pilot.step()
-        if time.perf_counter() - prepared > PILOT_FRACTION * 60 * minutes:
+        height, width = pilot.step().truth.shape[:2]
+        now = time.perf_counter()
+        forecast.observe(config, pilot.done, now, pilot.num_gaussians, height * width)
+        if now - prepared > PILOT_FRACTION * 60 * minutes:
             break
-    now = time.perf_counter()
-    pace, used = (now - start) / (pilot.done - done), used + (prepared - begin) + (now - begin)
-    found = fitting_steps(config, 0, pace, AIM * 60 * minutes - used, wanted)
+    used += (prepared - begin) + (time.perf_counter() - begin)
+    found = fitting_steps(forecast, config, 0, AIM * 60 * minutes - used, wanted)
     fewest = min(FEWEST_STEPS, wanted)
     if found < fewest:
-        needed = (used + seconds_left(config, 0, fewest, pace)) / AIM / 60
+        needed = (used + forecast.seconds(with_steps(config, fewest), fewest, 0)) / AIM / 60
         raise DyngsError(
             f"train.minutes={minutes:g}: about {found} steps would fit, and fewer than {fewest} are of no use; "
             f"{_rounded_up(needed):g} would do, or smaller images (data.longest_side)"
@@ -189,31 +187,14 @@ def refitted(trainer: Trainer, config: Config) -> Trainer:
     return fitted
 
 
-def fitting_steps(config: Config, done: int, pace: float, seconds: float, most: int) -> int:
-    """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in ``seconds``.
-
-    Args:
-        config: by whose schedules ``pace`` was measured, seconds per step.
-    """
+def fitting_steps(forecast: Forecast, config: Config, done: int, seconds: float, most: int) -> int:
+    """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in ``seconds``."""
     low, high = done, max(most, done)
     while low < high:
         middle = (low + high + 1) // 2
-        low, high = (middle, high) if seconds_left(config, done, middle, pace) <= seconds else (low, middle - 1)
+        fits = forecast.seconds(with_steps(config, middle), middle, done) <= seconds
+        low, high = (middle, high) if fits else (low, middle - 1)
     return low
-
-
-def seconds_left(config: Config, done: int, steps: int, pace: float) -> float:
-    """Return the seconds that the rest of ``steps`` takes after ``done``, at ``pace`` seconds per step so far."""
-    options, left = with_steps(config, steps).train, steps - done
-    now = _weight(image_divisor(config.train, max(done, 1)))
-    sampled = (done + math.ceil(left * (i + 0.5) / _SAMPLES) for i in range(_SAMPLES))
-    weight = fmean(_weight(image_divisor(options, step)) for step in sampled) / now
-    if done < scaled(config.strategy.stop, steps):
-        weight *= GROWTH
-    motion = motion_begins_after(config, steps)
-    if motion is not None and done < motion:
-        weight *= MOTION
-    return left * pace * weight
 
 
 def same_phase(old: Config, new: Config, done: int) -> bool:
@@ -225,11 +206,6 @@ def _happened(config: Config, done: int) -> tuple[bool, ...]:
     """Return, for each one-time event of a run, whether it has happened after ``done`` steps."""
     once = motion_begins_after(config, config.train.steps), harmonics_measured_after(config)
     return tuple(done >= step for step in once if step is not None)
-
-
-def _weight(divisor: int) -> float:
-    """Return the time of a step with images shrunk by ``divisor``, relative to one at full size."""
-    return 1 - PIXEL_FRACTION + PIXEL_FRACTION / divisor**2
 
 
 def _rounded_up(x: float) -> float:

@@ -37,7 +37,7 @@ from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import write_seconds
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to, inside, staying_within
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import read_json_object
 from dyngs.files.write import write_image, write_text
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.read import FORMATS
 from dyngs.errors import DyngsError, reading
-from dyngs.files.cache import cache_folder
+from dyngs.files.temporary import cache_folder
 
 FEWEST_PHOTOS = 3
 

@@ -30,6 +30,7 @@ _REQUIRED = {
 _OPTIONAL = {
     "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install 'dyngs[metrics]'"),
     "lpips": ("lpips", "the LPIPS metric: pip install 'dyngs[metrics]'"),
+    "matplotlib": ("matplotlib", "the plot of `dyngs tradeoff`: pip install 'dyngs[plots]'"),
     "tensorboard": ("tensorboard", "train.tensorboard=true: pip install 'dyngs[tensorboard]'"),
 }
 

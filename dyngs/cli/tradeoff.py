@@ -14,10 +14,9 @@ from dyngs.errors import DyngsError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.tradeoff.distributed import ProcessGroup
     from dyngs.tradeoff.measurements import Measurement
-    from dyngs.tradeoff.requirements import Goal, Requirement
-    from dyngs.tradeoff.table import TableRow
+    from dyngs.tradeoff.sweep import ProcessGroup
+    from dyngs.tradeoff.table import Goal, Requirement, TableRow
     from dyngs.tradeoff.variant_runs import VariantRuns
 
 _EPILOG = """\
@@ -40,7 +39,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "tradeoff",
         help="measure quality, speed and size of a run with other settings, and pick the best one",
         description="Vary the settings of a run one at a time and then several together. Writes tradeoff.csv, .json, "
-        ".svg, .png and .html, and picks the best run that meets requirements.",
+        ".html and, with the extra plots, .svg and .png, and picks the best run that meets requirements.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -81,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     from contextlib import nullcontext
 
     from dyngs.runs.lock import writing
-    from dyngs.tradeoff.distributed import ProcessGroup
+    from dyngs.tradeoff.sweep import ProcessGroup
 
     for name, least in (("finetune", 0), ("combine", 0), ("rounds", 1), ("threads", 0)):
         if getattr(arguments, name) < least:
@@ -95,10 +94,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _run(arguments: argparse.Namespace, group: ProcessGroup) -> int:
     from rich.console import Console
 
+    from dyngs.tradeoff.plot import MISSING, can_plot
     from dyngs.tradeoff.report import write_report
-    from dyngs.tradeoff.requirements import parse_goal, parse_requirements
     from dyngs.tradeoff.sweep import Plan, sweep
-    from dyngs.tradeoff.table import table_rows
+    from dyngs.tradeoff.table import parse_goal, parse_requirements, table_rows
     from dyngs.tradeoff.variant_runs import VariantRuns
     from dyngs.tradeoff.variants import parse_variations
 
@@ -131,6 +130,8 @@ def _run(arguments: argparse.Namespace, group: ProcessGroup) -> int:
     console.print(_variants_table(rows, measurements[0].num_views))
     console.print(_exchange_table(measurements))
     print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")
+    if not can_plot():
+        print(f"note: {MISSING}")
     if arguments.require or arguments.minimize or arguments.maximize:
         _write_best(rows, asked, goal, runs)
     return 0
@@ -192,7 +193,7 @@ def _table(title: str, head: Sequence[str]) -> Table:
 
 def _write_best(rows: Sequence[TableRow], asked: tuple[Requirement, ...], goal: Goal, runs: VariantRuns) -> None:
     """Write the best run that meets the requirements and print its metrics."""
-    from dyngs.tradeoff.requirements import choose
+    from dyngs.tradeoff.table import choose
     from dyngs.tradeoff.variant_runs import write_chosen
 
     best = choose(rows, asked, goal)

@@ -19,8 +19,7 @@ import numpy as np
 from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.geometry import inverse_rigid
 from dyngs.errors import DyngsError, printable
-from dyngs.files.fields import is_number
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import is_number, read_json_object
 from dyngs.files.write import write_text
 
 SECONDS_FILE = "times.json"

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.ops.offsets import add_offsets_
 from dyngs.ops.quaternions import identity_quat, quat_product
 from dyngs.ops.registration import has_kernel
+from dyngs.ops.skinning import add_offsets_
 from dyngs.state import State, moved_to, part_of, prefixed
 
 if TYPE_CHECKING:

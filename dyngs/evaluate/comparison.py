@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, median
-from typing import TypeAlias
+from statistics import fmean
 
+import numpy as np
 import torch
 
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
+from dyngs.evaluate.drawing import Drawing, seconds_in_turn
 from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
-from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import psnr
-from dyngs.ops.device import CPU, finish
+from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.training.background import evaluation_background
@@ -26,9 +25,6 @@ from dyngs.training.background import evaluation_background
 COMPARED_VIEWS = 20
 """Number of views compared per split; enough for before and after, not for a benchmark."""
 ROUNDS = 3
-
-_Shown: TypeAlias = list[tuple[Image, list[Drawing]]]
-"""Images, each with one drawing per run."""
 
 
 @dataclass(frozen=True)
@@ -52,27 +48,21 @@ class Cost:
 
 
 def compared(folders: Sequence[Path], threads: int, device: torch.device = CPU) -> list[Cost]:
-    """Return the costs of runs on one capture; images are drawn in turn, so that machine load affects all.
-
-    Args:
-        folders: of runs, or of files that were exported from them; the capture is that of the first.
-        threads: to draw with.
-        device: draws.
-    """
+    """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all alike."""
     runs = [load_run(folder) for folder in folders]
     capture = read_capture(runs[0].config.data)
     has_test = bool(capture.splits.get("test"))
     with kernel_threads(threads), torch.no_grad():
         splits = ("train", "test") if has_test else ("train",)
         shown = {split: _views(runs, capture, split, device) for split in splits}
-        psnrs = {split: _psnr(len(runs), views) for split, views in shown.items()}
-        fps = _fps(len(runs), shown[splits[-1]], device)
+        psnrs = {split: _psnrs(*views) for split, views in shown.items()}
+        seconds = seconds_in_turn(*shown[splits[-1]], ROUNDS)
     return [
         Cost(
             num_gaussians=len(run.scene),
             psnr_train=psnrs["train"][i],
             psnr_test=psnrs["test"][i] if has_test else None,
-            fps=fps[i],
+            fps=1 / float(np.median(seconds[i])),
             megabytes=parameter_megabytes(run.scene),
             stored=_stored(folders[i]),
         )
@@ -84,28 +74,19 @@ def _stored(folder: Path) -> float | None:
     return 1e-6 * (folder / SCENE_FILE).stat().st_size if has_only_scene_file(folder) else None
 
 
-def _psnr(num_runs: int, views: _Shown) -> list[float]:
-    values: list[list[float]] = [[] for _ in range(num_runs)]
-    for image, drawings in views:
-        for found, drawing in zip(values, drawings, strict=True):
-            drawn = drawing.image(image.cameras, image.time)
-            found.append(psnr(drawn, image.composite(drawing.background), image.mask))
-    return [fmean(found) for found in values]
+def _psnrs(drawings: Sequence[Drawing], images: Sequence[Image]) -> list[float]:
+    """Return the mean PSNR of each drawing, dB."""
+    truths = [(image, image.composite(drawings[0].background)) for image in images]
+    return [
+        fmean(psnr(drawing.image(image.cameras, image.time), truth, image.mask) for image, truth in truths)
+        for drawing in drawings
+    ]
 
 
-def _fps(num_runs: int, views: _Shown, device: torch.device) -> list[float]:
-    seconds: list[list[float]] = [[] for _ in range(num_runs)]
-    for image, drawings in views * ROUNDS:
-        for found, drawing in zip(seconds, drawings, strict=True):
-            start = time.perf_counter()
-            drawing.image(image.cameras, image.time)
-            finish(device)
-            found.append(time.perf_counter() - start)
-    return [1 / median(found) for found in seconds]
-
-
-def _views(runs: Sequence[LoadedRun], capture: Capture, split: str, device: torch.device) -> _Shown:
-    """Return some images of a split, each with one drawing per run."""
+def _views(
+    runs: Sequence[LoadedRun], capture: Capture, split: str, device: torch.device
+) -> tuple[list[Drawing], list[Image]]:
+    """Return one drawing per run as a split shows it, and some images of that split."""
     config = runs[0].config
     loader = ImageLoader(split_views(capture, split), config.data)
     loader.device = device
@@ -114,4 +95,4 @@ def _views(runs: Sequence[LoadedRun], capture: Capture, split: str, device: torc
         Drawing(scene_of_split(run, capture, split).to(device), render_options(run.config.model), background)
         for run in runs
     ]
-    return [(loader[i], drawings) for i in evenly_spaced(len(loader), COMPARED_VIEWS)]
+    return drawings, [loader[i] for i in evenly_spaced(len(loader), COMPARED_VIEWS)]

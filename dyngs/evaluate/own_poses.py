@@ -18,7 +18,7 @@ import torch
 
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
-from dyngs.evaluate.temporal import Drawing
+from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.view_scores import PoseScores, means_of, score_views
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
@@ -44,14 +44,7 @@ class PoseRefinement:
 
 
 def scores_from_own_poses(drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips) -> PoseRefinement:
-    """Return the scores of images from poses that were fitted to them; the scene stays as it is.
-
-    Args:
-        drawing: of the scene.
-        images: of a split.
-        size: of the scene, world units.
-        lpips: from ``load_lpips``.
-    """
+    """Return the scores of images from poses that were fitted to them; the scene stays as it is."""
     avatar = avatar_of(drawing.scene)
     if avatar is None:
         return PoseRefinement(psnr_from_own_poses(drawing, images, size))
@@ -72,13 +65,7 @@ def _person_scores(
 
 
 def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
-    """Return the mean PSNR, dB, of images from poses that were fitted to them; the scene stays as it is.
-
-    Args:
-        drawing: of the scene.
-        images: of a split.
-        size: of the scene, world units.
-    """
+    """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in world units."""
     scene, options, background = drawing.scene, drawing.options, drawing.background
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
@@ -94,9 +81,6 @@ def images_of_split(capture: Capture, views: Sequence[View], run_dir: Path, run:
 
     Images that were not trained on have the lens that they share with others, and the pose of a camera that stands
     still; all other poses are those of the capture.
-
-    Raises:
-        DyngsError: unreadable images, or a checkpoint of other views.
     """
     images = ImageLoader(views, run.config.data)
     found = found_corrections(run_dir, run, capture.splits["train"])

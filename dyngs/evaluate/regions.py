@@ -6,7 +6,6 @@ Local letters: T images of a camera, H x W pixels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -17,7 +16,8 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced, static_cameras
 from dyngs.metrics import psnr
 
-RegionName = Literal["foreground", "moving", "still"]
+RegionMetric = Literal["psnr_foreground", "psnr_moving", "psnr_static"]
+REGION_METRICS: tuple[RegionMetric, ...] = ("psnr_foreground", "psnr_moving", "psnr_static")
 
 FEWEST_PIXELS = 25
 """A region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing."""
@@ -31,15 +31,6 @@ NO_ALPHA = "the images have no alpha and no silhouettes"
 NO_TIMES = "the images have no times"
 NO_MOTION_KNOWN = "the views have no motion masks, and no camera of this split stands still while time passes"
 TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
-
-
-@dataclass(frozen=True)
-class RegionScores:
-    """PSNR of one view in dB inside each region; None where it has too few such pixels, or they are not known."""
-
-    foreground: float | None = None
-    moving: float | None = None
-    still: float | None = None
 
 
 class Regions:
@@ -69,22 +60,17 @@ class Regions:
         self._moving_from: set[str] = set()
         self._has_alpha = False
 
-    def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> RegionScores:
-        """Return the PSNR of a view's regions.
-
-        Args:
-            image: of the view.
-            rendered, truth: (H, W, 3) on the same background.
-        """
+    def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[str, float | None]:
+        """Return the PSNR of a view's regions, dB, by metric; None for too few such pixels, or unknown ones."""
         foreground, moves = foreground_of(image), self.moving(image)
         self._has_alpha |= foreground is not None
         inside = torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
         parts = {
-            "foreground": foreground,
-            "moving": None if moves is None else moves & inside,
-            "still": None if moves is None else ~moves & inside,
+            "psnr_foreground": foreground,
+            "psnr_moving": None if moves is None else moves & inside,
+            "psnr_static": None if moves is None else ~moves & inside,
         }
-        return RegionScores(**{name: _psnr_inside(part, image, rendered, truth) for name, part in parts.items()})
+        return {metric: _psnr_inside(part, image, rendered, truth) for metric, part in parts.items()}
 
     def moving(self, image: Image) -> Tensor | None:
         """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
@@ -104,9 +90,9 @@ class Regions:
         """How it was found what moves in the images so far; None where it was not."""
         return " and ".join(sorted(self._moving_from)) or None
 
-    def reason(self, name: RegionName) -> str:
+    def reason(self, metric: RegionMetric) -> str:
         """Return why no image so far has a score of this region."""
-        if name == "foreground":
+        if metric == "psnr_foreground":
             return TOO_SMALL if self._has_alpha else NO_ALPHA
         if self._moving_from:
             return TOO_SMALL

@@ -18,11 +18,12 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
+from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.own_poses import PoseRefinement, images_of_split, scores_from_own_poses
-from dyngs.evaluate.regions import RegionName, Regions
-from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_of_split, psnr_per_time
+from dyngs.evaluate.regions import REGION_METRICS, Regions
+from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
-from dyngs.evaluate.view_scores import PoseScores, ViewScore, mean_of, means_of, score_views
+from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.human.avatar.scene import avatar_of
@@ -33,26 +34,15 @@ from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, lo
 from dyngs.training.background import evaluation_background
 from dyngs.training.views import training_cameras
 
-REGION_METRICS: dict[str, RegionName] = {
-    "psnr_foreground": "foreground",
-    "psnr_moving": "moving",
-    "psnr_static": "still",
-}
-"""Metrics of regions: their names, and the regions."""
-
 
 @dataclass(frozen=True)
 class EvalReport:
-    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file (docs/formats.md).
+    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see docs/formats.md.
 
     Attributes:
-        split: which views.
-        num_views, width, height: how many, and the size of the first in pixels.
-        background: name of the colour behind images and renders, "white" or "black".
-        psnr, ssim, flip, lpips: means over the views of the per-view values.
-        lpips_net: backbone that LPIPS uses, or would use.
-        num_gaussians: N.
-        num_moving, moving_fraction: M and M / N.
+        width, height: size of the first view in pixels.
+        psnr, ssim, flip, lpips and the like: means over the views of what ``ViewScore`` holds, None where one has none.
+        psnr_foreground, psnr_moving, psnr_static: means over the views that have such a region (``Regions``).
         model_mb: float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per
             Gaussian.
         field_mb: of these, the field's.
@@ -60,27 +50,12 @@ class EvalReport:
         fps: one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and
             metrics not counted.
         deform_fraction: median fraction of that time that the deformation takes.
-        psnr_per_time: mean PSNR at each distinct time; empty for a still capture.
-        flicker, flicker_error: see ``dyngs.evaluate.temporal``.
-        seconds_train, step: how long and how far the run was trained.
+        stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
         reasons: metric name to why it is None.
         notes: anything else that a reader of the numbers should know.
-        per_view: the single views.
-        stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
-        psnr_person, ssim_person: means inside the box around the person, where the true image is not transparent;
-            only of a human model, and None where images have no alpha.
-        psnr_black, ssim_black, lpips_black: means of the whole image on black, as published figures of people have
-            it; None in the same cases.
-        psnr_foreground, psnr_moving, psnr_static: means over the views that have such a region, see
-            ``dyngs.evaluate.regions``.
         moving_from: how it was found what moves, None where it was not.
-        psnr_right, psnr_right_fitted: means of the PSNR of right halves, as the scene shows them, and after an affine
-            colour fitted on left halves, see ``dyngs.evaluate.half_fit``; None where a half has no pixel that counts.
-        track_error_px, track_within_5px, track_motion_px: see ``dyngs.evaluate.tracks``.
-        psnr_own_poses: PSNR from poses refined on the images themselves, of cameras (``dyngs.evaluate.own_poses``)
-            or of the body (``dyngs.human.avatar.pose_fit``); None where that was not asked for.
-        own_poses: of a person, all scores from these poses.
-        silhouette_poses: of a person, all scores from poses fitted to the silhouettes of these images alone.
+        track_error_px, track_within_5px, track_motion_px: see ``TrackScores``.
+        psnr_own_poses, own_poses, silhouette_poses: see ``PoseRefinement``; None where that was not requested.
     """
 
     split: str
@@ -152,10 +127,6 @@ def evaluate_run(
         refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
             images themselves; always done for a run that refined its cameras.
         device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
-
-    Raises:
-        DyngsError: no such run or split, unreadable images, a render or metric that is not finite, unwritable folder,
-            poses of training views that are to be refined, no GPU that can be used.
     """
     draws_on = device_for(device)
     _require_untrained(run_dir, split, refine_poses)
@@ -175,28 +146,25 @@ def evaluate_run(
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
         fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips) if asked else PoseRefinement()
-    reasons |= {name: measured.reason for name, measured in temporal.items() if measured.reason is not None}
     report = EvalReport(
         split=split,
-        num_views=len(scores),
         background=background,
-        flip=mean_of([s.flip for s in scores]),
         lpips_net=lpips_net,
-        psnr_per_time=psnr_per_time((s.time, s.psnr) for s in scores),
-        reasons=reasons,
+        moving_from=regions.moving_from,
         notes=_notes(run, scores),
-        per_view=tuple(scores),
-        **_own_poses(fitted),
-        **{name: measured.value for name, measured in temporal.items()},
-        **means_of(scores),
+        psnr_own_poses=fitted.psnr,
+        own_poses=fitted.to_images,
+        silhouette_poses=fitted.to_silhouettes,
+        **{name: metric.value for name, metric in temporal.items()},
+        track_error_px=tracks.error_px,
+        track_within_5px=tracks.within_5px,
+        track_motion_px=tracks.motion_px,
+        **_of_views(scores),
         **_facts(run_dir, run, scene),
-        **_sizes_and_speed(scores),
     )
-    return _written(run_dir, _with_parts(report, regions, tracks))
-
-
-def _written(run_dir: Path, report: EvalReport) -> EvalReport:
-    write_text(report_path(run_dir, report.split), report.to_json())
+    reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason is not None}
+    report = replace(report, reasons=reasons | _reasons(report, regions, tracks))
+    write_text(report_path(run_dir, split), report.to_json())
     return report
 
 
@@ -205,15 +173,6 @@ def _require_untrained(run_dir: Path, split: str, refine_poses: bool) -> None:
         raise DyngsError(
             f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"
         )
-
-
-def _own_poses(fitted: PoseRefinement) -> dict[str, Any]:
-    """Return the fields of a report on refined poses."""
-    return {
-        "psnr_own_poses": fitted.psnr,
-        "own_poses": fitted.to_images,
-        "silhouette_poses": fitted.to_silhouettes,
-    }
 
 
 def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
@@ -231,45 +190,30 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
     }
 
 
-def _sizes_and_speed(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the size of the first image, and how fast all were drawn."""
-    return {
+def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
+    """Return the fields of a report on views; means of regions are over the views that have one, others over all."""
+    means: dict[str, Any] = {
+        "num_views": len(scores),
         "width": scores[0].width,
         "height": scores[0].height,
-        "fps": 1 / median(s.render_seconds for s in scores),
-        "deform_fraction": median(s.deform_seconds / s.render_seconds for s in scores),
+        "fps": 1 / median(score.render_seconds for score in scores),
+        "deform_fraction": median(score.deform_seconds / score.render_seconds for score in scores),
+        "psnr_per_time": psnr_per_time((score.time, score.psnr) for score in scores),
+        "per_view": tuple(scores),
     }
+    means |= means_of(scores) | means_of(scores, ("flip", "psnr_right", "psnr_right_fitted"))
+    for metric in REGION_METRICS:
+        known = [value for value in (getattr(score, metric) for score in scores) if value is not None]
+        means[metric] = fmean(known) if known else None
+    return means
 
 
-def _with_parts(report: EvalReport, regions: Regions, tracks: TrackScores) -> EvalReport:
-    """Return the report with the means of the regions' metrics, and the errors of tracks."""
-    reasons: dict[str, str] = {}
-    means: dict[str, float | None] = {}
-    for metric, region in REGION_METRICS.items():
-        known = [value for value in (getattr(view, metric) for view in report.per_view) if value is not None]
-        means[region] = fmean(known) if known else None
-        if not known:
-            reasons[metric] = regions.reason(region)
-    right, fitted = (
-        mean_of([getattr(x, name) for x in report.per_view]) for name in ("psnr_right", "psnr_right_fitted")
-    )
-    if right is None:
-        reasons["psnr_right"] = reasons["psnr_right_fitted"] = "half a view has no pixel that counts"
-    if tracks.reason is not None:
-        reasons["track_error_px"] = tracks.reason
-    return replace(
-        report,
-        psnr_foreground=means["foreground"],
-        psnr_moving=means["moving"],
-        psnr_static=means["still"],
-        psnr_right=right,
-        psnr_right_fitted=fitted,
-        moving_from=regions.moving_from,
-        track_error_px=tracks.error_px,
-        track_within_5px=tracks.within_5px,
-        track_motion_px=tracks.motion_px,
-        reasons=report.reasons | reasons,
-    )
+def _reasons(report: EvalReport, regions: Regions, tracks: TrackScores) -> dict[str, str]:
+    """Return why there are no values of parts of the images, and no errors of tracks, by the metric."""
+    reasons = {metric: regions.reason(metric) for metric in REGION_METRICS if getattr(report, metric) is None}
+    if report.psnr_right is None:
+        reasons |= dict.fromkeys(("psnr_right", "psnr_right_fitted"), "half a view has no pixel that counts")
+    return reasons if tracks.reason is None else reasons | {"track_error_px": tracks.reason}
 
 
 def report_path(run_dir: Path, split: str) -> Path:

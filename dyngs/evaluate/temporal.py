@@ -21,8 +21,7 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.evaluate.drawing import Drawing
 from dyngs.metrics import MetricValue
 
 MAX_MOMENTS = 60
@@ -41,33 +40,8 @@ class TimeScore:
     num_views: int
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """A scene and how it is drawn.
-
-    Attributes:
-        scene: Gaussians at any time.
-        options: as in training, without depth.
-        background: (3,) colour.
-    """
-
-    scene: Scene
-    options: RenderOptions
-    background: Tensor
-
-    @torch.no_grad()
-    def image(self, cameras: Cameras, time: float | None) -> Tensor:
-        """Return the image (H, W, 3) of the one camera at ``time``, clamped to [0, 1]."""
-        drawn = self.scene.render(cameras, time, options=self.options, background=self.background)
-        return drawn.rgb[0].clamp(0, 1)
-
-
 def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Return ``times`` within [0, 1], and a line of warning where one was not.
-
-    Raises:
-        DyngsError: a time that is not finite.
-    """
+    """Return ``times`` within [0, 1], and a line of warning where one was not."""
     if not all(math.isfinite(t) for t in times):
         raise DyngsError(f"times must be finite numbers in [0, 1], got {', '.join(f'{t:g}' for t in times)}")
     inside = tuple(min(max(float(t), 0.0), 1.0) for t in times)
@@ -106,7 +80,7 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
     seen: dict[int, Tensor] = {}
     values = []
     for k in _middles(len(times)):
-        seen = {i: seen[i] if i in seen else drawing.image(cameras, times[i]) for i in (k - 1, k, k + 1)}
+        seen = {i: seen[i] if i in seen else drawing.image(cameras, times[i]).clamp(0, 1) for i in (k - 1, k, k + 1)}
         before, now, after = (times[i] for i in (k - 1, k, k + 1))
         line = torch.lerp(seen[k + 1], seen[k - 1], (after - now) / (after - before))
         values.append(2 * 255 * _mean_change(line, seen[k]))
@@ -118,11 +92,6 @@ def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) 
 
     Over all neighbours in time of each pose that has several times; a mask leaves out what does not count in one of
     the two. Something that should move but does not has it, as has everything that flickers.
-
-    Args:
-        drawing: what is drawn.
-        loader: images of ``views``, in their order.
-        views: one split.
     """
     if all(view.time is None for view in views):
         return MetricValue(None, _NO_TIMES)
@@ -158,7 +127,7 @@ def _signed_error(drawing: Drawing, image: Image) -> tuple[Tensor, Tensor]:
     """Return (H, W, 3) render minus truth and its mask (H, W): R' - R - (G' - G) is the difference of two of them."""
     truth = image.composite(drawing.background).clamp(0, 1)
     counts = torch.ones(truth.shape[:2], device=truth.device) if image.mask is None else image.mask
-    return drawing.image(image.cameras, image.time) - truth, counts
+    return drawing.image(image.cameras, image.time).clamp(0, 1) - truth, counts
 
 
 def _mean_change(a: Tensor, b: Tensor) -> float:

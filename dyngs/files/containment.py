@@ -64,11 +64,7 @@ def images_up_to(megapixels: float) -> Iterator[None]:
 
 
 def inside(path: Path) -> Path:
-    """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may.
-
-    Raises:
-        DyngsError: it lies outside the capture (says where), or it is a pipe or a device.
-    """
+    """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
     boundary = _boundary.get()
     if boundary is not None:
         _require_below(boundary, path)
@@ -87,11 +83,7 @@ def _require_below(boundary: _Boundary, path: Path) -> None:
 
 
 def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
-    """Check that an image is not too large to be decoded; more than four channels count in proportion.
-
-    Raises:
-        DyngsError: it has more pixels than are allowed; says how many and which key allows more.
-    """
+    """Check that an image is not too large to be decoded; more than four channels count in proportion."""
     megapixels, limit = width * height * max(channels / 4, 1) / 1e6, _max_megapixels.get()
     if megapixels > limit:
         many = f" of {channels} channels" if channels > 4 else ""

@@ -1,17 +1,37 @@
-"""Checks of values in dictionaries from files: required keys, numbers, matrices."""
+"""JSON files and checks of values in dictionaries from files: required keys, numbers, matrices."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
 
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading
+from dyngs.files.containment import inside
 
 LARGEST = 1e30
 """Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
+
+
+def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
+    """Read the JSON object in ``path``; a byte order mark is allowed.
+
+    Args:
+        what: text of the error for a file that holds anything else than an object.
+    """
+    with reading(path, "it must be a JSON file; copy or export it again"):
+        try:
+            fields = json.loads(inside(path).read_text(encoding="utf-8-sig"))
+        except json.JSONDecodeError as error:
+            where = f"{path}, line {error.lineno} column {error.colno}"
+            raise DyngsError(f"{where}: broken JSON ({error.msg}); copy or export it again") from error
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{path}: {what}")
+    return fields
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
@@ -20,11 +40,7 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 
 def matrix_of(where: str, key: str, value: object) -> np.ndarray:
-    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not checked.
-
-    Raises:
-        DyngsError: other things than numbers; ``where`` and ``key`` say which.
-    """
+    """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not checked."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -32,11 +48,7 @@ def matrix_of(where: str, key: str, value: object) -> np.ndarray:
 
 
 def entry(where: object, fields: object, key: str) -> Any:
-    """Return ``fields[key]`` of a dictionary from a file.
-
-    Raises:
-        DyngsError: it is no dictionary or lacks the key; ``where`` says which file.
-    """
+    """Return ``fields[key]`` of a dictionary from a file."""
     if not isinstance(fields, dict):
         raise DyngsError(f"{where}: must be a dictionary with the key '{key}'; export it again")
     if key not in fields:
@@ -45,11 +57,7 @@ def entry(where: object, fields: object, key: str) -> Any:
 
 
 def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
-    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the file may differ.
-
-    Raises:
-        DyngsError: no numbers, or another number of them; ``where`` says which file.
-    """
+    """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the file may differ."""
     array = float_array(value)
     fits = array is not None and (shape is None or array.size == math.prod(shape))
     if array is None or not fits or not (np.abs(array) <= LARGEST).all():

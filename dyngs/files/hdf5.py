@@ -15,11 +15,7 @@ from dyngs.files.containment import check_size, inside
 
 
 def read_hdf5(path: Path, key: str, rows: int | EllipsisType = ...) -> np.ndarray:
-    """Read the data set ``key`` of an HDF5 file, or one row of it.
-
-    Raises:
-        DyngsError: h5py is not installed; the file is missing or damaged, or lacks the data set or the row.
-    """
+    """Read the data set ``key`` of an HDF5 file, or one row of it."""
     return np.asarray(_hdf5(path, key, rows))
 
 

@@ -13,11 +13,7 @@ VARIABLE = "DYNGS_LIMITS"
 
 
 def allowed(most: int) -> int:
-    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not set.
-
-    Raises:
-        DyngsError: the variable is not a number of at least 1.
-    """
+    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not set."""
     text = os.environ.get(VARIABLE, "1")
     try:
         factor = float(text)
@@ -29,17 +25,7 @@ def allowed(most: int) -> int:
 
 
 def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
-    """Check that a file asks for no more than the limit, which ``DYNGS_LIMITS`` may raise.
-
-    Args:
-        where: the file.
-        amount: number that the file asks for.
-        most: the limit.
-        what: what is counted, in the plural, for the message.
-
-    Raises:
-        DyngsError: names the file, both numbers, and the variable that allows more.
-    """
+    """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that ``DYNGS_LIMITS`` may raise."""
     if amount > most and amount > allowed(most):
         shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
         factor = math.ceil(amount / most) if amount < 10**18 else "N"

@@ -49,22 +49,14 @@ def read_arrays(path: Path, choose: Callable[[Collection[str]], Iterable[str]]) 
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read the float64 array of a ``.npy`` file; archives and Python objects are refused.
-
-    Raises:
-        DyngsError: the file is missing, damaged, or holds something else than numbers.
-    """
+    """Read the float64 array of a ``.npy`` file; archives and Python objects are refused."""
     # NumPy reads the header as Python text; a damaged one raises nearly anything.
     with reading(path, "it must be a NumPy array of numbers; copy it again"), inside(path).open("rb") as file:
         return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
 
 def read_map(path: Path, key: str) -> np.ndarray:
-    """Read the numbers of a ``.npy``, or the array ``key`` or else the only one of a ``.npz``, as float64.
-
-    Raises:
-        DyngsError: the file is missing, damaged, holds no numbers, or several arrays of which none is ``key``.
-    """
+    """Read the numbers of a ``.npy``, or the array ``key`` or else the only one of a ``.npz``, as float64."""
     if not inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it or remove it from the capture")
     if path.suffix.lower() != ".npz":
@@ -77,11 +69,7 @@ def read_map(path: Path, key: str) -> np.ndarray:
 
 
 def read_npz(path: Path, keys: Collection[str], optional: Collection[str] = ()) -> dict[str, np.ndarray]:
-    """Read the arrays ``keys`` of a ``.npz`` file, and those of ``optional`` that exist; Python objects are refused.
-
-    Raises:
-        DyngsError: the file is missing or damaged, holds objects there, lacks a key, or asks for too much memory.
-    """
+    """Read the arrays ``keys`` of a ``.npz`` file, and those of ``optional`` that exist; Python objects are refused."""
     if not inside(path).is_file():
         raise DyngsError(f"{path}: no such file; it should hold the body parameters {', '.join(keys)}")
     found = read_arrays(path, lambda names: [name for name in (*keys, *optional) if name in names])

@@ -1,4 +1,4 @@
-"""Temporary files and folders beside their targets, and removal of those that killed processes left behind."""
+"""Files that may go: temporary ones beside their targets, those that killed processes left, and the user's cache."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import shutil
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 from dyngs.errors import DyngsError
 
+CACHE_VARIABLE = "DYNGS_CACHE_DIR"
 _NAME = re.compile(r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})\.dyngs(?P<suffix>\.[^.]*)?", re.DOTALL)
 
 
@@ -27,11 +29,7 @@ def temporary_beside(path: Path) -> Path:
 
 
 def temporary_folder_beside(path: Path) -> Path:
-    """Create an empty temporary folder, to be renamed to ``path``; an earlier one of this process is replaced.
-
-    Raises:
-        DyngsError: it cannot be created.
-    """
+    """Create an empty temporary folder, to be renamed to ``path``; an earlier one of this process is replaced."""
     try:
         folder = temporary_beside(path)
         shutil.rmtree(folder, ignore_errors=True)
@@ -104,3 +102,13 @@ def _is_alive(pid: int) -> bool:
     except OSError:  # somebody else's
         return True
     return True
+
+
+def cache_folder(kind: Literal["frames", "poses", "bodies"]) -> Path:
+    """Return the folder of one kind of cached files: in ``$DYNGS_CACHE_DIR``, else in the user's cache."""
+    chosen = os.environ.get(CACHE_VARIABLE, "")
+    if chosen:
+        return Path(chosen).expanduser().absolute() / kind
+    from platformdirs import user_cache_path
+
+    return user_cache_path("dyngs", appauthor=False) / kind

@@ -46,9 +46,6 @@ def write_tensors(
         tensors: contiguous tensors by name.
         header: values that JSON can hold.
         advice: end of the message for a full disk.
-
-    Raises:
-        DyngsError: the file cannot be written.
     """
     full = {"format": kind.version, **header}
     full["digest"] = _digest(tensors, full)
@@ -67,11 +64,6 @@ def write_tensors(
 
 def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read header and tensors of a file.
-
-    Args:
-        path: file to read.
-        kind: expected kind.
-        advice: end of the messages for damaged files.
 
     Raises:
         DyngsError: a file that is missing, truncated, altered, of another kind or version.

@@ -1,16 +1,16 @@
-"""Atomic writing of files, text and images: a file appears complete or not at all."""
+"""Atomic writing of files, text and images: a file appears complete or not at all. Error texts of OpenImageIO."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
-from dyngs.errors import DyngsError
-from dyngs.files.image_errors import image_error
+from dyngs.errors import DyngsError, printable
 from dyngs.files.temporary import temporary_beside
 
 
@@ -23,9 +23,6 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     Args:
         path: file to write.
         durable: also wait until it is on disk, so that a power cut leaves the old file or the new one, complete.
-
-    Raises:
-        DyngsError: the folder cannot be made or the file cannot be written.
     """
     try:
         temporary = temporary_beside(path)
@@ -67,9 +64,6 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         path: ``.png`` or ``.jpg`` (8 bit), ``.exr`` (float32), or what else OpenImageIO writes.
         pixels: (H, W) or (H, W, C); uint8 as it is, or floats, which are clamped to [0, 1] for 8-bit formats. A fourth
             channel is alpha: straight for PNG, premultiplied for EXR, as these formats want it.
-
-    Raises:
-        DyngsError: unknown suffix, a full disk, and the like.
     """
     import OpenImageIO as oiio
 
@@ -100,3 +94,23 @@ def to_uint8(pixels: np.ndarray) -> np.ndarray:
         return pixels
     clean = np.nan_to_num(pixels.astype(np.float32), nan=0.0)
     return (np.clip(clean, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+class _HasErrors(Protocol):
+    """OpenImageIO itself, or one of its readers and writers."""
+
+    def geterror(self) -> str: ...
+
+
+def image_error(source: _HasErrors) -> str:
+    """Return the last error of OpenImageIO as one short line, "" if there is none."""
+    text = any_text(source.geterror).strip()
+    return printable(text.splitlines()[0], 100) if text else ""
+
+
+def any_text(ask: Callable[[], str]) -> str:
+    """Return the text of ``ask``, with escapes for bytes that are not UTF-8, where OpenImageIO's binding raises."""
+    try:
+        return ask()
+    except UnicodeDecodeError as error:
+        return error.object.decode("utf-8", "backslashreplace")

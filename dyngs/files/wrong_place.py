@@ -25,10 +25,6 @@ def command_for(path: Path, *, captures: bool = True) -> str | None:
     """Return what the path is and the command that takes it, in a few words; None for anything else.
 
     Only names are looked at, those directly in a folder and in ``images`` below it.
-
-    Args:
-        path: a file or a folder.
-        captures: captures are named, too.
     """
     where = shlex.quote(str(path))
     static, dynamic = (f"`dyngs train {preset} data.root={where}`" for preset in ("static", "dynamic"))

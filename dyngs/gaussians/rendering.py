@@ -13,9 +13,8 @@ from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.ops.finite import check_finite, finite_rows
+from dyngs.ops.checks import check_choice, check_count, check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
-from dyngs.ops.options import check_choice, check_count
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads, writable
-from dyngs.ops.registration import has_kernel, register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import InPlace, has_kernel, launch, register
 from dyngs.ops.transfer import sent
 
 Count: TypeAlias = int | Tensor
@@ -28,48 +28,23 @@ def _adam_step(
     eps: float,
     step: int,
 ) -> Tensor:
-    moments = writable(exp_avg), writable(exp_avg_sq)
-    chosen, options = None if rows is None else array(rows), (betas[0], betas[1], eps, step)
     skipped = param.new_zeros(1, dtype=torch.int32)
-    arrays = writable(param), array(grad), *moments, array(rates), chosen, array(skipped)
-    core_for(param).adam_step(*arrays, options, num_threads())
+    changed, options = [InPlace(x) for x in (param, exp_avg, exp_avg_sq)], (betas[0], betas[1], eps, step)
+    launch(param, "adam_step", changed[0], grad, *changed[1:], rates, rows, skipped, options, num_threads())
     return skipped[0].long()
 
 
-def _fake_adam_step(
-    param: Tensor,
-    grad: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    rates: Tensor,
-    rows: Tensor | None,
-    betas: list[float],
-    eps: float,
-    step: int,
-) -> Tensor:
-    return param.new_empty((), dtype=torch.int64)
-
-
-adam_step_op = register(
-    "adam_step_",
-    _adam_step,
-    fake=_fake_adam_step,
-    mutates=("param", "exp_avg", "exp_avg_sq"),
-)
+adam_step_op = register("adam_step_", _adam_step, mutates=("param", "exp_avg", "exp_avg_sq"))
 """Update (N, C) arrays in place, with rates (C,) and rows (N,) bool; returns the number () int64 of rows skipped."""
 
 
 def _seen_rows(grads: Tensor) -> Tensor:
-    seen = grads.new_empty(len(grads), dtype=torch.bool)
-    core_for(grads).seen_rows(array(grads), array(seen), num_threads())
+    seen = grads.new_empty(grads.shape[0], dtype=torch.bool)
+    launch(grads, "seen_rows", grads, seen, num_threads())
     return seen
 
 
-def _fake_seen_rows(grads: Tensor) -> Tensor:
-    return grads.new_empty(len(grads), dtype=torch.bool)
-
-
-seen_rows_op = register("seen_rows", _seen_rows, fake=_fake_seen_rows)
+seen_rows_op = register("seen_rows", _seen_rows)
 
 
 @torch.no_grad()

@@ -4,48 +4,30 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, empty_like, launch, register
 
 
 def _harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
     colors = means.new_empty(centers.shape[0], means.shape[0], 3)
-    arrays = (array(x) for x in (means, centers, sh, radii))
-    core_for(means).harmonics_forward(*arrays, array(colors), degree, num_threads())
+    launch(means, "harmonics_forward", means, centers, sh, radii, colors, degree, num_threads())
     return colors
-
-
-def _fake_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
-    return means.new_empty(centers.shape[0], means.shape[0], 3)
 
 
 def _harmonics_backward(
     inputs: list[Tensor], colors: Tensor, grad: Tensor, degree: int, with_centers: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     means, centers, sh, _ = inputs
-    g_means, g_sh = (torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means, sh))
+    g_means, g_sh = empty_like(means), empty_like(sh)
     g_centers = centers.new_zeros(centers.shape)
-    core_for(means).harmonics_backward(
-        *(array(x) for x in inputs),
-        (array(colors), array(grad)),
-        (array(g_means), array(g_sh), array(g_centers) if with_centers else None),
-        degree,
-        num_threads(),
-    )
+    results = g_means, g_sh, g_centers if with_centers else None
+    launch(means, "harmonics_backward", *inputs, (colors, grad), results, degree, num_threads())
     return g_means, g_sh, g_centers
 
 
-def _fake_harmonics_backward(
-    inputs: list[Tensor], colors: Tensor, grad: Tensor, degree: int, with_centers: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    g_means, g_sh, g_centers = (torch.empty_like(inputs[i], memory_format=torch.contiguous_format) for i in (0, 2, 1))
-    return g_means, g_sh, g_centers
-
-
-harmonics_backward_op = register("harmonics_backward", _harmonics_backward, fake=_fake_harmonics_backward)
+harmonics_backward_op = register("harmonics_backward", _harmonics_backward)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -60,7 +42,7 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return g_means, g_centers if with_centers else None, g_sh, None, None
 
 
-harmonics_op = register("harmonics", _harmonics, fake=_fake_harmonics, gradient=Gradient(_save, _backward))
+harmonics_op = register("harmonics", _harmonics, gradient=Gradient(_save, _backward))
 
 
 def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:

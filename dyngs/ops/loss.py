@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, has_kernel, register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, has_kernel, launch, register
 
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
@@ -28,23 +28,8 @@ def _l1_ssim(
 ) -> tuple[Tensor, Tensor]:
     gradient = torch.empty_like(rendered) if with_gradient else None
     loss = rendered.new_empty(1, dtype=torch.float64)
-    core_for(rendered).l1_ssim(
-        array(rendered),
-        array(target),
-        None if mask is None else array(mask),
-        None if gradient is None else array(gradient),
-        array(loss),
-        ssim_weight,
-        num_threads(),
-    )
+    launch(rendered, "l1_ssim", rendered, target, mask, gradient, loss, ssim_weight, num_threads())
     return loss[0].to(rendered.dtype), rendered.new_empty(0) if gradient is None else gradient
-
-
-def _fake_l1_ssim(
-    rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, with_gradient: bool
-) -> tuple[Tensor, Tensor]:
-    gradient = torch.empty_like(rendered) if with_gradient else rendered.new_empty(0)
-    return rendered.new_empty(()), gradient
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
@@ -60,7 +45,7 @@ def _backward(ctx: Any, grad_loss: Tensor, _: Tensor | None) -> tuple[Tensor | N
     return grad_loss * gradient, None, None, None, None
 
 
-l1_ssim_op = register("l1_ssim", _l1_ssim, fake=_fake_l1_ssim, gradient=Gradient(_save, _backward))
+l1_ssim_op = register("l1_ssim", _l1_ssim, gradient=Gradient(_save, _backward))
 """The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for; float32, contiguous."""
 
 

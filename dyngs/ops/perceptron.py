@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, has_kernel, register
+from dyngs.ops.native import core_for, num_threads
+from dyngs.ops.registration import Gradient, has_kernel, launch, register
 
 KEPT_BYTES = 2**30
 """The backward pass computes activations again where keeping them would take more memory than this, and on a GPU."""
@@ -46,13 +46,8 @@ def _empty_kept(x: Tensor, widths: list[int], skip: int, keep: bool) -> Tensor:
 def _perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
     y = x.new_empty(x.shape[0], widths[-1])
     kept = _empty_kept(x, widths, skip, keep)
-    arrays = (array(t) for t in (x, params, y))
-    core_for(x).perceptron_forward(*arrays, array(kept) if kept.numel() else None, widths, skip, num_threads())
+    launch(x, "perceptron_forward", x, params, y, _or_none(kept), widths, skip, num_threads())
     return y, kept
-
-
-def _fake_perceptron(x: Tensor, params: Tensor, widths: list[int], skip: int, keep: bool) -> tuple[Tensor, Tensor]:
-    return x.new_empty(x.shape[0], widths[-1]), _empty_kept(x, widths, skip, keep)
 
 
 def _perceptron_backward(
@@ -61,30 +56,16 @@ def _perceptron_backward(
     x, params, kept = inputs
     grad_x = x.new_empty(x.shape if with_x else (0,))
     grad_params = params.new_empty(params.shape)
-    core_for(x).perceptron_backward(
-        *(array(t) for t in (x, params, grad)),
-        array(kept) if kept.numel() else None,
-        array(grad_x) if with_x else None,
-        array(grad_params),
-        widths,
-        skip,
-        num_threads(),
-    )
+    results = grad_x if with_x else None, grad_params
+    launch(x, "perceptron_backward", x, params, grad, _or_none(kept), *results, widths, skip, num_threads())
     return grad_x, grad_params
 
 
-def _fake_perceptron_backward(
-    inputs: list[Tensor], grad: Tensor, widths: list[int], skip: int, with_x: bool
-) -> tuple[Tensor, Tensor]:
-    x, params, _ = inputs
-    return x.new_empty(x.shape if with_x else (0,)), params.new_empty(params.shape)
+def _or_none(kept: Tensor) -> Tensor | None:
+    return kept if kept.numel() else None
 
 
-perceptron_backward_op = register(
-    "perceptron_backward",
-    _perceptron_backward,
-    fake=_fake_perceptron_backward,
-)
+perceptron_backward_op = register("perceptron_backward", _perceptron_backward)
 """Gradients by x, empty unless asked for, and by the parameters; ``inputs`` are x, params and kept."""
 
 
@@ -101,12 +82,7 @@ def _backward(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor | None, 
     return grad_x if with_x else None, grad_params, None, None, None
 
 
-perceptron_op = register(
-    "perceptron",
-    _perceptron,
-    fake=_fake_perceptron,
-    gradient=Gradient(_save, _backward),
-)
+perceptron_op = register("perceptron", _perceptron, gradient=Gradient(_save, _backward))
 """Outputs (M, out), and the activations between the layers in the kernel's layout or an empty tensor. ``params`` holds
 weight and bias of each layer, flat; ``skip`` 0 means none."""
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, empty_like, launch, register
 
 MAX_POINTS = 2**31 - 1
 
@@ -34,50 +34,28 @@ class PlaneLevel:
     time: Tensor
 
 
-def _pairs(planes: Sequence[Tensor]) -> list[tuple[object, object]]:
+def _pairs(planes: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
     """Return the space and time planes of each level, as the kernels take them."""
-    return [(array(space), array(time)) for space, time in zip(planes[::2], planes[1::2], strict=True)]
-
-
-def _empty_like(planes: Sequence[Tensor]) -> list[Tensor]:
-    return [torch.empty_like(x, memory_format=torch.contiguous_format) for x in planes]
+    return list(zip(planes[::2], planes[1::2], strict=True))
 
 
 def _hexplane(coords: Tensor, planes: list[Tensor], time: float) -> tuple[Tensor, Tensor]:
-    features, order = _fake_hexplane(coords, planes, time)
-    core_for(coords).hexplane_forward(array(coords), _pairs(planes), time, array(features), array(order), num_threads())
+    features = coords.new_empty(coords.shape[0], len(planes) // 2 * planes[0].shape[3])
+    order = coords.new_empty(coords.shape[0], dtype=torch.int32)
+    launch(coords, "hexplane_forward", coords, _pairs(planes), time, features, order, num_threads())
     return features, order
-
-
-def _fake_hexplane(coords: Tensor, planes: list[Tensor], time: float) -> tuple[Tensor, Tensor]:
-    features = coords.new_empty(len(coords), len(planes) // 2 * planes[0].shape[3])
-    return features, coords.new_empty(len(coords), dtype=torch.int32)
 
 
 def _hexplane_backward(
     coords: Tensor, planes: list[Tensor], order: Tensor, grad: Tensor, time: float, with_coords: bool
 ) -> tuple[Tensor, list[Tensor]]:
-    g_coords, g_planes = _fake_hexplane_backward(coords, planes, order, grad, time, with_coords)
-    core_for(coords).hexplane_backward(
-        array(coords),
-        _pairs(planes),
-        time,
-        array(order),
-        array(grad),
-        _pairs(g_planes),
-        array(g_coords) if with_coords else None,
-        num_threads(),
-    )
+    g_coords, g_planes = coords.new_empty(coords.shape if with_coords else (0,)), [empty_like(x) for x in planes]
+    results = _pairs(g_planes), g_coords if with_coords else None
+    launch(coords, "hexplane_backward", coords, _pairs(planes), time, order, grad, *results, num_threads())
     return g_coords, g_planes
 
 
-def _fake_hexplane_backward(
-    coords: Tensor, planes: list[Tensor], order: Tensor, grad: Tensor, time: float, with_coords: bool
-) -> tuple[Tensor, list[Tensor]]:
-    return coords.new_empty(coords.shape if with_coords else (0,)), _empty_like(planes)
-
-
-hexplane_backward_op = register("hexplane_backward", _hexplane_backward, fake=_fake_hexplane_backward)
+hexplane_backward_op = register("hexplane_backward", _hexplane_backward)
 """Gradients by the coordinates, empty unless asked for, and by the planes."""
 
 
@@ -95,23 +73,17 @@ def _hexplane_gradient(ctx: Any, grad: Tensor, _: Tensor | None) -> tuple[Tensor
     return g_coords if with_coords else None, g_planes, None
 
 
-hexplane_op = register(
-    "hexplane", _hexplane, fake=_fake_hexplane, gradient=Gradient(_save_hexplane, _hexplane_gradient)
-)
+hexplane_op = register("hexplane", _hexplane, gradient=Gradient(_save_hexplane, _hexplane_gradient))
 """Features (M, L * C), and the order (M,) int32 in which the backward pass visits the points. ``planes`` holds those of
 space and those of time of each level in turn."""
 
 
 def _plane_penalty(planes: list[Tensor], weights: list[float], with_gradient: bool) -> tuple[Tensor, list[Tensor]]:
-    grads = _empty_like(planes) if with_gradient else []
+    first, grads = planes[0], [empty_like(x) for x in planes] if with_gradient else []
+    penalty = first.new_empty(1, dtype=torch.float64)
     pairs = _pairs(grads) if with_gradient else None
-    penalty = planes[0].new_empty(1, dtype=torch.float64)
-    core_for(planes[0]).plane_penalty(_pairs(planes), pairs, tuple(weights), array(penalty), num_threads())
-    return penalty[0].to(planes[0].dtype), grads
-
-
-def _fake_plane_penalty(planes: list[Tensor], weights: list[float], with_gradient: bool) -> tuple[Tensor, list[Tensor]]:
-    return planes[0].new_empty(()), _empty_like(planes) if with_gradient else []
+    launch(first, "plane_penalty", _pairs(planes), pairs, tuple(weights), penalty, num_threads())
+    return penalty[0].to(first.dtype), grads
 
 
 def _save_penalty(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, list[Tensor]]) -> None:
@@ -136,9 +108,7 @@ def _penalty_gradient(ctx: Any, grad: Tensor, _: object) -> tuple[list[Tensor], 
     return grads, None, None
 
 
-plane_penalty_op = register(
-    "plane_penalty", _plane_penalty, fake=_fake_plane_penalty, gradient=Gradient(_save_penalty, _penalty_gradient)
-)
+plane_penalty_op = register("plane_penalty", _plane_penalty, gradient=Gradient(_save_penalty, _penalty_gradient))
 """The penalty () and its gradients by the planes, an empty list unless asked for."""
 
 

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.checks import check_tensors
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, launch, register
 
 _KEPT = 12
 """Numbers per Gaussian that the forward pass keeps for the backward pass."""
@@ -24,17 +25,11 @@ _Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def _posing(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> _Results:
-    results = _fake_posing(means, quats, log_scales, weights, transforms)
-    *moved, blended, kept = results
-    rest = _arrays([means, quats, log_scales])
-    given = (rest, array(weights), array(transforms))
-    core_for(means).pose_forward(*given, _arrays(moved), array(blended), array(kept), num_threads())
-    return results
-
-
-def _fake_posing(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> _Results:
-    moved = (means.new_empty(means.shape), quats.new_empty(quats.shape), log_scales.new_empty(log_scales.shape))
-    return (*moved, transforms.new_empty(len(means), 3, 4), means.new_empty(len(means), _KEPT))
+    moved = means.new_empty(means.shape), quats.new_empty(quats.shape), log_scales.new_empty(log_scales.shape)
+    blended, kept = transforms.new_empty(means.shape[0], 3, 4), means.new_empty(means.shape[0], _KEPT)
+    rest = means, quats, log_scales
+    launch(means, "pose_forward", rest, weights, transforms, moved, blended, kept, num_threads())
+    return *moved, blended, kept
 
 
 def _posing_backward(
@@ -46,38 +41,16 @@ def _posing_backward(
     g_blended: Tensor | None,
     with_weights: bool,
 ) -> _Results:
-    found = _fake_posing_backward(rest, weights, transforms, posed, grads, g_blended, with_weights)
-    *by_rest, by_weights, by_transforms = found
-    *moved, blended, kept = posed
-    core_for(weights).pose_backward(
-        *(_arrays(rest), array(weights), array(transforms)),
-        (_arrays(moved), array(blended), array(kept)),
-        *(_arrays(grads), None if g_blended is None else array(g_blended)),
-        *(_arrays(by_rest), array(by_weights) if with_weights else None, array(by_transforms)),
-        num_threads(),
-    )
-    return found
-
-
-def _fake_posing_backward(
-    rest: list[Tensor],
-    weights: Tensor,
-    transforms: Tensor,
-    posed: list[Tensor],
-    grads: list[Tensor],
-    g_blended: Tensor | None,
-    with_weights: bool,
-) -> _Results:
-    means, quats, log_scales = (x.new_empty(x.shape) for x in rest)
+    means, quats, log_scales = by_rest = [x.new_empty(x.shape) for x in rest]
     by_weights = weights.new_empty(weights.shape if with_weights else (0,))
-    return means, quats, log_scales, by_weights, transforms.new_empty(transforms.shape)
+    by_transforms = transforms.new_empty(transforms.shape)
+    given = rest, weights, transforms, (posed[:3], *posed[3:]), grads, g_blended
+    results = by_rest, by_weights if with_weights else None, by_transforms
+    launch(weights, "pose_backward", *given, *results, num_threads())
+    return means, quats, log_scales, by_weights, by_transforms
 
 
-def _arrays(tensors: list[Tensor]) -> tuple[object, ...]:
-    return tuple(array(x) for x in tensors)
-
-
-posing_backward_op = register("posing_backward", _posing_backward, fake=_fake_posing_backward)
+posing_backward_op = register("posing_backward", _posing_backward)
 """Gradients by means, quaternions and log scales at rest, by the weights, empty unless asked for, and by transforms;
 ``posed`` is what ``posing_op`` returned, ``grads`` are the gradients by the first three of it."""
 
@@ -99,7 +72,7 @@ def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     return (*by_rest, by_weights if with_weights else None, by_transforms)
 
 
-posing_op = register("posing", _posing, fake=_fake_posing, gradient=Gradient(_save, _backward))
+posing_op = register("posing", _posing, gradient=Gradient(_save, _backward))
 """Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs (N, 12)."""
 
 
@@ -146,14 +119,9 @@ def pose_by_joints(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Te
 
 
 def _check(inputs: dict[str, Tensor]) -> None:
-    weights, device = inputs["weights"], inputs["means"].device
+    weights = inputs["weights"]
     if weights.ndim != 2:
         raise DyngsError(f"pose_by_joints: weights must be (N, J), got {tuple(weights.shape)}")
     count, joints = weights.shape
     wanted = {"means": (count, 3), "quats": (count, 4), "log_scales": (count, 3), "transforms": (joints, 3, 4)}
-    for name, x in inputs.items():
-        if tuple(x.shape) != wanted.get(name, x.shape):
-            raise DyngsError(f"pose_by_joints: {name} must be {wanted[name]}, got {tuple(x.shape)}")
-        if not x.is_floating_point() or x.device != device:
-            like = f"floating point on {device} like the means"
-            raise DyngsError(f"pose_by_joints: {name} must be {like}, got {x.dtype} on {x.device}")
+    check_tensors("pose_by_joints", {name: (x, wanted.get(name, tuple(x.shape))) for name, x in inputs.items()})

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.ops.limits import check_memory, check_size
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.options import check_near_and_far, check_number
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.checks import check_memory, check_near_and_far, check_number, check_size
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register
 
 
 @dataclass(frozen=True)
@@ -26,9 +24,6 @@ class ProjectionOptions:
         alpha_min: pixels with less alpha are not drawn; sets the extent of a splat.
         radius_clip: splats with no larger half extent are culled, px.
         antialiased: the extent uses the compensated opacity.
-
-    Raises:
-        DyngsError: a negative number or NaN, or ``far`` not beyond ``near``.
     """
 
     eps2d: float = 0.3
@@ -70,14 +65,13 @@ class Projection:
         return torch.stack([u * u, u * w, w * w + v * v], dim=-1)
 
 
-def _settings(core: ModuleType, size: list[int], limits: list[float], antialiased: bool):
+def _settings(size: list[int], limits: list[float], antialiased: bool) -> Struct:
     check_size(*size)
-    return core.ProjectSettings(*size, *limits, antialiased, num_threads())
+    return Struct("ProjectSettings", (*size, *limits, antialiased, num_threads()))
 
 
-def _arrays(core: ModuleType, *tensors: Tensor):
-    kind = core.GaussianArraysF32 if tensors[0].dtype == torch.float32 else core.GaussianArraysF64
-    return kind(*(array(x) for x in tensors))
+def _arrays(*tensors: Tensor) -> Struct:
+    return Struct("GaussianArraysF32" if tensors[0].dtype == torch.float32 else "GaussianArraysF64", tensors)
 
 
 def _project(
@@ -92,33 +86,15 @@ def _project(
     antialiased: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     rows = (viewmats.shape[0], means.shape[0])
-    core = core_for(means)
-    settings = _settings(core, size, limits, antialiased)
     per_splat = 7 * means.element_size() + 8
-    check_memory(rows[0] * rows[1] * per_splat, f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)", means)
+    settings, what = _settings(size, limits, antialiased), f"the splats of {rows[1]} Gaussians in {rows[0]} view(s)"
+    check_memory(rows[0] * rows[1] * per_splat, what, means)
     means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
     factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
-    radii = means.new_empty(*rows, 2, dtype=torch.int32)
-    arrays = _arrays(core, means, quats, scales, opacities, viewmats, intrinsics)
-    core.project_forward(arrays, settings, *(array(x) for x in (means2d, depths, factors, compensations, radii)))
-    return means2d, depths, factors, compensations, radii
-
-
-def _fake_project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmats: Tensor,
-    intrinsics: Tensor,
-    size: list[int],
-    limits: list[float],
-    antialiased: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    rows = (viewmats.shape[0], means.shape[0])
-    means2d, depths = means.new_empty(*rows, 2), means.new_empty(rows)
-    factors, compensations = means.new_empty(*rows, 3), means.new_empty(rows)
-    return means2d, depths, factors, compensations, means.new_empty(*rows, 2, dtype=torch.int32)
+    splats = means2d, depths, factors, compensations, means.new_empty(*rows, 2, dtype=torch.int32)
+    arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
+    launch(means, "project_forward", arrays, settings, *splats)
+    return splats
 
 
 def _project_backward(
@@ -131,36 +107,15 @@ def _project_backward(
     with_cameras: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     means, quats, scales, _, viewmats, intrinsics = gaussians
-    out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means, quats, scales)]
+    by_means, by_quats, by_scales = (empty_like(x) for x in (means, quats, scales))
     of_cameras = viewmats.new_zeros(viewmats.shape), intrinsics.new_zeros(intrinsics.shape)
-    core = core_for(means)
-    settings = _settings(core, size, limits, antialiased)
-    core.project_backward(
-        _arrays(core, *gaussians),
-        settings,
-        array(radii),
-        tuple(array(g) for g in grads),
-        (*(array(x) for x in out), *(array(x) if with_cameras else None for x in of_cameras)),
-    )
-    return out[0], out[1], out[2], *of_cameras
+    results = by_means, by_quats, by_scales, *(of_cameras if with_cameras else (None, None))
+    settings = _settings(size, limits, antialiased)
+    launch(means, "project_backward", _arrays(*gaussians), settings, radii, tuple(grads), results)
+    return by_means, by_quats, by_scales, *of_cameras
 
 
-def _fake_project_backward(
-    gaussians: list[Tensor],
-    radii: Tensor,
-    grads: list[Tensor],
-    size: list[int],
-    limits: list[float],
-    antialiased: bool,
-    with_cameras: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    g_means, g_quats, g_scales, g_viewmats, g_intrinsics = (
-        torch.empty_like(gaussians[i], memory_format=torch.contiguous_format) for i in (0, 1, 2, 4, 5)
-    )
-    return g_means, g_quats, g_scales, g_viewmats, g_intrinsics
-
-
-project_backward_op = register("project_backward", _project_backward, fake=_fake_project_backward)
+project_backward_op = register("project_backward", _project_backward)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -182,7 +137,7 @@ def _backward(
     return *out, None, *of_cameras, None, None, None
 
 
-project_op = register("project", _project, fake=_fake_project, gradient=Gradient(_save, _backward))
+project_op = register("project", _project, gradient=Gradient(_save, _backward))
 
 
 def project(

@@ -9,18 +9,16 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
-from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.limits import REMEDY, check_memory, check_size
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.options import check_number
+from dyngs.ops.checks import REMEDY, check_memory, check_number, check_size
+from dyngs.ops.native import num_threads
 from dyngs.ops.projection import Projection
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register
 
 TILE = 16
 MAX_CHANNELS = 40
@@ -41,9 +39,6 @@ class BlendOptions:
         absgrad: also sum the absolute gradients of the 2D means into the probe.
         max_entries: refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more than
             memory holds, at 20 bytes each.
-
-    Raises:
-        DyngsError: numbers out of [0, 1] or NaN, an ``alpha_max`` that float32 cannot tell from 1, a negative count.
     """
 
     alpha_min: float = 1 / 255
@@ -83,11 +78,7 @@ class TileEntries:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
 
     def check(self, device: torch.device) -> None:
-        """Raise an error unless the tensors are what the kernels take; those check lengths and indices themselves.
-
-        Raises:
-            DyngsError: another dtype, device or number of axes.
-        """
+        """Raise an error unless the tensors are what the kernels take; those check lengths and indices themselves."""
         for name, x in vars(self).items():
             dtype = torch.int64 if name == "tile_offsets" else torch.int32
             if x.dtype != dtype or x.ndim != 1 or x.device != device:
@@ -114,14 +105,14 @@ class Blended:
     transmittance: Tensor
 
 
-def _settings(core: ModuleType, size: list[int], thresholds: list[float]):
+def _settings(size: list[int], thresholds: list[float]) -> Struct:
     check_size(*size)
-    return core.BlendSettings(*size, *thresholds, num_threads())
+    return Struct("BlendSettings", (*size, *thresholds, num_threads()))
 
 
-def _arrays(core: ModuleType, means2d: Tensor, factors: Tensor, opacities: Tensor, radii: Tensor):
-    kind = core.SplatArraysF32 if means2d.dtype == torch.float32 else core.SplatArraysF64
-    return kind(*(array(x) for x in (means2d, factors, opacities, radii)))
+def _arrays(*splats: Tensor) -> Struct:
+    """Return means2d, factors, opacities and radii as the kernels take them."""
+    return Struct("SplatArraysF32" if splats[0].dtype == torch.float32 else "SplatArraysF64", splats)
 
 
 @contextmanager
@@ -136,11 +127,9 @@ def _refusals(kernel: str) -> Generator[None]:
 def _bin_tiles(
     splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    core = core_for(depths)
+    settings, most = _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
     try:
-        entries = core.bin_tiles(
-            _arrays(core, *splats), array(depths), _settings(core, size, thresholds), min(max_entries, MAX_ENTRIES)
-        )
+        entries = launch(depths, "bin_tiles", _arrays(*splats), depths, settings, most)
     except ValueError as error:  # std::length_error
         raise DyngsError(f"render refused: {error}; {REMEDY}") from None
     tile_offsets, slot_ranges, gaussians, slots = (x if isinstance(x, Tensor) else torch.from_numpy(x) for x in entries)
@@ -171,12 +160,8 @@ def _image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     views, channels = colors.shape[0], colors.shape[2]
     needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)
     check_memory(needed, f"{views} image(s) of {size[0]}x{size[1]} px with {channels} channels", colors)
-    return _empty_image(colors, size)
-
-
-def _empty_image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    shape = (colors.shape[0], size[1], size[0])
-    image = colors.new_empty(*shape, colors.shape[2])
+    shape = (views, size[1], size[0])
+    image = colors.new_empty(*shape, channels)
     return image, colors.new_empty(shape), colors.new_empty(shape, dtype=torch.int32)
 
 
@@ -196,38 +181,12 @@ def _blend(
     thresholds: list[float],
     absgrad: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    core = core_for(colors)
-    color, transmittance, stop = _image(colors, size)
+    image = _image(colors, size)
+    splats, entries = _arrays(means2d, factors, opacities, radii), (tile_offsets, slot_ranges, gaussians, slots)
     with _refusals("rasterize"):
-        core.rasterize_forward(
-            _arrays(core, means2d, factors, opacities, radii),
-            array(colors),
-            None if background is None else array(background),
-            tuple(array(x) for x in (tile_offsets, slot_ranges, gaussians, slots)),
-            _settings(core, size, thresholds),
-            (array(color), array(transmittance), array(stop), None),
-            0,
-        )
-    return color, transmittance, stop
-
-
-def _fake_blend(
-    means2d: Tensor,
-    factors: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    background: Tensor | None,
-    probe: Tensor | None,
-    radii: Tensor,
-    tile_offsets: Tensor,
-    slot_ranges: Tensor,
-    gaussians: Tensor,
-    slots: Tensor,
-    size: list[int],
-    thresholds: list[float],
-    absgrad: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    return _empty_image(colors, size)
+        settings = _settings(size, thresholds)
+        launch(colors, "rasterize_forward", splats, colors, background, entries, settings, (*image, None), 0)
+    return image
 
 
 def _blend_backward(
@@ -242,44 +201,20 @@ def _blend_backward(
     with_probe: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     means2d, factors, opacities, colors, radii = splats
-    core = core_for(colors)
-    pairs, fields = len(entries[3]), MOMENTS + colors.shape[2] + 2 * absgrad
+    pairs, fields = entries[3].shape[0], MOMENTS + colors.shape[2] + 2 * absgrad
     check_memory(pairs * fields * colors.element_size(), f"the gradients of {pairs} (Gaussian, tile) pairs", colors)
-    out = [torch.empty_like(x, memory_format=torch.contiguous_format) for x in (means2d, factors, opacities, colors)]
+    by_means2d, by_factors, by_opacities, by_colors = out = [
+        empty_like(x) for x in (means2d, factors, opacities, colors)
+    ]
     probe = means2d.new_empty(*opacities.shape, 4) if with_probe else means2d.new_empty(0)
+    given = _arrays(means2d, factors, opacities, radii), colors, background, tuple(entries)
     with _refusals("rasterize, backward"):
-        core.rasterize_backward(
-            _arrays(core, means2d, factors, opacities, radii),
-            array(colors),
-            None if background is None else array(background),
-            tuple(array(x) for x in entries),
-            _settings(core, size, thresholds),
-            tuple(array(x) for x in (*grads, *image)),
-            (*(array(x) for x in out), array(probe) if with_probe else None),
-            absgrad,
-        )
-    return out[0], out[1], out[2], out[3], probe
+        settings, results = _settings(size, thresholds), (*out, probe if with_probe else None)
+        launch(colors, "rasterize_backward", *given, settings, (*grads, *image), results, absgrad)
+    return by_means2d, by_factors, by_opacities, by_colors, probe
 
 
-def _fake_blend_backward(
-    splats: list[Tensor],
-    background: Tensor | None,
-    entries: list[Tensor],
-    image: list[Tensor],
-    grads: list[Tensor],
-    size: list[int],
-    thresholds: list[float],
-    absgrad: bool,
-    with_probe: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    g_means2d, g_factors, g_opacities, g_colors = (
-        torch.empty_like(x, memory_format=torch.contiguous_format) for x in splats[:4]
-    )
-    probe = splats[0].new_empty(*splats[2].shape, 4) if with_probe else splats[0].new_empty(0)
-    return g_means2d, g_factors, g_opacities, g_colors, probe
-
-
-blend_backward_op = register("blend_backward", _blend_backward, fake=_fake_blend_backward)
+blend_backward_op = register("blend_backward", _blend_backward)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -313,7 +248,7 @@ def _backward(ctx: Any, g_color: Tensor, g_transmittance: Tensor, _: Tensor | No
     return *out, g_background, probe if with_probe else None, *[None] * 8
 
 
-blend_op = register("blend", _blend, fake=_fake_blend, gradient=Gradient(_save, _backward))
+blend_op = register("blend", _blend, gradient=Gradient(_save, _backward))
 
 
 def _tally(
@@ -325,35 +260,15 @@ def _tally(
     thresholds: list[float],
     kind: int,
 ) -> Tensor:
-    core = core_for(colors)
-    sums = torch.empty_like(splats[2], memory_format=torch.contiguous_format)
-    image = (*_image(colors, size), sums)
+    sums = empty_like(splats[2])
+    image = *_image(colors, size), sums
     with _refusals("tally"):
-        core.rasterize_forward(
-            _arrays(core, *splats),
-            array(colors),
-            None if background is None else array(background),
-            tuple(array(x) for x in entries),
-            _settings(core, size, thresholds),
-            tuple(array(x) for x in image),
-            kind,
-        )
+        settings = _settings(size, thresholds)
+        launch(colors, "rasterize_forward", _arrays(*splats), colors, background, tuple(entries), settings, image, kind)
     return sums
 
 
-def _fake_tally(
-    splats: list[Tensor],
-    colors: Tensor,
-    background: Tensor | None,
-    entries: list[Tensor],
-    size: list[int],
-    thresholds: list[float],
-    kind: int,
-) -> Tensor:
-    return torch.empty_like(splats[2], memory_format=torch.contiguous_format)
-
-
-tally_op = register("tally", _tally, fake=_fake_tally)
+tally_op = register("tally", _tally)
 
 
 def bin_tiles(

@@ -1,10 +1,10 @@
 """Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
 
-One call of ``register`` holds all that an op is: its implementation (whose type hints are the schema), the shapes of
-its results without any data (for ``torch.compile``), and the formula of its gradient. Callers call the op and never ask
-where a tensor lies; the dispatcher picks the implementation. The compiled cores for CPU and CUDA have the same
-functions, so that one implementation, which asks ``native.core_for`` for its core, serves both. A back end for another
-device adds its implementations with ``implement`` and changes nothing here.
+One call of ``register`` holds all that an op is: its implementation, whose type hints are the schema, and the formula
+of its gradient. An implementation allocates its results and has them filled by ``launch``, which does nothing where
+only shapes are needed (``torch.compile``). Callers never ask where a tensor lies; the dispatcher picks the
+implementation. The compiled cores for CPU and CUDA have the same functions, so that one implementation serves both. A
+back end for another device adds its implementations with ``implement`` and changes nothing here.
 
 ``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
 """
@@ -14,15 +14,17 @@ device adds its implementations with ``implement`` and changes nothing here.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import has_cuda_core
+from dyngs.ops.native import array, core_for, has_cuda_core, writable
 
 NAMESPACE = "dyngs"
 
@@ -52,7 +54,7 @@ def register(
     name: str,
     kernel: Callable[P, R],
     *,
-    fake: Callable[P, R],
+    fake: Callable[P, R] | None = None,
     devices: tuple[str, ...] = ("cpu", "cuda"),
     mutates: tuple[str, ...] = (),
     gradient: Gradient | None = None,
@@ -64,7 +66,7 @@ def register(
     Args:
         name: of the op.
         kernel: the implementation; its type hints give the schema. No result may share memory with an input.
-        fake: results of the right shape, dtype and device for inputs without data.
+        fake: results of the right shape, dtype and device for inputs without data; None: ``kernel`` gives them.
         devices: for whose tensors ``kernel`` is; CUDA counts only where its core was built.
         mutates: arguments that ``kernel`` writes to.
         gradient: None: not differentiable.
@@ -72,7 +74,7 @@ def register(
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
     qualified = f"{NAMESPACE}::{name}"
     _LIBRARY.define(name + schema)
-    torch.library.register_fake(qualified, fake, lib=_LIBRARY)
+    torch.library.register_fake(qualified, fake or _shapes_of(kernel), lib=_LIBRARY)
     _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")  # for every device that has none of its own
     _kernels[name] = {"meta"}
     for device in devices:
@@ -82,6 +84,80 @@ def register(
         formula = _first_order(qualified, gradient.backward)
         torch.library.register_autograd(qualified, formula, setup_context=gradient.save, lib=_LIBRARY)
     return cast(Callable[P, R], getattr(getattr(torch.ops, NAMESPACE), name).default)
+
+
+@dataclass(frozen=True)
+class InPlace:
+    """A contiguous tensor that a kernel writes to, as an argument of ``launch``."""
+
+    tensor: Tensor
+
+
+@dataclass(frozen=True)
+class Struct:
+    """An object of the core, of its class ``name``, as an argument of ``launch``."""
+
+    name: str
+    fields: tuple[object, ...]
+
+
+class _Mode(threading.local):
+    shapes_only = False
+
+
+_mode = _Mode()
+
+
+def shapes_only() -> bool:
+    """Return whether an implementation is asked for the shapes of its results alone: its inputs have no data."""
+    return _mode.shapes_only
+
+
+def launch(like: Tensor, name: str, *arguments: object) -> Any:
+    """Return what the function ``name`` of the core gives; None, without calling it, where only shapes are needed.
+
+    Args:
+        like: lies where the function computes.
+        name: of the function.
+        arguments: tensors, those written to included, are passed as arrays, also those in tuples and lists.
+    """
+    if _mode.shapes_only:
+        return None
+    core = core_for(like)
+    return getattr(core, name)(*(_passed(core, x) for x in arguments))
+
+
+def empty_like(x: Tensor) -> Tensor:
+    """Return an uninitialised contiguous tensor like ``x``."""
+    return torch.empty_like(x, memory_format=torch.contiguous_format)
+
+
+def _passed(core: ModuleType, value: Any) -> Any:
+    """Return ``value`` as the functions of the core take it."""
+    match value:
+        case Tensor():
+            return array(value)
+        case InPlace():
+            return writable(value.tensor)
+        case Struct():
+            return getattr(core, value.name)(*(_passed(core, x) for x in value.fields))
+        case list() | tuple():
+            return tuple(_passed(core, x) for x in cast(Iterable[object], value))
+        case _:
+            return value
+
+
+def _shapes_of(kernel: Callable[P, R]) -> Callable[P, R]:
+    """Return ``kernel`` without the calls of the core."""
+
+    def shapes(*arguments: P.args, **named: P.kwargs) -> R:
+        _mode.shapes_only = True
+        try:
+            return kernel(*arguments, **named)
+        finally:
+            _mode.shapes_only = False
+
+    return shapes
 
 
 def implement(name: str, device: str, kernel: Callable[..., object]) -> None:

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.ops.native import array, core_for, num_threads
+from dyngs.ops.native import num_threads
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.registration import Gradient, launch, register
 
 
 @dataclass(frozen=True)
@@ -64,36 +64,11 @@ def _shading(
     time: float | None,
     normals: bool,
 ) -> Tensor:
-    out = base.new_empty(len(base), num_inputs(sees_time=time is not None, sees_normals=normals))
-    core_for(base).shading_inputs(
-        (array(means), array(quats), array(log_scales)),
-        array(rows),
-        array(base),
-        array(eye[None]),
-        array(box),
-        None if rest is None or turn is None else (array(rest), array(turn)),
-        None if time is None else 2 * time - 1,
-        normals,
-        array(out),
-        num_threads(),
-    )
+    out = base.new_empty(base.shape[0], num_inputs(sees_time=time is not None, sees_normals=normals))
+    at_rest = None if rest is None or turn is None else (rest, turn)
+    seen = (means, quats, log_scales), rows, base, eye[None], box, at_rest, None if time is None else 2 * time - 1
+    launch(base, "shading_inputs", *seen, normals, out, num_threads())
     return out
-
-
-def _fake_shading(
-    base: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    log_scales: Tensor,
-    rows: Tensor,
-    eye: Tensor,
-    box: Tensor,
-    rest: Tensor | None,
-    turn: Tensor | None,
-    time: float | None,
-    normals: bool,
-) -> Tensor:
-    return base.new_empty(len(base), num_inputs(sees_time=time is not None, sees_normals=normals))
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -104,7 +79,7 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return grad[:, ctx.begin : ctx.begin + 3], *[None] * 10
 
 
-shading_op = register("shading_inputs", _shading, fake=_fake_shading, gradient=Gradient(_save, _backward))
+shading_op = register("shading_inputs", _shading, gradient=Gradient(_save, _backward))
 """Inputs (M, K) of a colour network; ``rest`` and ``turn`` are both there or both None."""
 
 

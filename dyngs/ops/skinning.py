@@ -1,10 +1,11 @@
-"""Linear blend skinning of points by sparse control nodes, differentiable (SC-GS: Huang et al. 2024).
+"""Linear blend skinning of points by sparse control nodes (SC-GS: Huang et al. 2024), and offsets added to Gaussians.
 
 M points, S nodes, B nodes that one point follows, D values of a node.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -12,58 +13,38 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.native import array, core_for, num_threads
-from dyngs.ops.registration import Gradient, register
+from dyngs.ops.checks import check_tensors
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, InPlace, launch, register
 
 
 def _skinning(
     points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    offset, blended, weights = _fake_skinning(points, positions, radii, followed, motion, values)
-    nodes = tuple(array(x) for x in (positions, radii, motion, values))
-    outputs = (array(x) for x in (offset, blended, weights))
+    count, nodes = points.shape[0], (positions, radii, motion, values)
+    results = points.new_empty(count, 3), points.new_empty(count, values.shape[1]), points.new_empty(followed.shape)
     try:
-        core_for(points).skinning_forward(nodes, (array(points), array(followed)), *outputs, num_threads())
+        launch(points, "skinning_forward", nodes, (points, followed), *results, num_threads())
     except IndexError:
         raise DyngsError(
             f"blend_skinning: followed must be in [0, {len(positions)}), the nodes there are, "
             f"got {int(followed.min())} to {int(followed.max())}"
         ) from None
-    return offset, blended, weights
-
-
-def _fake_skinning(
-    points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, motion: Tensor, values: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    count = len(points)
-    return points.new_empty(count, 3), points.new_empty(count, values.shape[1]), points.new_empty(followed.shape)
+    return results
 
 
 def _skinning_backward(
     nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    g_points, g_motion, g_values = _fake_skinning_backward(nodes, points, followed, weights, grads, with_points)
-    core_for(points).skinning_backward(
-        tuple(array(x) for x in nodes),
-        (array(points), array(followed)),
-        tuple(array(x) for x in (*grads, weights)),
-        array(g_points) if with_points else None,
-        array(g_motion),
-        array(g_values),
-        num_threads(),
-    )
+    _, _, motion, values = nodes
+    g_points = points.new_empty(points.shape if with_points else (0,))
+    g_motion, g_values = points.new_empty(motion.shape), points.new_empty(values.shape)
+    results = g_points if with_points else None, g_motion, g_values
+    launch(points, "skinning_backward", nodes, (points, followed), (*grads, weights), *results, num_threads())
     return g_points, g_motion, g_values
 
 
-def _fake_skinning_backward(
-    nodes: list[Tensor], points: Tensor, followed: Tensor, weights: Tensor, grads: list[Tensor], with_points: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    _, _, motion, values = nodes
-    g_points = points.new_empty(points.shape if with_points else (0,))
-    return g_points, points.new_empty(motion.shape), points.new_empty(values.shape)
-
-
-skinning_backward_op = register("skinning_backward", _skinning_backward, fake=_fake_skinning_backward)
+skinning_backward_op = register("skinning_backward", _skinning_backward)
 """Gradients by the points, empty unless asked for, and by motion and values of the nodes; ``nodes`` are positions,
 radii, motion and values, ``grads`` those by offsets and blended values."""
 
@@ -83,7 +64,7 @@ def _backward(ctx: Any, g_offset: Tensor, g_blended: Tensor, _: Tensor | None) -
     return g_points if with_points else None, None, None, None, g_motion, g_values
 
 
-skinning_op = register("skinning", _skinning, fake=_fake_skinning, gradient=Gradient(_save, _backward))
+skinning_op = register("skinning", _skinning, gradient=Gradient(_save, _backward))
 """Offsets (M, 3), blended values (M, D), and the weights (M, B) of the nodes."""
 
 
@@ -127,12 +108,7 @@ def _check(points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, m
         "motion": (motion, (nodes, 7)),
         "values": (values, (nodes, *values.shape[1:2])) if values.ndim == 2 else (values, (nodes, -1)),
     }
-    for name, (tensor, shape) in expected.items():
-        if tuple(tensor.shape) != shape:
-            raise DyngsError(f"blend_skinning: {name} must be {shape}, got {tuple(tensor.shape)}")
-        if not tensor.is_floating_point() or tensor.device != points.device:
-            wanted = f"floating point on {points.device} like the points"
-            raise DyngsError(f"blend_skinning: {name} must be {wanted}, got {tensor.dtype} on {tensor.device}")
+    check_tensors("blend_skinning", expected)
     if followed.dtype != torch.int64 or followed.device != points.device:
         wanted = f"int64 on {points.device} like the points"
         raise DyngsError(f"blend_skinning: followed must be {wanted}, got {followed.dtype} on {followed.device}")
@@ -140,3 +116,50 @@ def _check(points: Tensor, positions: Tensor, radii: Tensor, followed: Tensor, m
         raise DyngsError(
             f"blend_skinning: followed must be ({len(points)}, B) with B at least 1, got {tuple(followed.shape)}"
         )
+
+
+def _add_offsets(
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    logit_opacities: Tensor,
+    sh: Tensor,
+    rows: Tensor | None,
+    by_means: Tensor,
+    by_quats: Tensor | None,
+    by_log_scales: Tensor | None,
+    by_logit_opacities: Tensor | None,
+    by_colors: Tensor | None,
+) -> None:
+    gaussians = [InPlace(x) for x in (means, quats, log_scales, logit_opacities, sh)]
+    offsets = (by_means, by_quats, by_log_scales, by_logit_opacities, by_colors)
+    launch(means, "add_offsets", gaussians, rows, offsets, num_threads())
+
+
+add_offsets_op = register(
+    "add_offsets_", _add_offsets, mutates=("means", "quats", "log_scales", "logit_opacities", "sh")
+)
+
+
+def add_offsets_(gaussians: Sequence[Tensor], rows: Tensor | None, offsets: Sequence[Tensor | None]) -> None:
+    """Move M of N Gaussians in place, as ``dyngs.deform.field.deformed`` defines it; no gradient.
+
+    Args:
+        gaussians: (N, 3) means, (N, 4) quats, (N, 3) log scales, (N,) opacity logits, (N, K, 3) harmonics; contiguous
+            where there are offsets.
+        rows: (M,) int64 without repetition; None: the first M.
+        offsets: (M, ...) of each in this order, of the base colour in place of harmonics; None but for the first: none.
+
+    Raises:
+        IndexError: a row that does not exist.
+        DyngsError: Gaussians that are not contiguous.
+    """
+    by_means, by_quats, by_log_scales, by_logits, by_colors = (
+        None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets
+    )
+    assert by_means is not None
+    # .data where nothing is added: a tensor that stays as it is must not count as changed for autograd
+    means, quats, log_scales, logits, sh = (
+        x.data.contiguous() if offset is None else x.detach() for x, offset in zip(gaussians, offsets, strict=True)
+    )
+    add_offsets_op(means, quats, log_scales, logits, sh, rows, by_means, by_quats, by_log_scales, by_logits, by_colors)

@@ -18,11 +18,7 @@ def sent(x: Tensor, device: torch.device | str) -> Tensor:
 
 
 class ReadBack:
-    """Numbers of a tensor, which a GPU copies to the CPU as soon as it has them, while more work is queued.
-
-    Args:
-        x: their tensor.
-    """
+    """Numbers of a tensor, which a GPU copies to the CPU as soon as it has them, while more work is queued."""
 
     def __init__(self, x: Tensor) -> None:
         self._ready: torch.cuda.Event | None = None
@@ -45,10 +41,6 @@ class Upload:
     """Arrays of the CPU that are copied to a GPU beside its work: by a stream of their own, from pinned memory.
 
     May be made in any thread. What has no such streams gets them when they are asked for.
-
-    Args:
-        arrays: on the CPU.
-        device: where they go.
     """
 
     def __init__(self, arrays: Sequence[Tensor], device: torch.device) -> None:

@@ -13,7 +13,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import StaticModel
 from dyngs.gaussians.rendering import contributions
 from dyngs.training.background import background_colour
@@ -36,12 +35,7 @@ FEWEST_VIEWS, MOST = 20, 0.01
 
 
 class FloaterRemoval:
-    """Listener that removes floaters when training ends, if that is asked for; static scenes only.
-
-    Args:
-        loop: of the run.
-        trainer: returns the trainer of its scene, which may be another one later.
-    """
+    """Listener that removes floaters when training ends, if that is asked for; static scenes only."""
 
     def __init__(self, loop: Loop, trainer: Callable[[], Trainer]) -> None:
         self._loop, self._trainer = loop, trainer
@@ -79,7 +73,7 @@ def floaters(trainer: Trainer) -> Tensor:
     total, most = torch.zeros_like(gaussians.logit_opacities), torch.zeros_like(gaussians.logit_opacities)
     nearness = torch.full_like(total, torch.inf)
     for camera in trainer.images.cameras():
-        small = _small(camera)
+        small = camera.scaled(min(1.0, LONGEST_SIDE / max(camera.width, camera.height)))
         drawn = scene.render(small, None, options=options, background=background)
         assert drawn.depth is not None
         depths = drawn.depth[0][drawn.alpha[0] > SOLID]
@@ -90,11 +84,3 @@ def floaters(trainer: Trainer) -> Tensor:
         nearness = torch.where(is_main, (gaussians.means @ pose[2, :3] + pose[2, 3]) / depth, nearness)
         total, most = total + weight, torch.where(is_main, weight, most)
     return (total > SEEN) & (most > MAIN_FRACTION * total) & (nearness < NEAR)
-
-
-def _small(camera: Cameras) -> Cameras:
-    """Return ``camera`` with images of at most ``LONGEST_SIDE``."""
-    factor = min(1.0, LONGEST_SIDE / max(camera.width, camera.height))
-    width, height = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
-    scale = camera.intrinsics.new_tensor([width / camera.width, height / camera.height, 1.0])
-    return Cameras(camera.cam_from_world, scale[:, None] * camera.intrinsics, width, height)

@@ -5,6 +5,7 @@ Local letters: K moments, C (K, N) sums over pixels and views of what a Gaussian
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -105,6 +106,14 @@ def importance(views: ScoringViews, *, slopes: bool) -> Importance:
             for camera in views.cameras:
                 squares = squares + sensitivities(now, camera, options, background=behind, shader=shader)[0]
     return Importance(torch.stack(fractions), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
+
+
+def highest(scores: Tensor, fraction: float) -> Tensor:
+    """Return (N,) bool: all but the lowest ``fraction`` of ``scores`` (N,), at least one; of equal ones the first."""
+    count = min(max(1, math.ceil(len(scores) * (1 - fraction) - 1e-9)), len(scores))
+    kept = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
+    kept[torch.sort(scores, descending=True, stable=True).indices[:count]] = True
+    return kept
 
 
 def _smoothed(x: Tensor) -> Tensor:

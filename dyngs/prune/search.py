@@ -191,9 +191,6 @@ class Search:
         """Return the smallest accepted candidate whose file keeps the promise, and that file, rounded as far as it may.
 
         The last resort is the run as it is, whose file is compared with itself.
-
-        Raises:
-            DyngsError: not even the file of that does.
         """
         for candidate in reversed(found.accepted):
             least = candidate.psnr - max(max_loss - candidate.worst, SMALLEST_FILE_LOSS)

@@ -24,8 +24,7 @@ from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.metrics import psnr
 from dyngs.ops.transfer import sent
-from dyngs.prune.score import Importance, ScoringViews, importance
-from dyngs.prune.selection import highest
+from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.static.fixed import FixedDensifier
 from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
@@ -63,12 +62,7 @@ class Pruned:
 
 
 class PruneStage:
-    """Listener that prunes when training ends and fine-tuning begins.
-
-    Args:
-        loop: of the run.
-        trainer: returns the trainer of its scene, which may be another one later.
-    """
+    """Listener that prunes when training ends and fine-tuning begins."""
 
     def __init__(self, loop: Loop, trainer: Callable[[], Trainer]) -> None:
         self._loop, self._trainer = loop, trainer

@@ -13,16 +13,7 @@ from dyngs.training.state import OTHER_CONFIG
 
 
 def found_corrections(run_dir: Path, run: LoadedRun, trained_on: Sequence[View]) -> CameraCorrections | None:
-    """Return the corrections of a run's cameras; None where it refined none, or has no checkpoint.
-
-    Args:
-        run_dir: its folder.
-        run: what was loaded from there.
-        trained_on: the training views of its capture.
-
-    Raises:
-        DyngsError: a checkpoint of other views.
-    """
+    """Return the corrections of a run's cameras; None where it refined none, or has no checkpoint."""
     if run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
         return None
     checkpoint = latest_checkpoint(run_dir)

@@ -135,11 +135,7 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
 
 
 def load_run(run_dir: Path) -> LoadedRun:
-    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints.
-
-    Raises:
-        DyngsError: no run folder, no checkpoint, or a damaged one.
-    """
+    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints."""
     config = load_resolved(run_dir)
     if network_of(config) is not None:
         raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")

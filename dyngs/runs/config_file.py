@@ -22,9 +22,6 @@ def write_config(config: Config, folder: Path) -> None:
 
     The fit is copied once: where the folder has one it is the run's. Where the fit is gone, as that of a run of former
     versions may be, its path stays as it is.
-
-    Raises:
-        DyngsError: something cannot be written.
     """
     body, own = config.data.body, folder.absolute() / BODY_FOLDER
     if body is not None and (own.is_dir() or (body / _PARAMETERS[0]).is_file()):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,24 +18,16 @@ from dyngs.runs.log import LOG_NAME
 
 EXPORT_FOLDER = "export"
 """In a run folder: the run as one .dyngs file of at most ``budget.max_mb``."""
-FORMER_EXPORT_FOLDER = "small"
-"""Name of ``EXPORT_FOLDER`` in runs of earlier versions; nothing is written there."""
 STILL_FOLDER = "still"
 """In the folder of a run of a moving scene: the run of the static model that it is compared with."""
 ASKED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
 _BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER, BODY_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
-_OLD_LEFTOVER = re.compile(r"\.step_\d+\.\d+\.safetensors|\.tmp[A-Za-z0-9]{6}")
-"""Names of half-written checkpoints of earlier versions and of the library that wrote them."""
 
 
 def default_folder(name: str) -> Path:
-    """Return the run folder of a run that has only a name.
-
-    Raises:
-        DyngsError: the name leads out of ``runs``, or is none.
-    """
+    """Return the run folder of a run that has only a name."""
     parts = Path(name).parts
     if not parts or ".." in parts or Path(name).is_absolute():
         raise DyngsError(f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER")
@@ -44,11 +35,7 @@ def default_folder(name: str) -> Path:
 
 
 def require_no_run(folder: Path) -> None:
-    """Raise unless a new run can be written to ``folder`` without replacing anything.
-
-    Raises:
-        DyngsError: says what is there.
-    """
+    """Raise unless a new run can be written to ``folder`` without replacing anything."""
     found = _found(folder)
     if checkpoint_paths(folder):
         raise DyngsError(
@@ -63,11 +50,7 @@ def require_no_run(folder: Path) -> None:
 
 
 def require_empty(folder: Path) -> None:
-    """Raise unless ``folder`` does not exist or is empty; a lock file whose owner was killed is removed.
-
-    Raises:
-        DyngsError: something is there, or a process writes there.
-    """
+    """Raise unless ``folder`` does not exist or is empty; a lock file whose owner was killed is removed."""
     if folder.is_dir() and not folder.is_symlink() and [path.name for path in folder.iterdir()] == [LOCK_NAME]:
         with writing(folder):  # it removes the file at its end
             pass
@@ -79,11 +62,7 @@ def require_empty(folder: Path) -> None:
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """Yield a hidden folder beside ``out`` that gets its name when the block ends well, and is removed otherwise.
-
-    Raises:
-        DyngsError: ``out`` is not empty, when the block begins or when it ends.
-    """
+    """Yield a hidden folder beside ``out`` that gets its name when the block ends well, and is removed otherwise."""
     require_empty(out)
     started = temporary_folder_beside(out)
     try:
@@ -101,11 +80,7 @@ def new_folder(out: Path) -> Iterator[Path]:
 
 @contextmanager
 def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
-    """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one that becomes it.
-
-    Raises:
-        DyngsError: ``out`` holds another run, or a process writes there.
-    """
+    """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one that becomes it."""
     if not out.exists():
         with new_folder(out) as started:
             yield started
@@ -132,9 +107,6 @@ def _require_export_of(config: Config, folder: Path) -> None:
 def require_startable(folder: Path, config: Config) -> None:
     """Raise unless the run of ``config`` can begin in ``folder``: it would replace nothing there, or only what
     the very same run left that was stopped before its first checkpoint.
-
-    Raises:
-        DyngsError: says what is there and what to do.
     """
     begun = _config_of_begun(folder)
     if begun is None:
@@ -166,11 +138,7 @@ def note_asked(folder: Path, asked: Config) -> None:
 
 
 def asked_for(folder: Path) -> Config:
-    """Return the configuration of a run as it was asked for.
-
-    Raises:
-        DyngsError: there is none, or it is broken.
-    """
+    """Return the configuration of a run as it was asked for."""
     path = folder / ASKED_NAME
     return load_resolved(path if path.is_file() else folder)
 
@@ -243,20 +211,15 @@ def tidy(folder: Path, *, sole_writer: bool) -> None:
     """
     ours = set(_BEGUN)
     remove_leftovers(folder, ours.__contains__ if sole_writer else None)
-    checkpoints = folder / "checkpoints"
-    for inner in (checkpoints, folder / EXPORT_FOLDER, folder / FORMER_EXPORT_FOLDER):
+    for inner in (folder / "checkpoints", folder / EXPORT_FOLDER):
         if not inner.is_symlink():
             remove_leftovers(inner, (lambda _: True) if sole_writer else None)
-    if sole_writer and not checkpoints.is_symlink():
-        for path in checkpoints.glob(".*"):
-            if _OLD_LEFTOVER.fullmatch(path.name):
-                remove_quietly(path)
 
 
 def _found(folder: Path) -> list[str]:
     """Return the names in ``folder`` that a run writes, whatever lies there under them; those of a begun run last."""
     metrics = sorted(path.name for path in folder.glob("metrics*.json"))
-    names = [SCENE_FILE, EXPORT_FOLDER, FORMER_EXPORT_FOLDER, *metrics, *_BEGUN]
+    names = [SCENE_FILE, EXPORT_FOLDER, *metrics, *_BEGUN]
     found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
     checkpoints = folder / "checkpoints"
     is_taken = not checkpoints.is_dir() and (checkpoints.exists() or checkpoints.is_symlink())

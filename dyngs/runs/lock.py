@@ -71,11 +71,7 @@ def _made(folder: Path) -> list[Path]:
 
 
 def _locked(folder: Path) -> tuple[int, bool]:
-    """Return the open lock file of a folder, and whether it is locked.
-
-    Raises:
-        DyngsError: another process has it.
-    """
+    """Return the open lock file of a folder, and whether it is locked."""
     path = folder / LOCK_NAME
     while True:
         file = _opened(path)

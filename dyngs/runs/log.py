@@ -47,9 +47,6 @@ class RunLog:
         after_step: lines beyond this step, left by an interrupted run, are dropped (0: all).
         every: steps between lines; the last step has one, too.
         tensorboard: also write event files to ``run_dir/tensorboard``.
-
-    Raises:
-        DyngsError: TensorBoard is wanted and not installed, or the folder cannot be written.
     """
 
     def __init__(self, run_dir: Path, after_step: int, *, every: int = 1, tensorboard: bool = False) -> None:

@@ -11,7 +11,7 @@ from typing import IO, Any
 
 from dyngs.config import Config
 from dyngs.runs.log import LogRecord, record_of
-from dyngs.runs.remaining import RemainingTime
+from dyngs.training.clock import Forecast
 from dyngs.training.events import Evaluated, Event, Message, StepDone, TotalChanged
 
 PLAIN_LINES = 10
@@ -44,7 +44,7 @@ class Progress:
         self._total, self._start, self._every = total, done, every
         self._stream = sys.stderr if stream is None else stream
         self._since = time.perf_counter()
-        self._remaining = RemainingTime(config, done, self._since)
+        self._config, self._forecast = config, Forecast(done, self._since)
         self._has_stepped = False
         self._psnr: float | None = None
         self._next_line = done
@@ -58,7 +58,7 @@ class Progress:
                 self.update(record_of(event), event.report.truth.shape[0] * event.report.truth.shape[1])
             case StepDone() if not self._has_stepped:
                 self._has_stepped = True
-                self._remaining.restart(event.step, time.perf_counter())
+                self._forecast.restart(event.step, time.perf_counter())
             case TotalChanged():
                 self.expect(event.total)
             case Evaluated():
@@ -73,8 +73,9 @@ class Progress:
             self._psnr = record.psnr if self._psnr is None else 0.95 * self._psnr + 0.05 * record.psnr
         now = time.perf_counter()
         rate = (record.step - self._start) / max(now - self._since, 1e-9)
-        self._remaining.observe(record.step, now, record.num_gaussians, pixels)
-        left = _clock(self._remaining.seconds(self._total))
+        config = None if self._config is None else self._config()
+        self._forecast.observe(config, record.step, now, record.num_gaussians, pixels)
+        left = _clock(self._forecast.seconds(config, self._total))
         psnr = "-" if self._psnr is None else f"{self._psnr:.2f}"
         text = f"loss {record.loss:.4f} psnr {psnr} {record.num_gaussians:,} Gaussians {rate:.1f} steps/s"
         if self._bar is not None:
@@ -99,14 +100,14 @@ class Progress:
     def pause(self, seconds: float) -> None:
         """Leave ``seconds`` that were not spent training out of the rate."""
         self._since += seconds
-        self._remaining.pause(seconds)
+        self._forecast.pause(seconds)
 
     def __enter__(self) -> Progress:
         if self._stream.isatty() and os.environ.get("TERM") != "dumb":
             self._bar, self._task = _rich_bar(self._total, self._start, self._stream)
             self._bar.start()
         self._since = time.perf_counter()
-        self._remaining.restart(self._start, self._since)
+        self._forecast.restart(self._start, self._since)
         return self
 
     def __exit__(

@@ -2,56 +2,22 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
+from dyngs.evaluate.drawing import Drawing, seconds_in_turn
 from dyngs.evaluate.report import render_options
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
 from dyngs.metrics import Lpips, psnr, ssim
-from dyngs.ops.device import finish
 from dyngs.tradeoff.measurements import Quartiles, Speed
 from dyngs.tradeoff.variants import Variant
-
-
-@dataclass(frozen=True)
-class VariantRenderer:
-    """Renders a variant.
-
-    Attributes:
-        scene: its scene.
-        options: how to render it.
-        background: (3,) colour.
-        scale: width and height rendered, relative to those returned.
-    """
-
-    scene: Scene
-    options: RenderOptions
-    background: Tensor
-    scale: float = 1.0
-
-    @torch.no_grad()
-    def image(self, cameras: Cameras, time: float | None) -> Tensor:
-        """Return (H, W, 3), seen by one camera at ``time``; upscaled bilinearly if ``scale`` < 1."""
-        small = scaled_cameras(cameras, self.scale)
-        rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[0]
-        size = (cameras.height, cameras.width)
-        if rgb.shape[:2] == size:
-            return rgb
-        return torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None], size=size, mode="bilinear")[0].permute(
-            1, 2, 0
-        )
 
 
 @dataclass(frozen=True)
@@ -79,24 +45,11 @@ def render_options_of(variant: Variant, model: SceneModel) -> RenderOptions:
     return render_options(with_render_settings(variant, model))
 
 
-def scaled_cameras(cameras: Cameras, scale: float) -> Cameras:
-    """Return the cameras with width and height times ``scale``, rounded to whole pixels."""
-    if scale == 1:
-        return cameras
-    width, height = (max(1, round(scale * side)) for side in (cameras.width, cameras.height))
-    factors = cameras.intrinsics.new_tensor([width / cameras.width, height / cameras.height, 1.0])
-    return Cameras(cameras.cam_from_world, factors[:, None] * cameras.intrinsics, width, height)
-
-
-def measure_quality(renderer: VariantRenderer, images: Iterable[Image], lpips: Lpips) -> Quality:
-    """Return mean metrics over images, each rendered at its own time.
-
-    Raises:
-        DyngsError: a render holds NaN or Inf.
-    """
+def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> Quality:
+    """Return mean metrics over images, each rendered at its own time."""
     psnrs, ssims, distances = [], [], []
     for image in images:
-        rendered, truth = renderer.image(image.cameras, image.time), image.composite(renderer.background)
+        rendered, truth = drawing.image(image.cameras, image.time), image.composite(drawing.background)
         if not bool(rendered.isfinite().all()):
             raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
         psnrs.append(psnr(rendered, truth, image.mask))
@@ -106,27 +59,9 @@ def measure_quality(renderer: VariantRenderer, images: Iterable[Image], lpips: L
     return Quality(fmean(psnrs), fmean(ssims), fmean(known) if len(known) == len(distances) else None)
 
 
-def time_interleaved(renderers: Sequence[VariantRenderer], images: Sequence[Image], rounds: int) -> list[Speed]:
-    """Return the speed of each renderer, relative to the first one.
-
-    All render each image in turn, starting with another one each time, so that other load on the machine affects all
-    alike.
-
-    Args:
-        renderers: at least one.
-        images: their cameras and times are rendered.
-        rounds: renders of each image.
-    """
-    seconds = np.zeros((len(renderers), rounds * len(images)))
-    for renderer in renderers:
-        renderer.image(images[0].cameras, images[0].time)  # warm-up
-    for column in range(seconds.shape[1]):
-        image = images[column % len(images)]
-        for turn in range(len(renderers)):
-            row = (column + turn) % len(renderers)
-            start = time.perf_counter()
-            finish(renderers[row].image(image.cameras, image.time).device)
-            seconds[row, column] = time.perf_counter() - start
+def time_interleaved(drawings: Sequence[Drawing], images: Sequence[Image], rounds: int) -> list[Speed]:
+    """Return the speed of each drawing, relative to the first one; arguments as for ``seconds_in_turn``."""
+    seconds = seconds_in_turn(drawings, images, rounds)
     return [Speed(ms=quartiles(1e3 * own), gain=quartiles(seconds[0] / own)) for own in seconds]
 
 

@@ -1,9 +1,10 @@
-"""Measurements of variants, and their files: one per variant, so that nothing is measured twice."""
+"""Measurements of variants, their Pareto front, and their files: one per variant, so that nothing is measured twice."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -72,11 +73,7 @@ _SHORTEST = 1e-9
 
 
 def read_measurement(path: Path) -> Measurement:
-    """Read a measurement from its JSON file.
-
-    Raises:
-        DyngsError: the file holds something else.
-    """
+    """Read a measurement from its JSON file."""
     with reading(path, "it is no measurement of a variant: remove it to have it measured again"):
         require_regular(path)
         stored = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite, parse_constant=_finite)
@@ -99,3 +96,17 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text} is not finite")
     return value
+
+
+def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
+    """Return which points are on the Pareto front: no other is as good in all goals and better in one."""
+    return [not any(_dominates(other, own) for other in goals) for own in goals]
+
+
+def on_front(measurements: Sequence[Measurement]) -> list[bool]:
+    """Return which variants are on the Pareto front of PSNR, speed and size."""
+    return pareto_mask([(m.psnr, m.gain, -m.mb) for m in measurements])
+
+
+def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
+    return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))

@@ -18,9 +18,10 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
+from dyngs.evaluate.drawing import Drawing
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
-from dyngs.tradeoff.measure import VariantRenderer, render_options_of
+from dyngs.tradeoff.measure import render_options_of
 from dyngs.tradeoff.variants import Variant
 
 _STATUS = Path("/proc/self/status")
@@ -101,14 +102,11 @@ def _measure(request: dict[str, Any]) -> None:
     variant = Variant(**request["variant"])
     with kernel_threads(1):
         run = load_run(Path(request["folder"]))
-        options, background = (
-            render_options_of(variant, run.config.model),
-            torch.tensor(request["background"], device="cpu"),
-        )
-        renderer = VariantRenderer(run.scene, options, background, variant.scale)
+        background = torch.tensor(request["background"], device="cpu")
+        drawing = Drawing(run.scene, render_options_of(variant, run.config.model), background, variant.scale)
         for view in request["views"]:
             pose, intrinsics = (torch.tensor(view[name], device="cpu") for name in ("pose", "intrinsics"))
-            renderer.image(Cameras(pose, intrinsics, *view["size"]), view["time"])
+            drawing.image(Cameras(pose, intrinsics, *view["size"]), view["time"])
     print(1024e-6 * (_kilobytes("VmHWM") - before), flush=True)
 
 

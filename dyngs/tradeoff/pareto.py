@@ -1,4 +1,4 @@
-"""The Pareto front of variants, the PSNR cost of each setting per factor of two, and combinations worth measuring."""
+"""The PSNR cost of each setting per factor of two, and combinations worth measuring."""
 
 from __future__ import annotations
 
@@ -33,20 +33,6 @@ class ExchangeRate:
     size: float
 
 
-def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
-    """Return which points are on the Pareto front: no other is as good in all goals and better in one.
-
-    Args:
-        goals: values of each point, all to be maximised.
-    """
-    return [not any(_dominates(other, own) for other in goals) for own in goals]
-
-
-def on_front(measurements: Sequence[Measurement]) -> list[bool]:
-    """Return which variants are on the Pareto front of PSNR, speed and size."""
-    return pareto_mask([(m.psnr, m.gain, -m.mb) for m in measurements])
-
-
 def rate(loss: float, factor: float) -> float | None:
     """Return dB lost per factor 2; None if less than 3.5 % is gained."""
     doublings = math.log2(factor)
@@ -60,12 +46,7 @@ def slope(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
 
 
 def exchange_rates(base: Measurement, measurements: Iterable[Measurement]) -> list[ExchangeRate]:
-    """Return the exchange rate of each setting, from the variants that change it alone, in order of appearance.
-
-    Args:
-        base: the run itself.
-        measurements: of any variants.
-    """
+    """Return the exchange rate of each setting, from the variants that change it alone, in order of appearance."""
     groups: dict[str, list[Measurement]] = {}
     for m in measurements:
         if m.variant.setting not in ("", SEVERAL):
@@ -124,7 +105,3 @@ def _accumulated(start: Variant, changes: Iterable[Variant], order: Sequence[Var
             if len(now.settings) > 1:
                 steps.append(now)
     return steps
-
-
-def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
-    return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))

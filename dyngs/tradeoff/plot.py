@@ -1,149 +1,105 @@
-"""Plot of a sweep: PSNR against speed and against size."""
+"""Plot of a sweep: PSNR against speed and against size; drawn by matplotlib, of the extra ``plots``."""
 
 from __future__ import annotations
 
-import math
+import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from html import escape
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
-from dyngs.tradeoff.pareto import pareto_mask
+from dyngs.tradeoff.measurements import pareto_mask
 from dyngs.tradeoff.table import TableRow
 from dyngs.tradeoff.variants import SEVERAL
-from dyngs.tradeoff.vector_graphics import Circle, Drawing, Line, Shape, Text
 
-PANEL = (520, 400)
-"""Width and height of a panel, px."""
-LEFT, TOP, BOTTOM, RIGHT = 58, 34, 48, 16
-LEGEND_ROW = 18
-PER_ROW = 6
-COLOURS = (
-    "#222222",
-    "#4477aa",
-    "#ee6677",
-    "#228833",
-    "#ccbb44",
-    "#66ccee",
-    "#aa3377",
-    "#ff8800",
-    "#997755",
-    "#7755dd",
-    "#009988",
-    "#ee3399",
-    "#88aa22",
-    "#cc3311",
-    "#0077bb",
-    "#555555",
-)
-"""Colour of the run itself first."""
-HEADROOM = 0.06
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'"
 
 
-@dataclass(frozen=True)
-class _Axis:
-    """Map of values to pixels, linear or logarithmic."""
-
-    low: float
-    high: float
-    start: float
-    end: float
-    logarithmic: bool
-
-    def at(self, value: float) -> float:
-        a, b, x = (math.log(v) if self.logarithmic else v for v in (self.low, self.high, value))
-        return self.start + (self.end - self.start) * (x - a) / (b - a)
-
-    def ticks(self) -> list[float]:
-        """Return 1, 2, 5 times powers of ten; evenly spaced values if a logarithmic axis has fewer than 3 of those."""
-        if self.logarithmic:
-            powers = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
-            found = [m * 10.0**p for p in powers for m in (1, 2, 5) if self.low <= m * 10.0**p <= self.high]
-            if len(found) >= 3:
-                return found
-        step = _round_step((self.high - self.low) / 5)
-        first = math.ceil(self.low / step)
-        return [k * step for k in range(first, math.floor(self.high / step) + 1)]
+def can_plot() -> bool:
+    """Return whether matplotlib is installed."""
+    return find_spec("matplotlib") is not None
 
 
-def plot(rows: Sequence[TableRow]) -> Drawing:
+def plot(rows: Sequence[TableRow]) -> Figure:
     """Return two panels, PSNR against speed and against size, and a legend.
 
     A thin line joins the run with the values of one setting in their order; the thick grey line is the Pareto front of
-    the two axes. Values that are not positive are left out of logarithmic axes.
-
-    Args:
-        rows: the run itself first.
+    the two axes. Values that are not positive are left out of the logarithmic axes. The run itself comes first.
     """
-    settings = list(dict.fromkeys(p.variant.setting for p in rows if p.variant.setting != SEVERAL))
-    colours = {setting: COLOURS[i % len(COLOURS)] for i, setting in enumerate(settings)} | {SEVERAL: "#888888"}
-    if any(p.variant.setting == SEVERAL for p in rows):
-        settings.append(SEVERAL)
-    legend_rows = math.ceil(len(settings) / PER_ROW)
-    width, height = 2 * PANEL[0], PANEL[1] + legend_rows * LEGEND_ROW + 8
-    shapes = [
-        *_panel(rows, colours, 0, ("speed", "frames per second (more is better)", lambda p: p.fps), 1),
-        *_panel(rows, colours, PANEL[0], ("size", "MB on disk (less is better)", lambda p: p.mb), -1),
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    found = dict.fromkeys(row.variant.setting for row in rows)
+    settings = [*(setting for setting in found if setting != SEVERAL), *([SEVERAL] if SEVERAL in found else [])]
+    shades = colormaps["tab20"].resampled(20)
+    colours: dict[str, object] = {setting: shades(i % 20) for i, setting in enumerate(settings)}
+    colours |= {"": "#222222", SEVERAL: "#888888"}
+    figure = Figure(figsize=(10.4, 4.6), layout="constrained")
+    speed, size = figure.subplots(1, 2)
+    _draw_panel(speed, rows, colours, lambda row: row.fps, 1)
+    _draw_panel(size, rows, colours, lambda row: row.mb, -1)
+    for axes, title, label in (
+        (speed, "speed", "frames per second (more is better)"),
+        (size, "size", "MB on disk (less is better)"),
+    ):
+        axes.set_title(f"PSNR and {title}", loc="left", fontweight="bold")
+        axes.set_xlabel(f"{label}, logarithmic")
+        axes.set_ylabel("dB")
+    handles = [
+        speed.plot([], [], "o", color=colours[setting], label=setting or "the run itself")[0] for setting in settings
     ]
-    for i, setting in enumerate(settings):
-        x, y = LEFT + (i % PER_ROW) * (width - LEFT) / PER_ROW, PANEL[1] + 12 + LEGEND_ROW * (i // PER_ROW)
-        shapes += [Circle(x, y - 4, 5, colours[setting]), Text(x + 10, y, setting or "the run itself")]
-    return Drawing(width, height, shapes)
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+    return figure
 
 
-def _panel(
-    rows: Sequence[TableRow],
-    colours: dict[str, str],
-    left: float,
-    axis: tuple[str, str, Callable[[TableRow], float]],
-    sign: int,
-) -> list[Shape]:
-    """Return one panel; ``sign`` is 1 if larger x is better, -1 otherwise."""
-    title, label, value = axis
-    shown = [p for p in rows if value(p) > 0]
-    if not shown:
-        return []
-    low, high = _wider([value(p) for p in shown], logarithmic=True)
-    across = _Axis(low, high, left + LEFT, left + PANEL[0] - RIGHT, True)
-    up = _Axis(*_wider([p.psnr for p in shown], logarithmic=False), PANEL[1] - BOTTOM, TOP, False)
-    places = {p.variant: (across.at(value(p)), up.at(p.psnr)) for p in shown}
-    best = pareto_mask([(p.psnr, sign * value(p)) for p in shown])
-    front = sorted({places[p.variant] for p, is_best in zip(shown, best, strict=True) if is_best})
-    shapes = [*_frame(across, up, f"PSNR and {title}", label), Line(tuple(front), "#d4d4d4", 5)]
+def svg_of(figure: Figure) -> str:
+    """Return a figure as an SVG element, whose points have their labels as tooltips; equal figures give equal text."""
+    import matplotlib
+
+    file = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "dyngs", "svg.fonttype": "none"}):
+        figure.savefig(file, format="svg", metadata={"Date": None})
+    text = file.getvalue()
+    text = text[text.index("<svg") :]
+    for tip in {str(line.get_gid()) for axes in figure.axes for line in axes.lines if line.get_gid()}:
+        text = text.replace(f'<g id="{tip}">', f"<g><title>{escape(tip)}</title>")
+    return text
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as the bytes of a PNG file."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=200, metadata={"Software": None})
+    return file.getvalue()
+
+
+def _draw_panel(
+    axes: Axes, rows: Sequence[TableRow], colours: dict[str, object], value: Callable[[TableRow], float], sign: int
+) -> None:
+    """Draw PSNR against ``value``; ``sign`` is 1 if more of that is better, -1 otherwise."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    shown = [row for row in rows if value(row) > 0]
+    best = pareto_mask([(row.psnr, sign * value(row)) for row in shown])
+    front = sorted((value(row), row.psnr) for row, is_best in zip(shown, best, strict=True) if is_best)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.6g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="#e4e4e4")
+    axes.margins(0.06)
+    axes.plot([x for x, _ in front], [y for _, y in front], color="#d4d4d4", linewidth=5)
     for setting, colour in colours.items():
+        joined = [row for row in shown if row.variant.setting in ("", setting)]
         if setting not in ("", SEVERAL):
-            turned = tuple(places[p.variant] for p in shown if p.variant.setting in ("", setting))
-            shapes.append(Line(turned, colour, 0.75))
-    for p in reversed(shown):  # draws the run itself on top
-        tip = f"{p.variant.name}: {p.psnr:.2f} dB, {p.fps:.1f} fps, {p.mb:.2f} MB"
-        shapes.append(Circle(*places[p.variant], 6.5 if not p.variant.setting else 5, colours[p.variant.setting], tip))
-    return shapes
-
-
-def _frame(across: _Axis, up: _Axis, title: str, label: str) -> list[Shape]:
-    """Return grid, tick labels, title and axis label."""
-    shapes: list[Shape] = [Text(across.start, 20, title, size=13, bold=True), Text(across.start - 44, TOP - 8, "dB")]
-    for tick in across.ticks():
-        x = across.at(tick)
-        shapes.append(Line(((x, up.start), (x, up.end)), "#e4e4e4", 1))
-        shapes.append(Text(x, up.start + 16, f"{tick:,.6g}", "middle"))
-    for tick in up.ticks():
-        y = up.at(tick)
-        shapes.append(Line(((across.start, y), (across.end, y)), "#e4e4e4", 1))
-        shapes.append(Text(across.start - 6, y + 4, f"{tick:,.6g}", "end"))
-    middle = (across.start + across.end) / 2
-    return [*shapes, Text(middle, up.start + 34, f"{label}, logarithmic", "middle")]
-
-
-def _wider(values: Sequence[float], *, logarithmic: bool) -> tuple[float, float]:
-    """Return limits with some margin around the values, never empty."""
-    low, high = min(values), max(values)
-    if logarithmic:
-        room = max((high / low) ** HEADROOM, 1.05)
-        return low / room, high * room
-    room = max(HEADROOM * (high - low), 0.05)
-    return low - room, high + room
-
-
-def _round_step(step: float) -> float:
-    """Return 1, 2, 5 or 10 times a power of ten that is at least ``step``."""
-    power = 10.0 ** math.floor(math.log10(step))
-    return next(m * power for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9))
+            axes.plot([value(row) for row in joined], [row.psnr for row in joined], color=colour, linewidth=0.75)
+    for row in reversed(shown):  # draws the run itself on top
+        tip = f"{row.variant.name}: {row.psnr:.2f} dB, {row.fps:.1f} fps, {row.mb:.2f} MB"
+        size = 7 if row.variant.setting else 9
+        axes.plot(
+            value(row), row.psnr, "o", color=colours[row.variant.setting], markeredgecolor="white", ms=size, gid=tip
+        )

@@ -10,10 +10,10 @@ from dataclasses import asdict
 from html import escape
 from pathlib import Path
 
-from dyngs.files.write import write_image, write_text
+from dyngs.files.write import atomic_file, write_text
 from dyngs.tradeoff.measurements import Measurement
 from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates
-from dyngs.tradeoff.plot import plot
+from dyngs.tradeoff.plot import can_plot, plot, png_of, svg_of
 from dyngs.tradeoff.table import TableRow, table_rows
 
 STEM = "tradeoff"
@@ -24,6 +24,10 @@ td, th { padding: 2px 10px; text-align: right; border-bottom: 1px solid #ddd; }
 td:first-child, th:first-child { text-align: left; }
 .front { background: #eef5ff; }
 """
+_UNDER_PLOT = (
+    "<p>Thick lines: Pareto fronts of the two axes. Thin lines: the values of one setting in their order. "
+    "Hover over a point for its name.</p>"
+)
 _HEAD = (
     "changed",
     "PSNR dB",
@@ -45,16 +49,13 @@ EXCHANGE_HEAD = (
 
 
 def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
-    """Write ``tradeoff.csv``, ``.json``, ``.svg``, ``.html`` and ``.png``; return their paths.
+    """Write ``tradeoff.csv``, ``.json`` and ``.html``, with matplotlib ``.svg`` and ``.png``, too; return their paths.
 
-    The page needs no other files and no network.
-
-    Args:
-        out: output folder.
-        measurements: with speed, the run itself first.
+    The page needs no other files and no network. ``measurements`` have speeds, the run itself comes first.
     """
     rows, rates = table_rows(measurements), exchange_rates(measurements[0], measurements)
-    svg = plot(rows)
+    figure = plot(rows) if can_plot() else None
+    svg = "" if figure is None else svg_of(figure)
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0].columns), lineterminator="\n")
     writer.writeheader()
@@ -67,13 +68,16 @@ def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
     texts = {
         "csv": table.getvalue(),
         "json": json.dumps(values, indent=2, allow_nan=False) + "\n",
-        "svg": svg.svg(),
-        "html": _page(rows, rates, svg.svg()),
+        "html": _page(rows, rates, svg),
     }
+    if svg:
+        texts["svg"] = svg
     for suffix, text in texts.items():
         write_text(out / f"{STEM}.{suffix}", text)
-    write_image(out / f"{STEM}.png", svg.pixels())
-    return [out / f"{STEM}.{suffix}" for suffix in (*texts, "png")]
+    if figure is not None:
+        with atomic_file(out / f"{STEM}.png") as temporary:
+            temporary.write_bytes(png_of(figure))
+    return [out / f"{STEM}.{suffix}" for suffix in (*texts, *(["png"] if svg else []))]
 
 
 def exchange_cells(rate: ExchangeRate) -> tuple[str, ...]:
@@ -109,9 +113,7 @@ def _page(rows: Sequence[TableRow], rates: Sequence[ExchangeRate], svg: str) -> 
         [
             '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Tradeoff</title>',
             f"<style>{_STYLE}</style></head><body><h1>Quality, speed and size</h1>",
-            svg,
-            "<p>Thick lines: Pareto fronts of the two axes. Thin lines: the values of one setting in their order. "
-            "Hover over a point for its name.</p>",
+            f"{svg}{_UNDER_PLOT if svg else ''}",
             "<h2>Each setting alone</h2><table>",
             *rate_lines,
             "</table><h2>All variants</h2><p>Shaded: Pareto front of PSNR, speed and size.</p><table>",

@@ -1,4 +1,8 @@
-"""Measure a run and its variants: one setting at a time, then combinations. Finished measurements are kept."""
+"""Measure a run and its variants: one setting at a time, then combinations. Finished measurements are kept.
+
+The processes that ``torchrun`` starts share a sweep, on one machine or several with a common file system: they exchange
+results through files.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from pathlib import Path
 from typing import cast
 
@@ -17,20 +22,21 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
+from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
 from dyngs.metrics import load_lpips
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.tradeoff.distributed import SINGLE_PROCESS, ProcessGroup
-from dyngs.tradeoff.measure import VariantRenderer, measure_quality, render_options_of, time_interleaved
+from dyngs.tradeoff.measure import measure_quality, render_options_of, time_interleaved
 from dyngs.tradeoff.measurements import Measurement, read_measurement, write_measurement
 from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
 from dyngs.tradeoff.variants import Variant, Variation, single_changes
 from dyngs.training.background import evaluation_background
+from dyngs.training.processes import numbers_of_torchrun
 
 TIMED_VIEWS = 8
 """Number of views for timing, evenly spread over the split; quality is measured on all."""
@@ -38,6 +44,8 @@ SERIES = 12
 """Number of variants timed together with the run; bounds the memory needed."""
 MEMORY_VIEWS = 2
 SOURCE_NAME = "source.json"
+TIMEOUT = timedelta(days=30)
+"""A process may have to wait while others train."""
 
 
 @dataclass(frozen=True)
@@ -63,18 +71,67 @@ class Plan:
     device: torch.device = CPU
 
 
+@dataclass(frozen=True)
+class ProcessGroup:
+    """This process and the number of the others.
+
+    Attributes:
+        rank: number of this process; rank 0 also measures speed and writes the report.
+        size: number of processes.
+        local_size: number of processes on this machine.
+    """
+
+    rank: int = 0
+    size: int = 1
+    local_size: int = 1
+
+    @staticmethod
+    def from_environment() -> ProcessGroup:
+        """Return the group that ``torchrun`` describes in environment variables; a single process without it."""
+        numbers = numbers_of_torchrun()
+        return SINGLE_PROCESS if numbers is None else ProcessGroup(*numbers)
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process has rank 0."""
+        return self.rank == 0
+
+    @property
+    def cores(self) -> int:
+        """Cores for this process if all on this machine get the same number, at least 1."""
+        return max(1, num_cores() // self.local_size)
+
+    def share(self, variants: Sequence[Variant]) -> list[Variant]:
+        """Return the variants for this process; variants that are made from one another stay together."""
+        owners: dict[Variant, int] = {}
+        for variant in variants:
+            owners.setdefault(_longest_stage(variant), len(owners) % self.size)
+        return [variant for variant in variants if owners[_longest_stage(variant)] == self.rank]
+
+    def wait(self) -> None:
+        """Block until all processes are here."""
+        if self.size == 1:
+            return
+        if not torch.distributed.is_initialized():
+            torch.distributed.init_process_group("gloo", timeout=TIMEOUT)
+        torch.distributed.barrier()
+
+
+SINGLE_PROCESS = ProcessGroup()
+
+
+def _longest_stage(variant: Variant) -> Variant:
+    """Return the part of a variant that takes longest to make: training, else pruning and masking, else the rest."""
+    pruned = replace(variant.stored, storage=None, field_step=1.0, sh_degree=None)
+    return next((part for part in (variant.trained, pruned, variant.stored) if part != Variant()), variant)
+
+
 def sweep(
     runs: VariantRuns, plan: Plan, log: Callable[[str], None], group: ProcessGroup = SINGLE_PROCESS
 ) -> list[Measurement]:
     """Return the measurements of all variants, the run itself first.
 
-    Each is kept as a file in ``runs.out / "points"`` and not made again.
-
-    Args:
-        runs: the run and the folder for its variants.
-        plan: what to measure.
-        log: called with a line per measurement.
-        group: processes that call this together.
+    Each is kept as a file in ``runs.out / "points"`` and not made again; ``log`` is called with a line per measurement.
 
     Raises:
         DyngsError: no such run or split, or the folder holds measurements of another run.
@@ -121,8 +178,8 @@ class _Session:
         path = self._path(variant)
         if path.is_file():
             return read_measurement(path)
-        folder, renderer = self._runs.folder(variant), self._renderer(variant)
-        quality = measure_quality(renderer, (self._loader[i] for i in range(len(self._loader))), self._lpips)
+        folder, drawing = self._runs.folder(variant), self._drawing(variant)
+        quality = measure_quality(drawing, (self._loader[i] for i in range(len(self._loader))), self._lpips)
         shown = self._images(MEMORY_VIEWS)
         measurement = Measurement(
             variant=variant,
@@ -130,7 +187,7 @@ class _Session:
             psnr=quality.psnr,
             ssim=quality.ssim,
             lpips=quality.lpips,
-            num_gaussians=len(renderer.scene),
+            num_gaussians=len(drawing.scene),
             mb=megabytes_on_disk(folder),
             memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background)
             if self._plan.device == CPU
@@ -152,16 +209,16 @@ class _Session:
         for group in groups:
             self._log(f"timing {len(group) + 1} variants in turn")
             together = [first, *group]
-            speeds = time_interleaved([self._renderer(m.variant) for m in together], images, self._plan.rounds)
+            speeds = time_interleaved([self._drawing(m.variant) for m in together], images, self._plan.rounds)
             for m, speed in zip(together, speeds, strict=True):
                 if m.speed is None:
                     write_measurement(self._path(m.variant), replace(m, speed=speed))
             first = self._measurement(first.variant)
 
-    def _renderer(self, variant: Variant) -> VariantRenderer:
+    def _drawing(self, variant: Variant) -> Drawing:
         run = load_run(self._runs.folder(variant))
         scene = scene_of_split(run, self._capture, self._plan.split).to(self._plan.device)
-        return VariantRenderer(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
+        return Drawing(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
 
     def _images(self, count: int) -> list[Image]:
         return [self._loader[i] for i in evenly_spaced(len(self._loader), count)]
@@ -171,11 +228,7 @@ class _Session:
 
 
 def _require_same_source(runs: VariantRuns, plan: Plan, *, is_first: bool) -> None:
-    """Compare the checkpoint and split with those of earlier measurements in the folder; rank 0 notes them.
-
-    Raises:
-        DyngsError: they differ.
-    """
+    """Compare the checkpoint and split with those of earlier measurements in the folder; rank 0 notes them."""
     newest = checkpoint_paths(runs.run_dir)[-1]
     source = {
         "run": str(runs.run_dir.absolute()),

@@ -1,16 +1,19 @@
-"""The table of a sweep: one row per measured variant, with what the report, the plot and the requirements use."""
+"""The table of a sweep, one row per measured variant, and the best row that meets requirements (``psnr>=30,mb<=5``)."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-from dyngs.tradeoff.measurements import Measurement
-from dyngs.tradeoff.pareto import on_front
+from dyngs.errors import DyngsError, printable
+from dyngs.tradeoff.measurements import Measurement, on_front
 from dyngs.tradeoff.variants import Variant
 
 METRICS = ("psnr", "ssim", "lpips", "fps", "mb", "memory_mb", "gaussians")
 """Columns that a requirement or a goal may name."""
+_CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
 
 
 @dataclass(frozen=True)
@@ -57,11 +60,7 @@ class TableRow:
 
 
 def table_rows(measurements: Sequence[Measurement]) -> list[TableRow]:
-    """Return a row per variant whose speed was measured, in their order.
-
-    Args:
-        measurements: the run itself first.
-    """
+    """Return a row per variant whose speed was measured, in their order: the run itself first."""
     base = measurements[0].speed
     fps = 0.0 if base is None else 1e3 / base.ms.median
     return [
@@ -83,3 +82,100 @@ def table_rows(measurements: Sequence[Measurement]) -> list[TableRow]:
         for m, is_best in zip(measurements, on_front(measurements), strict=True)
         if m.speed is not None
     ]
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """``name >= bound``, or ``name <= bound`` if ``at_most``."""
+
+    name: str
+    at_most: bool
+    bound: float
+
+    def __str__(self) -> str:
+        return f"{self.name}{'<=' if self.at_most else '>='}{self.bound:g}"
+
+    def is_met(self, row: TableRow) -> bool:
+        """Whether the metric was measured and meets the bound."""
+        value = row.metric(self.name)
+        return value is not None and (value <= self.bound if self.at_most else value >= self.bound)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The metric to minimise (``smallest``) or maximise."""
+
+    name: str
+    smallest: bool
+
+    def cost(self, row: TableRow) -> float:
+        """Return a value that is smaller for better rows, infinite where the metric was not measured."""
+        value = row.metric(self.name)
+        return math.inf if value is None else value if self.smallest else -value
+
+
+def parse_requirements(text: str) -> tuple[Requirement, ...]:
+    """Return the conditions of a list such as ``psnr>=30,fps>=20,mb<=5``."""
+    return tuple(_requirement(part) for part in text.split(","))
+
+
+def parse_goal(name: str, *, smallest: bool) -> Goal:
+    """Return the goal of ``--minimize`` or ``--maximize``."""
+    if name not in METRICS:
+        option = "--minimize" if smallest else "--maximize"
+        raise DyngsError(f"{option} {name}: no such metric; there are {', '.join(METRICS)}")
+    return Goal(name, smallest)
+
+
+def choose(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: Goal) -> TableRow:
+    """Return the best row among those that meet all requirements; of equally good ones that with the higher PSNR."""
+    fitting = [row for row in rows if all(r.is_met(row) for r in requirements)]
+    if not fitting:
+        raise DyngsError(_explanation(rows, requirements, goal))
+    return min(fitting, key=lambda row: (goal.cost(row), -row.psnr, row.variant.slug))
+
+
+def _requirement(part: str) -> Requirement:
+    match, shown = _CONDITION.match(part), printable(part.strip(), 60)
+    if match is None:
+        raise DyngsError(f"--require {shown!r} is no condition; write for instance psnr>=30,fps>=20,mb<=5")
+    name, sign, number = match.groups()
+    if name not in METRICS:
+        raise DyngsError(f"--require {shown}: no such metric; there are {', '.join(METRICS)}")
+    try:
+        bound = float(number)
+    except ValueError:
+        bound = math.nan
+    if not math.isfinite(bound):
+        raise DyngsError(f"--require {shown}: {printable(number, 30)!r} is not a number")
+    return Requirement(name, sign == "<=", bound)
+
+
+def _explanation(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: Goal) -> str:
+    """Return one line: the best value per requirement with the others met, or, if there is none, on its own."""
+    asked = ", ".join(str(r) for r in requirements)
+    relaxed = []
+    for binding in requirements:
+        others = [r for r in requirements if r is not binding]
+        fitting = [row for row in rows if all(r.is_met(row) for r in others) and row.metric(binding.name) is not None]
+        if fitting:
+            nearest = min(fitting, key=lambda row: (_violation(binding, row), goal.cost(row)))
+            best = f"with the others met the best is {nearest.metric(binding.name):.5g} ({nearest.name})"
+            relaxed.append(f"{binding} is too strict: {best}")
+    if not relaxed:
+        relaxed = [f"{r} alone: {_best_value(rows, r)}" for r in requirements]
+    return f"no measured variant has {asked}; {'; '.join(relaxed)}"
+
+
+def _violation(requirement: Requirement, row: TableRow) -> float:
+    """Return by how much a row misses the bound."""
+    value = row.metric(requirement.name)
+    assert value is not None
+    return value - requirement.bound if requirement.at_most else requirement.bound - value
+
+
+def _best_value(rows: Sequence[TableRow], requirement: Requirement) -> str:
+    known = [value for row in rows if (value := row.metric(requirement.name)) is not None]
+    if not known:
+        return "not measured here"
+    return f"the best is {min(known) if requirement.at_most else max(known):.5g}"

@@ -121,11 +121,7 @@ class Setting:
         return " or ".join([*number, *self.words])
 
     def parsed(self, text: str) -> Value:
-        """Return the value of a text.
-
-        Raises:
-            DyngsError: it is not allowed.
-        """
+        """Return the value of a text."""
         if text in self.words:
             return text
         try:
@@ -200,9 +196,6 @@ def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, 
     Args:
         words: one per ``--vary``.
         trains: settings that need training from scratch are allowed.
-
-    Raises:
-        DyngsError: an unknown setting, one given twice, or a value that is not allowed.
     """
     if not words:
         return tuple(Variation(setting, setting.values) for setting in SETTINGS if trains or not setting.trains)
@@ -224,13 +217,7 @@ def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, 
 
 
 def single_changes(variations: Sequence[Variation], run: RunSettings, finetune: int) -> list[Variant]:
-    """Return one variant per setting and value that applies to a run; pruned and masked ones also with fine-tuning.
-
-    Args:
-        variations: settings and values.
-        run: settings of the run.
-        finetune: steps; 0: no fine-tuning.
-    """
+    """Return one variant per setting and value that applies to a run; pruned and masked ones also with fine-tuning."""
     variants = []
     for variation in variations:
         name = variation.setting.name

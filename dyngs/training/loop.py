@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Protocol
 
 from dyngs.errors import DyngsError
 from dyngs.ops.adam import Count
+from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Listener, Message, Started, StepDone, StepReport, TotalChanged
 from dyngs.training.state import Checkpoint
 
@@ -53,21 +53,6 @@ class Trainable(Protocol):
             DyngsError: it belongs to something else, or its tensors do not fit together.
         """
         ...
-
-
-class Stopwatch:
-    """Seconds of training: from reading the capture on, over all resumes, without evaluations."""
-
-    def __init__(self) -> None:
-        self._since = time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        return time.perf_counter() - self._since
-
-    def pause(self, seconds: float) -> None:
-        """Leave ``seconds`` out (negative: count them in)."""
-        self._since += seconds
 
 
 class Loop:

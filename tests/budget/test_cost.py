@@ -10,12 +10,12 @@ from limited import limited
 
 from dyngs.api.train import train
 from dyngs.budget import cost
-from dyngs.budget.cost import CostMeter, Range, step_cost
-from dyngs.budget.time import with_steps
+from dyngs.budget.cost import CostMeter, Range
 from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, DefaultStrategy, FixedStrategy, McmcStrategy, RandomInit, TrainConfig
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.training.clock import step_cost, with_steps
 from dyngs.training.events import StepDone
 
 

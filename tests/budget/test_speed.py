@@ -40,7 +40,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
-from dyngs.evaluate.temporal import Drawing
+from dyngs.evaluate.drawing import Drawing
 from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.events import Event, StepDone

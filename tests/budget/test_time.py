@@ -24,16 +24,15 @@ from dyngs.budget.time import (
     fitting_steps,
     refitted,
     same_phase,
-    seconds_left,
-    with_steps,
 )
 from dyngs.build import assemble
 from dyngs.config import AutoColour, Config, DataConfig, DynamicModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.training.clock import Forecast, Stopwatch, with_steps
 from dyngs.training.events import StepReport
-from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.loop import Loop
 from dyngs.training.processes import Processes
 from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
@@ -51,26 +50,32 @@ def timed(config: Config, minutes: float) -> Config:
     return config.model_copy(update={"train": config.train.model_copy(update={"minutes": minutes})})
 
 
+def forecast_of(config: Config, pace: float, pixels: int = 10_000) -> Forecast:
+    """Ten steps at ``pace`` after the first 100."""
+    forecast = Forecast(100, 0.0, 1000)
+    forecast.observe(config, 110, 10 * pace, 1000, pixels)
+    return forecast
+
+
 @given(done=st.integers(0, 5000), pace=st.floats(1e-3, 10), seconds=st.floats(0, 1e5))
 def test_what_fits_fits_and_one_more_does_not(done: int, pace: float, seconds: float) -> None:
-    found = fitting_steps(PLAIN, done, pace, seconds, 7000)
+    forecast = forecast_of(PLAIN, pace)
+    found = fitting_steps(forecast, PLAIN, done, seconds, 7000)
     assert done <= found <= 7000
-    assert found == done or seconds_left(PLAIN, done, found, pace) <= seconds
-    assert found == 7000 or seconds_left(PLAIN, done, found + 1, pace) > seconds
+    assert found == done or forecast.seconds(with_steps(PLAIN, found), found, done) <= seconds
+    assert found == 7000 or forecast.seconds(with_steps(PLAIN, found + 1), found + 1, done) > seconds
 
 
 def test_a_settled_run_goes_on_as_it_was() -> None:
-    """After growth each step takes as long as the last."""
-    assert seconds_left(PLAIN, 6000, 7000, 0.5) == pytest.approx(500)
-    assert fitting_steps(PLAIN, 6000, 0.5, 100, 7000) == 6200
+    """Without growth each step takes as long as the last."""
+    assert fitting_steps(forecast_of(PLAIN, 0.5), PLAIN, 6000, 100, 7000) == 6200
 
 
 def test_sharper_images_take_longer() -> None:
-    """From a quarter of the sides on, a pixel's fraction of a step is 16 times as much."""
-    assert seconds_left(SHRUNK, 6000, 7000, 0.5) == pytest.approx(500)
-    small = seconds_left(SHRUNK, 10, 7000, 0.1)
-    assert small > 1.5 * seconds_left(PLAIN, 10, 7000, 0.1)
-    assert small < (1 / (0.3 + 0.7 / 16)) * seconds_left(PLAIN, 10, 7000, 0.1)
+    """From a quarter of the sides on, a step draws 16 times as many pixels."""
+    small = forecast_of(SHRUNK, 0.1, 100_000).seconds(SHRUNK, 7000, 10)
+    plain = forecast_of(PLAIN, 0.1, 100_000).seconds(PLAIN, 7000, 10)
+    assert 1.5 * plain < small < 16 * plain
 
 
 def simulated(seconds: float, most_steps: int, *, fits: bool) -> Deadline:
@@ -86,6 +91,7 @@ def test_a_run_whose_steps_change_pace_fills_its_time(factor: float) -> None:
     """A simulated machine: steps that take ``factor`` times as long from a third of the run on."""
     deadline, config, now = simulated(100.0, 100_000, fits=True), with_steps(PLAIN, 5000), 0.0
     for done in itertools.count():
+        deadline._forecast.observe(config, done, now, 1000, 10_000)
         found = deadline.steps(config, done, now)
         config = with_steps(config, found)
         if done >= found:
@@ -183,7 +189,7 @@ def test_a_first_fit_keeps_or_lowers_the_steps_or_refuses(
     long = with_steps(config, 1000)
     fitted = first_fit(timed(long, 20.0), assemble(long), 0.0).train.steps
     assert FEWEST_STEPS <= fitted < 1000
-    assert seconds_left(long, 0, fitted, 1.0) <= AIM * 1200
+    assert fitted <= AIM * 1200
 
 
 def test_a_run_that_gets_slow_ends_in_time_and_stays_ended(

@@ -14,7 +14,7 @@ from dyngs.capture.sfm import SfmOptions, SfmResult
 from dyngs.capture.unposed import with_poses
 from dyngs.config import DataConfig
 from dyngs.errors import DyngsError
-from dyngs.files.cache import cache_folder
+from dyngs.files.temporary import cache_folder
 from dyngs.files.write import write_image
 from dyngs.output.video import VideoWriter
 

@@ -73,11 +73,11 @@ def test_scores_are_those_of_the_pixels_of_each_region() -> None:
     rendered[9:15, 3:9] -= 0.1
     rendered[0, :, :] += 0.01
     scores = regions.scores(image, rendered, image.rgb_premultiplied)
-    assert scores.foreground is None
-    assert scores.moving == pytest.approx(20.0, abs=1e-3)
+    assert scores["psnr_foreground"] is None
+    assert scores["psnr_moving"] == pytest.approx(20.0, abs=1e-3)
     rest = SIDE * SIDE - 36
-    assert scores.still == pytest.approx(-10 * np.log10(SIDE * 1e-4 / rest), abs=1e-3)
-    assert regions.reason("foreground") == NO_ALPHA
+    assert scores["psnr_static"] == pytest.approx(-10 * np.log10(SIDE * 1e-4 / rest), abs=1e-3)
+    assert regions.reason("psnr_foreground") == NO_ALPHA
 
 
 def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
@@ -91,9 +91,9 @@ def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
     rendered[:12, :12] += 0.1
     rendered[12:] -= 0.5
     scores = regions.scores(image, rendered, truth)
-    assert scores.moving == pytest.approx(20.0, abs=1e-3)
-    assert scores.still == 100.0
-    assert scores.foreground == pytest.approx(20.0 + 10 * np.log10(2), abs=1e-3)
+    assert scores["psnr_moving"] == pytest.approx(20.0, abs=1e-3)
+    assert scores["psnr_static"] == 100.0
+    assert scores["psnr_foreground"] == pytest.approx(20.0 + 10 * np.log10(2), abs=1e-3)
     assert regions.moving_from == "motion masks"
 
 
@@ -104,24 +104,24 @@ def test_a_mask_of_a_image_holds_in_its_regions() -> None:
     image = replace(images[1], mask=mask)
     rendered = image.rgb_premultiplied.clone()
     rendered[12:] = 0
-    assert regions_of(images).scores(image, rendered, image.rgb_premultiplied).still == 100.0
+    assert regions_of(images).scores(image, rendered, image.rgb_premultiplied)["psnr_static"] == 100.0
     hidden = replace(image, mask=torch.zeros(SIDE, SIDE))
-    assert regions_of(images).scores(hidden, rendered, image.rgb_premultiplied).still is None
+    assert regions_of(images).scores(hidden, rendered, image.rgb_premultiplied)["psnr_static"] is None
 
 
 def test_reasons_say_why_there_is_no_score() -> None:
     images = images_of_a_walk()
     moved = regions_of(images, standing=False)
     assert moved.moving(images[0]) is None
-    assert (moved.reason("moving"), moved.moving_from) == (NO_MOTION_KNOWN, None)
+    assert (moved.reason("psnr_moving"), moved.moving_from) == (NO_MOTION_KNOWN, None)
     still = regions_of([replace(p, time=None) for p in images])
     assert still.moving(images[0]) is None
-    assert still.reason("still") == NO_TIMES
+    assert still.reason("psnr_static") == NO_TIMES
     same = [replace(p, rgb_premultiplied=torch.full((SIDE, SIDE, 3), 0.4)) for p in images]
     nothing = regions_of(same)
     scores = nothing.scores(same[0], same[0].rgb_premultiplied, same[0].rgb_premultiplied)
-    assert (scores.moving, scores.still) == (None, 100.0)
-    assert nothing.reason("moving") == TOO_SMALL
+    assert (scores["psnr_moving"], scores["psnr_static"]) == (None, 100.0)
+    assert nothing.reason("psnr_moving") == TOO_SMALL
 
 
 def test_images_without_alpha_and_mask_have_neither_region() -> None:

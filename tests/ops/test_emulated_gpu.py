@@ -19,16 +19,15 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops import native
 from dyngs.ops.adam import adam_step_, seen_rows
-from dyngs.ops.finite import count_nonfinite_op
+from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.ops.offsets import add_offsets_
 from dyngs.ops.perceptron import GPU_LAYERS, GPU_WIDTH, Layer, perceptron, perceptron_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 from dyngs.ops.shading import Sight, shading_inputs
-from dyngs.ops.skinning import blend_skinning
+from dyngs.ops.skinning import add_offsets_, blend_skinning
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

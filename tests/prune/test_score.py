@@ -1,4 +1,4 @@
-"""Scores of Gaussians whose importance is known."""
+"""Importance of Gaussians on scenes whose answers are known, and the choice of the highest."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from moving_scene import Blinking, Sliding, camera, moving_scene, row_of_balls, still_scene
 
 from dyngs.deform.field import Offsets
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import Scene
-from dyngs.prune.score import Importance, ScoringViews, importance
+from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.static.scene import StaticScene
 
 BLACK = torch.zeros(3)
@@ -98,3 +100,23 @@ def test_scores_are_finite_where_something_is_never_seen() -> None:
     found = importance(views(moving_scene(Fading(), rows=(0, 1, 2, 3, 4))), slopes=True)
     for scores in (found.variation, found.temporal, found.contribution):
         assert scores.isfinite().all()
+
+
+SCORES = torch.tensor([3.0, 0.5, 2.0, 0.5, 9.0])
+
+
+@pytest.mark.parametrize(
+    ("fraction", "kept"), [(0.0, {0, 1, 2, 3, 4}), (0.2, {0, 1, 2, 4}), (0.4, {0, 2, 4}), (0.79, {0, 4}), (0.99, {4})]
+)
+def test_the_lowest_go_and_of_equal_ones_the_last(fraction: float, kept: set[int]) -> None:
+    assert set(torch.nonzero(highest(SCORES, fraction))[:, 0].tolist()) == kept
+
+
+@given(st.lists(st.floats(0, 10, width=32), min_size=1, max_size=30), st.floats(0, 0.999))
+def test_no_more_go_than_asked_and_none_above_one_that_stays(values: list[float], fraction: float) -> None:
+    scores = torch.tensor(values)
+    kept = highest(scores, fraction)
+    assert 1 <= kept.sum() <= len(scores)
+    assert (~kept).sum() <= fraction * len(scores) + 1e-6
+    if not bool(kept.all()):
+        assert scores[~kept].max() <= scores[kept].min()

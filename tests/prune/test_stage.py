@@ -29,8 +29,9 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.prune.stage import Pruned, PruneStage, distinct_cameras, prune_
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.static.fixed import FixedDensifier
+from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
-from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")

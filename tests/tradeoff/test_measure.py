@@ -10,25 +10,19 @@ from moving_scene import Sliding, camera, moving_scene, still_scene
 from dyngs.config import StaticModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
+from dyngs.evaluate.drawing import Drawing
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import Lpips
-from dyngs.tradeoff.measure import (
-    VariantRenderer,
-    measure_quality,
-    quartiles,
-    render_options_of,
-    scaled_cameras,
-    time_interleaved,
-)
+from dyngs.tradeoff.measure import measure_quality, quartiles, render_options_of, time_interleaved
 from dyngs.tradeoff.variants import Variant
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 BLACK = torch.zeros(3)
 
 
-def image_of(renderer: VariantRenderer, time: float = 0.0) -> Image:
+def image_of(drawing: Drawing, time: float = 0.0) -> Image:
     """A render, as a ground-truth image."""
-    return Image("view", camera(), renderer.image(camera(), time).clamp(0, 1), None, None, time)
+    return Image("view", camera(), drawing.image(camera(), time).clamp(0, 1), None, None, time)
 
 
 def test_options_are_those_of_the_run_but_for_what_is_changed() -> None:
@@ -39,50 +33,31 @@ def test_options_are_those_of_the_run_but_for_what_is_changed() -> None:
     assert (changed.alpha_min, changed.transmittance_min) == (0.02, 0.01)
 
 
-def test_a_shrunk_camera_sees_the_same() -> None:
-    small = scaled_cameras(camera(20, 14), 0.5)
-    assert (small.width, small.height) == (10, 7)
-    corner = torch.tensor([20.0, 14.0, 1.0])
-    ray, same = (torch.linalg.inv(c.intrinsics[0]) @ p for c, p in ((camera(20, 14), corner), (small, corner / 2)))
-    assert torch.allclose(ray[:2], (ray / same * same)[:2])
-    assert torch.allclose(small.intrinsics[0] @ ray / ray[2], torch.tensor([10.0, 7.0, 1.0]))
-    assert scaled_cameras(camera(), 1.0).width == 20
-
-
-def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
-    renderers = [VariantRenderer(still_scene(1), RenderOptions(), BLACK + 1, scale) for scale in (1.0, 0.5)]
-    images = [1 - renderer.image(camera(40, 28), None).mean(2) for renderer in renderers]
-    assert [tuple(x.shape) for x in images] == [(28, 40), (28, 40)]
-    assert not torch.equal(*images)
-    across = [float((x.sum(0) * torch.arange(40)).sum() / x.sum()) for x in images]
-    assert across[0] == pytest.approx(across[1], abs=0.3)  # px; half a pixel's shift would be seen
-
-
 def test_quality_compares_each_view_at_its_time() -> None:
-    moving = VariantRenderer(moving_scene(Sliding()), RenderOptions(), BLACK)
+    moving = Drawing(moving_scene(Sliding()), RenderOptions(), BLACK)
     truths = [image_of(moving, time) for time in (0.0, 0.5)]
     no_lpips = Lpips("alex", "not here")
     perfect = measure_quality(moving, truths, no_lpips)
     assert perfect.psnr == 100.0
     assert perfect.ssim == pytest.approx(1.0)
     assert perfect.lpips is None
-    stopped = VariantRenderer(moving_scene(Sliding(0.0)), RenderOptions(), BLACK)
+    stopped = Drawing(moving_scene(Sliding(0.0)), RenderOptions(), BLACK)
     assert measure_quality(stopped, truths[:1], no_lpips).psnr == 100.0
     assert measure_quality(stopped, truths, no_lpips).psnr < 90
 
 
 def test_lpips_is_the_mean_where_it_can_be_had() -> None:
-    renderer = VariantRenderer(still_scene(), RenderOptions(), BLACK)
+    drawing = Drawing(still_scene(), RenderOptions(), BLACK)
     distance = Lpips("alex", None, lambda a, b: (a - b).abs().mean() + 0.25)
-    assert measure_quality(renderer, [image_of(renderer)] * 2, distance).lpips == pytest.approx(0.25)
+    assert measure_quality(drawing, [image_of(drawing)] * 2, distance).lpips == pytest.approx(0.25)
 
 
 def test_all_draw_every_image_in_turn() -> None:
     scenes = [moving_scene(Sliding()), moving_scene(Sliding())]
-    renderers = [VariantRenderer(scene, RenderOptions(), BLACK) for scene in scenes]
-    views = [image_of(renderers[0], 0.5)] * 3
+    drawings = [Drawing(scene, RenderOptions(), BLACK) for scene in scenes]
+    views = [image_of(drawings[0], 0.5)] * 3
     before = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
-    speeds = time_interleaved(renderers, views, rounds=2)
+    speeds = time_interleaved(drawings, views, rounds=2)
     after = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
     assert [b - a for a, b in zip(before, after, strict=True)] == [7, 7]  # a warm-up, and twice three views
     assert speeds[0].gain.low == speeds[0].gain.median == speeds[0].gain.high == 1.0

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed
-from dyngs.tradeoff.pareto import combinations, exchange_rates, on_front, pareto_mask, rate, slope
+from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed, on_front, pareto_mask
+from dyngs.tradeoff.pareto import combinations, exchange_rates, rate, slope
 from dyngs.tradeoff.variants import Variant
 
 GOALS = st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=12)

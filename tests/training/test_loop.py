@@ -8,8 +8,9 @@ import pytest
 from steps import Counting
 
 from dyngs.errors import DyngsError
+from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TotalChanged
-from dyngs.training.loop import Loop, Stopwatch
+from dyngs.training.loop import Loop
 
 
 def looped(

@@ -15,7 +15,7 @@ from dyngs.data.images.images import SUFFIXES, read_header, read_image, read_mas
 from dyngs.data.times import distinct_times, evenly_spaced
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import staying_within
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import read_json_object
 
 MAX_LINES_PER_KIND = 5
 """Problems of one kind that are listed; the others are counted."""

@@ -13,8 +13,7 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo, frame_seconds, probe_video, read_frames
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
-from dyngs.files.fields import first_few, is_number
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import first_few, is_number, read_json_object
 
 SMALL_SIDE = 160
 """Longer side of the small images, px."""

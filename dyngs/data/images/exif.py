@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyngs.files.image_errors import any_text
+from dyngs.files.write import any_text
 
 if TYPE_CHECKING:
     import OpenImageIO

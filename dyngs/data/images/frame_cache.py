@@ -23,10 +23,9 @@ import numpy as np
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.video import VideoInfo, probe_video, read_numbered_frames
 from dyngs.errors import DyngsError, reading
-from dyngs.files.cache import CACHE_VARIABLE, cache_folder
 from dyngs.files.containment import inside
-from dyngs.files.image_errors import image_error
-from dyngs.files.write import atomic_file, write_text
+from dyngs.files.temporary import CACHE_VARIABLE, cache_folder
+from dyngs.files.write import atomic_file, image_error, write_text
 
 try:
     import fcntl

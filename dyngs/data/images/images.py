@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.data.images.exif import PhotoTags, is_lying, rotated_upright, tags_of
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside, max_decoded_mb
-from dyngs.files.image_errors import image_error
+from dyngs.files.write import image_error
 
 if TYPE_CHECKING:
     import OpenImageIO

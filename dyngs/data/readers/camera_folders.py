@@ -17,8 +17,7 @@ from dyngs.data.images.images import SUFFIXES
 from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo
 from dyngs.data.readers.transforms import MAX_FPS, Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
-from dyngs.files.fields import first_few, is_number, matrix_of
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import first_few, is_number, matrix_of, read_json_object
 from dyngs.files.numpy_files import read_npy
 
 MIN_CAMERAS_TO_HOLD_OUT = 3

@@ -13,8 +13,7 @@ from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.transforms import Frame, FrameFile, read_views
 from dyngs.errors import DyngsError
-from dyngs.files.fields import is_number
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import is_number, read_json_object
 from dyngs.files.numpy_files import read_npy
 
 

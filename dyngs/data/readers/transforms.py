@@ -25,8 +25,7 @@ from dyngs.data.geometry import (
 from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
-from dyngs.files.fields import is_number, matrix_of
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import is_number, matrix_of, read_json_object
 
 MAX_FPS = 1e6
 """Higher frame rates are taken for mistakes."""

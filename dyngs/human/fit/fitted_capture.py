@@ -26,8 +26,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading
-from dyngs.files.cache import cache_folder
-from dyngs.files.temporary import temporary_folder_beside
+from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture

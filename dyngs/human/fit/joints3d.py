@@ -16,8 +16,7 @@ from torch import Tensor
 
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError, reading
-from dyngs.files.fields import entry, first_few, float_array
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import entry, first_few, float_array, read_json_object
 from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import read_arrays, read_npz
 from dyngs.files.pickles import read_pickle

@@ -15,8 +15,7 @@ from torch import Tensor
 from dyngs.data.capture import View
 from dyngs.data.images.lens import undistorted_points
 from dyngs.errors import DyngsError, reading
-from dyngs.files.fields import numbers_of
-from dyngs.files.json_files import read_json_object
+from dyngs.files.fields import numbers_of, read_json_object
 from dyngs.human.template.joints import JOINT_NAMES
 
 COCO = (

@@ -25,7 +25,6 @@ from dyngs.human.fit.solve import (
     usual,
     usual_pose,
 )
-from dyngs.human.fit.start import MOST_ANCHORS, NUM_HEADINGS, angle_between, heading, likely_path, roots_between
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 

@@ -28,7 +28,7 @@ from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.files.cache import cache_folder
+from dyngs.files.temporary import cache_folder
 
 
 @pytest.fixture

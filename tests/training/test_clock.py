@@ -10,7 +10,7 @@ import pytest
 
 from dyngs.config import Config
 from dyngs.config.io import load_config
-from dyngs.runs.remaining import RemainingTime
+from dyngs.training.clock import Forecast
 from dyngs.training.schedule import image_divisor
 
 STEPS = 6000
@@ -50,12 +50,12 @@ class Run:
 
     def predicted(self, until: int, every: int = 20) -> tuple[float, float]:
         """Return the seconds left after step ``until`` as predicted, and as steps so far would say."""
-        remaining, now = RemainingTime(lambda: self.config, 0, 100.0), 100.0
+        forecast, now = Forecast(0, 100.0), 100.0
         for step in range(every, until + 1, every):
             now += self.seconds(step - every, step)
-            remaining.observe(step, now, round(self.gaussians(self.share(step))), self.drawn(step))
+            forecast.observe(self.config, step, now, round(self.gaussians(self.share(step))), self.drawn(step))
         steps = self.config.train.steps
-        return remaining.seconds(steps), (now - 100.0) / until * (steps - until)
+        return forecast.seconds(self.config, steps), (now - 100.0) / until * (steps - until)
 
 
 def sharpening(x: float) -> float:
@@ -76,21 +76,21 @@ def test_small_images_first(machine: tuple[float, float, float, float]) -> None:
 
 
 def test_steps_that_are_all_alike_are_counted() -> None:
-    remaining = RemainingTime(None, 0, 0.0)
+    forecast = Forecast(0, 0.0)
     for step in range(10, 101, 10):
-        remaining.observe(step, 0.5 * step, 1000)
-    assert remaining.seconds(400) == pytest.approx(150.0)
-    assert remaining.seconds(100) == 0.0
+        forecast.observe(None, step, 0.5 * step, 1000)
+    assert forecast.seconds(None, 400) == pytest.approx(150.0)
+    assert forecast.seconds(None, 100) == 0.0
 
 
 def test_a_slow_first_step_and_pauses_do_not_count() -> None:
-    remaining = RemainingTime(None, 0, 0.0)
-    remaining.restart(1, 300.0)
-    remaining.observe(11, 301.0, 1000)
-    assert remaining.seconds(111) == pytest.approx(10.0)
-    remaining.pause(50.0)
-    remaining.observe(21, 352.0, 1000)
-    assert remaining.seconds(121) == pytest.approx(10.0)
+    forecast = Forecast(0, 0.0)
+    forecast.restart(1, 300.0)
+    forecast.observe(None, 11, 301.0, 1000)
+    assert forecast.seconds(None, 111) == pytest.approx(10.0)
+    forecast.pause(50.0)
+    forecast.observe(None, 21, 352.0, 1000)
+    assert forecast.seconds(None, 121) == pytest.approx(10.0)
 
 
 def test_after_densification_nothing_is_expected_to_grow() -> None:

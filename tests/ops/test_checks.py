@@ -1,25 +1,158 @@
-"""Renders that are too large are refused in one line with the figures: no process ends, no bare MemoryError."""
+"""Options in range, finite tensors, and sizes that kernels and memory can hold: errors say what, where and how much."""
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import dyngs
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
-from dyngs.ops.limits import MAX_SIDE, check_memory, check_size
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.ops.checks import (
+    MAX_SIDE,
+    check_choice,
+    check_count,
+    check_finite,
+    check_memory,
+    check_near_and_far,
+    check_number,
+    check_size,
+    count_nonfinite_op,
+    finite_rows,
+)
 from dyngs.ops.native import core
-from dyngs.ops.projection import Projection, project
-from dyngs.ops.rasterization import Tally, bin_tiles, rasterize, tally
+from dyngs.ops.projection import Projection, ProjectionOptions, project
+from dyngs.ops.rasterization import BlendOptions, Tally, bin_tiles, rasterize, tally
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+WRONG: dict[str, list[Any]] = {
+    "eps2d": [-0.1, math.nan, math.inf, "0.3", None],
+    "near": [-0.1, math.nan, math.inf, None],
+    "far": [-1.0, 0.1, 0.2, math.nan, None],
+    "alpha_min": [-0.1, 1.1, math.nan, None],
+    "alpha_max": [-0.1, 1.0, 1 - 1e-9, math.nan],
+    "transmittance_min": [-0.1, 1.1, math.nan],
+    "radius_clip": [-0.1, math.nan, math.inf],
+    "max_entries": [-1, math.nan],
+    "sh_degree": [-1, 5, 1.5, True],
+    "mode": ["mip", None, 3],
+    "depth": ["metric", None],
+    "nonfinite": ["ignore", None],
+}
+CASES = [
+    (kind, name, value)
+    for kind in (ProjectionOptions, BlendOptions, RenderOptions)
+    for name, values in WRONG.items()
+    for value in values
+    if name in kind.__dataclass_fields__ and not (name == "sh_degree" and value is None)
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), CASES)
+def test_options_out_of_range_are_refused_by_name(kind: type, name: str, value: Any) -> None:
+    """NaN gave an empty image, an unknown word the last of the choices."""
+    with pytest.raises(DyngsError, match=f"^{name} must "):
+        kind(**{name: value})
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"near": 0, "far": math.inf, "eps2d": 0, "alpha_min": 0, "transmittance_min": 0},
+        {"alpha_max": 0.999, "sh_degree": 0, "mode": "antialiased", "depth": "expected", "nonfinite": "skip"},
+    ],
+)
+def test_the_ends_of_the_ranges_are_allowed(options: dict[str, Any]) -> None:
+    assert RenderOptions(**options).projection.near >= 0
+
+
+def test_largest_alpha_leaves_something_in_float32() -> None:
+    from dyngs.ops.rasterization import LARGEST_ALPHA
+
+    assert 1 - torch.tensor(BlendOptions(alpha_max=LARGEST_ALPHA).alpha_max) > 0
+
+
+def test_messages_say_what_is_wanted_and_what_was_given() -> None:
+    for check, message in (
+        (lambda: check_number("size", math.nan, 0), "size must be a number of at least 0 and finite, got nan"),
+        (lambda: check_number("share", 2, 0, 1), "share must be a number of at least 0 and at most 1, got 2"),
+        (lambda: check_count("degree", 7, 0, 4), "degree must be a whole number from 0 to 4, got 7"),
+        (lambda: check_choice("mode", "x", ("a", "b")), "mode must be one of a, b, got 'x'"),
+        (lambda: check_near_and_far(2, 1), "far must lie beyond near, got near 2 and far 1"),
+    ):
+        with pytest.raises(DyngsError) as caught:
+            check()
+        assert str(caught.value) == message
+
+
+BAD = [float("nan"), float("inf"), -float("inf")]
+DTYPES = [torch.float32, torch.float64]
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    dtype=st.sampled_from(DTYPES),
+    places=st.sets(st.tuples(st.integers(0, 49), st.integers(0, 2)), max_size=9),
+    bad=st.sampled_from(BAD),
+)
+def test_counts_elements_and_rows(dtype: torch.dtype, places: set[tuple[int, int]], bad: float) -> None:
+    x = torch.randn(50, 3, dtype=dtype)
+    for row, column in places:
+        x[row, column] = bad
+    rows = {row for row, _ in places}
+    assert torch.nonzero(~finite_rows([x]))[:, 0].tolist() == sorted(rows)
+    if not places:
+        return check_finite({"means": x})
+    with pytest.raises(DyngsError, match=rf"^means holds {len(places)} NaN .* in {len(rows)} of 50 rows"):
+        check_finite({"fine": torch.zeros(3), "means": x})
+    return None
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_extreme_but_finite_numbers_pass(dtype: torch.dtype) -> None:
+    info = torch.finfo(dtype)
+    check_finite(
+        {"x": torch.tensor([info.max, -info.max, info.tiny, info.smallest_normal / 4, 0.0, -0.0], dtype=dtype)}
+    )
+
+
+def test_sees_strided_and_large_tensors() -> None:
+    wide = torch.zeros(200_000, 2)
+    wide[:, 1] = float("nan")
+    check_finite({"x": wide[:, 0]})
+    wide[199_999, 0] = float("inf")
+    with pytest.raises(DyngsError, match="holds 1 NaN or infinite"):
+        check_finite({"x": wide[:, 0]})
+
+
+def test_rows_are_finite_only_if_they_are_in_every_tensor() -> None:
+    one, two = torch.zeros(3, 2), torch.zeros(3)
+    one[0, 1], two[2] = float("nan"), float("inf")
+    assert finite_rows([one, two]).tolist() == [False, True, False]
+
+
+def test_nothing_is_finite() -> None:
+    check_finite({"x": torch.zeros(0, 3)})
+    assert finite_rows([torch.zeros(0, 3)]).shape == (0,)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_is_a_well_behaved_torch_op(dtype: torch.dtype) -> None:
+    x = torch.tensor([1.0, float("nan"), float("inf")], dtype=dtype)
+    assert count_nonfinite_op(x).item() == 2
+    torch.library.opcheck(count_nonfinite_op, (x,))
 
 
 def veils(count: int = 1) -> Projection:

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.requirements import Goal, Requirement, choose, parse_goal, parse_requirements
-from dyngs.tradeoff.table import TableRow
+from dyngs.tradeoff.table import Goal, Requirement, TableRow, choose, parse_goal, parse_requirements
 from dyngs.tradeoff.variants import Variant
 
 

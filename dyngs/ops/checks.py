@@ -1,0 +1,112 @@
+"""Checks of what callers give: numbers in range, finite tensors, and images that kernels can count and memory holds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import core, num_threads
+from dyngs.ops.registration import has_kernel, launch, register, shapes_only
+
+LARGEST = 3.4e38
+"""Options are computed with in float32."""
+
+LARGEST_COUNT = 2**31 - 1
+MAX_SIDE: int = core.MAX_SIDE
+"""px; float32 has no pixel centres beyond 2^23"""
+
+UNASKED = 1 << 26
+"""Bytes up to which the free memory is not asked for, because asking takes 0.1 ms."""
+
+REMEDY = "lower the resolution, the scales or the number of views"
+
+
+def check_number(name: str, value: object, low: float, high: float = LARGEST) -> None:
+    """Raise an error unless ``value`` is a number from ``low`` to ``high``."""
+    if not isinstance(value, (int, float)) or not low <= value <= high:
+        upto = "" if high == math.inf else " and finite" if high == LARGEST else f" and at most {high:g}"
+        raise DyngsError(f"{name} must be a number of at least {low:g}{upto}, got {value!r}")
+
+
+def check_tensors(op: str, tensors: Mapping[str, tuple[Tensor, tuple[int, ...]]]) -> None:
+    """Raise an error unless the ``tensors`` of ``op`` have these shapes, are floating point and on one device."""
+    first, device = next((name, x.device) for name, (x, _) in tensors.items())
+    for name, (x, shape) in tensors.items():
+        if tuple(x.shape) != shape:
+            raise DyngsError(f"{op}: {name} must be {shape}, got {tuple(x.shape)}")
+        if not x.is_floating_point() or x.device != device:
+            wanted = f"floating point on {device} like the {first}"
+            raise DyngsError(f"{op}: {name} must be {wanted}, got {x.dtype} on {x.device}")
+
+
+def check_near_and_far(near: object, far: object) -> None:
+    """Raise an error unless they are the limits of a range of depths; ``far`` may be infinite."""
+    check_number("near", near, 0)
+    check_number("far", far, 0, math.inf)
+    if not far > near:  # pyright: ignore[reportOperatorIssue]
+        raise DyngsError(f"far must lie beyond near, got near {near!r} and far {far!r}")
+
+
+def check_count(name: str, value: object, low: int, high: int) -> None:
+    """Raise an error unless ``value`` is a whole number from ``low`` to ``high``."""
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise DyngsError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Raise an error unless ``value`` is one of the ``choices``."""
+    if not isinstance(value, str) or value not in choices:
+        raise DyngsError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def check_size(width: int, height: int) -> None:
+    """Raise an error unless images of this size can be drawn."""
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise DyngsError(f"render refused: an image of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px")
+
+
+def check_memory(size: int, what: str, like: Tensor) -> None:
+    """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and RLIMIT_AS leave free.
+
+    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit.
+
+    Raises:
+        DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
+    """
+    if shapes_only() or like.device.type != "cpu" or size <= UNASKED:
+        return
+    available = core.available_memory()
+    if size > available:
+        needed, left = (f"{x / 1e9:.1f} GB" for x in (size, available))
+        raise DyngsError(f"render refused: {what} take {needed}; {left} of memory are available; {REMEDY}")
+
+
+def _count_nonfinite(x: Tensor) -> Tensor:
+    count = x.new_zeros(1, dtype=torch.int32)
+    launch(x, "count_nonfinite", x, count, num_threads())
+    return count[0].long()
+
+
+count_nonfinite_op = register("count_nonfinite", _count_nonfinite)
+
+
+def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
+    """Raise an error unless every element of the ``tensors`` (float32 or float64) is finite."""
+    for name, x in tensors.items():
+        native = has_kernel("count_nonfinite", x.device)
+        count = int(count_nonfinite_op(x.detach()) if native else (~x.isfinite()).sum())
+        if count:
+            rows = int((~finite_rows([x])).sum())
+            raise DyngsError(f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}")
+
+
+def finite_rows(tensors: Sequence[Tensor]) -> Tensor:
+    """Return (N,) bool: the rows that are finite in all of the tensors (N, ...)."""
+    keep = torch.ones(len(tensors[0]), dtype=torch.bool, device=tensors[0].device)
+    for x in tensors:
+        keep &= torch.isfinite(x.detach()).reshape(len(x), math.prod(x.shape[1:])).all(dim=1)
+    return keep
