@@ -189,6 +189,6 @@ def import_everything() -> None:
             continue
 
 
-_LIBRARIES = ("OpenImageIO", "av", "pycolmap", "trimesh", "scipy.sparse", "scipy.spatial.transform", "h5py")
+_LIBRARIES = ("OpenImageIO", "av", "pycolmap", "trimesh", "kornia", "scipy.sparse", "scipy.spatial.transform", "h5py")
 _RUNS_ON_IMPORT = re.compile(r"__main__$|\._core")
 """The command line, and native cores of which only one may suit this processor."""

@@ -22,6 +22,7 @@ _REQUIRED = {
     "rich": "rich",
     "pycolmap": "pycolmap",
     "trimesh": "trimesh",
+    "kornia": "kornia",
     "OpenImageIO": "OpenImageIO",
     "scikit-image": "skimage",
     "scipy": "scipy",

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,10 +14,8 @@ from torch import Tensor
 
 from dyngs.data.capture import Lens
 
-if TYPE_CHECKING:
-    import pycolmap
-
 _ROWS_PER_CHUNK = 256
+_ITERATIONS = 30
 _CLOSE_PX = 0.05
 _GRID = 64
 WIDEST_DEG = 120.0
@@ -51,19 +47,23 @@ def distort(lens: Lens, points: Tensor) -> Tensor:
 
     "opencv": Brown-Conrady, ``x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`` plus the tangential
     terms. "fisheye": ``theta (1 + k1 theta^2 + .. + k4 theta^8)`` along the direction of the point, theta = atan(r).
-    Both times ``focal_ratio``, by COLMAP in float64.
+    Both times ``focal_ratio``.
     """
     if is_pinhole(lens):
         return points
-    flat = points.detach().reshape(-1, 2).double().cpu().numpy()
-    found = np.asarray(_unit_camera(lens).img_from_cam(np.column_stack([flat, np.ones(len(flat))])))
-    return lens.focal_ratio * torch.as_tensor(found, device=points.device).reshape(points.shape).to(points.dtype)
+    if lens.model == "fisheye":
+        return lens.focal_ratio * _distort_fisheye(lens, points)
+    from kornia.geometry.calibration import distort_points
+
+    identity = torch.eye(3, dtype=points.dtype, device=points.device)[None]
+    coefficients = torch.tensor([_padded(lens.params)], dtype=points.dtype, device=points.device)
+    return lens.focal_ratio * distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
 
 
 def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Tensor:
     """Return the (..., 2) pixel positions in the pinhole image of ``points`` (..., 2) in the stored, distorted one.
 
-    By COLMAP's iteration, in float64; NaN where it does not converge to ``_CLOSE_PX``, as far outside the field of
+    By iteration, in float64; NaN where it does not converge to ``_CLOSE_PX``, as far outside the field of
     view, and where a point is NaN.
 
     Args:
@@ -71,12 +71,17 @@ def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Te
     """
     if is_pinhole(lens):
         return points
-    center, focal = intrinsics[:2, 2], np.diag(intrinsics)[:2]
-    wanted = (points.detach().reshape(-1, 2).double().cpu().numpy() - center) / focal
-    found = torch.as_tensor(np.asarray(_unit_camera(lens).cam_from_img(wanted / lens.focal_ratio)), device="cpu")
-    off = np.linalg.norm((distort(lens, found).numpy() - wanted) * focal, axis=1, keepdims=True)
-    straight = np.where(off < _CLOSE_PX, found.numpy() * focal + center, np.nan)  # false for NaN
-    return torch.as_tensor(straight, device=points.device).reshape(points.shape).to(points.dtype)
+    k = torch.as_tensor(intrinsics, dtype=torch.float64, device=points.device)
+    focal, center = k.diagonal()[:2], k[:2, 2]
+    wanted = (points.double() - center) / focal
+    found = wanted / lens.focal_ratio
+    if lens.model == "fisheye":
+        found = _straightened_fisheye(lens, found)
+    else:
+        for _ in range(_ITERATIONS):
+            found = found + (wanted - distort(lens, found)) / lens.focal_ratio
+    close = ((distort(lens, found) - wanted) * focal).norm(dim=-1, keepdim=True) < _CLOSE_PX
+    return torch.where(close, found * focal + center, torch.nan).to(points.dtype)
 
 
 def kept_fraction(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> float:
@@ -165,14 +170,36 @@ def undistort(pixels: Tensor, lens_map: LensMap) -> Tensor:
     return resampled.clamp(0, 1) * lens_map.valid[..., None]
 
 
-@lru_cache(maxsize=64)
-def _unit_camera(lens: Lens) -> pycolmap.Camera:
-    """Return COLMAP's camera with this lens, a focal length of 1 and its principal point at 0."""
-    import pycolmap
+def _padded(params: tuple[float, ...]) -> tuple[float, ...]:
+    """Pad the coefficients with zeros to 4, 5 or 8, as OpenCV orders them."""
+    size = next(n for n in (4, 5, 8) if n >= len(params))
+    return params + (0.0,) * (size - len(params))
 
-    model, count = ("OPENCV_FISHEYE", 4) if lens.model == "fisheye" else ("FULL_OPENCV", 8)
-    params = (1.0, 1.0, 0.0, 0.0, *lens.params, *(0.0,) * (count - len(lens.params)))
-    return pycolmap.Camera(model=model, width=1, height=1, params=params)
+
+def _distort_fisheye(lens: Lens, points: Tensor) -> Tensor:
+    radius = points.norm(dim=-1, keepdim=True)
+    angle = torch.atan(radius)
+    return points * torch.where(radius > 1e-9, _fisheye_radius(lens, angle) / radius.clamp(min=1e-9), 1.0)
+
+
+def _straightened_fisheye(lens: Lens, points: Tensor) -> Tensor:
+    """Return the inverse of ``_distort_fisheye``: Newton's method for the angle; NaN from 90 degrees on."""
+    radius = points.norm(dim=-1, keepdim=True)
+    angle = radius.clone()
+    for _ in range(_ITERATIONS):
+        slope = torch.ones_like(angle)
+        for power, k in enumerate(lens.params, start=1):
+            slope = slope + (2 * power + 1) * k * angle ** (2 * power)
+        angle = angle - (_fisheye_radius(lens, angle) - radius) / slope
+    straight = torch.where((angle >= 0) & (angle < 0.5 * math.pi), torch.tan(angle), torch.nan)
+    return points * torch.where(radius > 1e-9, straight / radius.clamp(min=1e-9), 1.0)
+
+
+def _fisheye_radius(lens: Lens, angle: Tensor) -> Tensor:
+    series = torch.ones_like(angle)
+    for power, k in enumerate(lens.params, start=1):
+        series = series + k * angle ** (2 * power)
+    return angle * series
 
 
 def _radius_limit(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> float:
@@ -181,10 +208,11 @@ def _radius_limit(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
     corners = (corners - intrinsics[:2, 2]) / np.diag(intrinsics)[:2]
     farthest = float(np.linalg.norm(corners, axis=1).max())
     radii = torch.linspace(0, farthest, 4096, dtype=torch.float64, device="cpu")
-    radial = replace(lens, focal_ratio=1.0)
-    if lens.model == "opencv":
-        k1, k2, _, _, *others = (*lens.params, 0.0, 0.0, 0.0, 0.0)[:8]
-        radial = replace(radial, params=(k1, k2, 0.0, 0.0, *others))
-    distorted = distort(radial, torch.stack([radii, torch.zeros_like(radii)], dim=-1))[:, 0]
+    if lens.model == "fisheye":
+        distorted = _fisheye_radius(lens, torch.atan(radii))
+    else:
+        k1, k2, _, _, k3, k4, k5, k6 = (*lens.params, *(0.0,) * 8)[:8]
+        r2 = radii**2
+        distorted = radii * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     turns = torch.nonzero(~(distorted.diff() > 0))
     return float(radii[turns[0, 0]]) if len(turns) else float("inf")
