@@ -123,7 +123,7 @@ class HumanTraining:
     def after_step(self, scene: HumanScene, step: int, edited: bool) -> HumanScene:
         return scene
 
-    def grown(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
+    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene as it is, and after the last step new values for what the images hardly show."""
         if step != self.rates.steps or not self.options.fill_unseen or not self.views or not len(scene):
             return None
@@ -144,9 +144,6 @@ class HumanTraining:
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
         return scene, EditResult(None, changes, finding=line if hardly >= WORTH_TELLING else None)
-
-    def variant(self, scene: Scene, step: int) -> None:
-        """Return None: there is nothing to choose from."""
 
     def all_moving(self, scene: HumanScene, extent: float) -> HumanScene:
         """Return ``scene``: they do."""
