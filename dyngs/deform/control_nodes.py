@@ -64,6 +64,8 @@ GROUP_RATES = {"group_quats": 3e-3, "binding": 2e-2}
 """Learning rates of rigid groups other than of their shifts."""
 LEAST = 0.02
 """Least fraction of a second group from which a Gaussian is bound to it."""
+SMOOTHNESS = 0.01
+"""Weight of the nodes' squared acceleration, in node spacings."""
 RESIDUALS = 0.01
 """Weight of what the nodes of a rigid group move in its frame: squared, in node spacings."""
 PER_GAUSSIAN = ("followed", "others", "bodies")
@@ -225,9 +227,8 @@ class ControlNodes(NetworkField):
         if len(self.buffers["positions"]) < 2:
             return {}
         penalties = {}
-        if self.options.smoothness:
-            bend = self.parameters["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
-            penalties["node acceleration"] = self.options.smoothness * bend.square().mean()
+        bend = self.parameters["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
+        penalties["node acceleration"] = SMOOTHNESS * bend.square().mean()
         if self.options.rigidity:
             penalties["node rigidity"] = self.options.rigidity * self._strain(self.at(time))
         if self.has_groups:

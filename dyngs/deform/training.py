@@ -134,7 +134,7 @@ class DynamicTraining:
         """Return the moment drawn for ``image`` at its time, and the regularizers of motion."""
         if scene.field is None:
             return scene.moment(image.time)
-        time = self._jittered(image.time or 0.0, step)
+        time = image.time or 0.0
         gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
         penalties = scene.field.penalties(time) | self._sparsity(offsets)
         if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the images
@@ -280,14 +280,6 @@ class DynamicTraining:
         part = MovingPart(now, scene.moving, lambda time: field.offsets(means, time), motion.mean, scene.filter_std)
         found = paid_motion(part, scores)
         return _with_frozen(scene, motion.mean, found.stays), EditResult(None, finding=f"motion {found}")
-
-    def _jittered(self, time: float, step: int) -> float:
-        """Return ``time`` with the annealed noise of Deformable-3DGS (Yang et al. 2024), against overfitting."""
-        if self.options.time_jitter == 0:
-            return time
-        gap = 1 / max(len(self.times) - 1, 1)
-        noise = float(torch.randn((), generator=self._generator, device="cpu")) * self.options.time_jitter * gap
-        return min(max(time + noise * max(0.0, 1 - step / self.schedule.rates.steps), 0.0), 1.0)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
         """Return the mean motion as a penalty: what need not move should not. What was found to travel must."""

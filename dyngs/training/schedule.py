@@ -30,7 +30,8 @@ MIN_RESET_GAP = 400
 """Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)."""
 RESET_FRACTION = 0.2
 """Fraction of a short run between opacity resets."""
-MAX_GROWTH = 0.25
+GROWTH, MAX_GROWTH = 0.05, 0.25
+"""Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
 MIN_COARSE_STEPS = 1000
 """Steps that a static model needs to show where it fails; short runs spend at most a third on it."""
@@ -62,7 +63,7 @@ def hold_out_until(options: TrainConfig) -> int:
 
 def rates_of(config: Config) -> Rates:
     """Return the course of the learning rates of a run."""
-    return Rates(config.train.steps, config.prune.steps, config.prune.rewind)
+    return Rates(config.train.steps, config.prune.steps)
 
 
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
@@ -111,14 +112,14 @@ def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
     return strategy.grad_threshold * min(1.0, steps / PUBLISHED_STEPS) ** 0.25
 
 
-def growth_per_change(strategy: McmcStrategy, steps: int) -> float:
+def growth_per_change(steps: int) -> float:
     """Return the fraction of Gaussians that MCMC adds per change.
 
     Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; each then adds
     more, up to a quarter, and the count follows the same curve over the run.
     """
-    rate = math.log1p(strategy.growth) * max(PUBLISHED_STEPS / steps, 1.0)
-    return max(strategy.growth, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
+    rate = math.log1p(GROWTH) * max(PUBLISHED_STEPS / steps, 1.0)
+    return max(GROWTH, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
 
 
 def filter_steps(strategy: Strategy, steps: int) -> range:

@@ -200,9 +200,9 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
 
 MEASURED_AFTER = 24
 COLOURS = {
-    "network": NetworkColour(width=8, depth=1, warm_up=5, opacity_entropy=1e-3),
-    "none pays": AutoColour(measure_at=0.6, tolerance=300.0),
-    "some pay": AutoColour(measure_at=0.6, tolerance=0.0),
+    "network": NetworkColour(width=8, depth=1, opacity_entropy=1e-3),
+    "none pays": AutoColour(tolerance=300.0),
+    "some pay": AutoColour(tolerance=0.0),
 }
 
 

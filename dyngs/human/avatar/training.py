@@ -29,6 +29,8 @@ from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates
 
 NEIGHBOURS = 5
+FRAMES_FROM = 0.25
+"""Fraction of the run after which poses of single frames are learned: what all frames share comes first."""
 CENTIMETRE = 0.01
 SIDES_WEIGHT = 0.1
 """Of the squared difference between colours of both sides, where light is learned, in the loss."""
@@ -55,7 +57,7 @@ class HumanTraining:
     ) -> None:
         self.options, self.rates, self.views = options, rates, views
         self.refines_from = round(options.refine_from * rates.steps)
-        self.frames_from = round(options.refine_frames_from * rates.steps)
+        self.frames_from = round(FRAMES_FROM * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
