@@ -439,7 +439,7 @@ def _densifier(config: Config, background: str, extent: float) -> Densifier:
     match strategy:
         case McmcStrategy():
             schedule = densify_schedule(strategy, steps, on_white)
-            return McmcDensifier(strategy, schedule, growth_per_change(strategy, steps))
+            return McmcDensifier(strategy, schedule, growth_per_change(steps))
         case DefaultStrategy():
             options = strategy.model_copy(update={"grad_threshold": grad_threshold(strategy, steps)})
             return DefaultDensifier(options, densify_schedule(strategy, steps, on_white), extent)

@@ -40,7 +40,7 @@ def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
         return TrajectoryField(polynomial=2, fourier=1, **heads)
     if kind == "control_nodes":
         return ControlNodesField(nodes=5, pieces=3, **heads)
-    return MlpField(depth=2, width=8, space_frequencies=2, time_frequencies=2, **heads)
+    return MlpField(depth=2, width=8, **heads)
 
 
 def tiny_setup(num_moving: int = 9, num_times: int = 10) -> FieldSetup:
@@ -109,7 +109,6 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         "sh_degree": 1,
         "deform": field,
         "freeze_below_px": freeze_below_px,
-        "time_jitter": 0.1,
         **phases,
         **model,
     }

@@ -111,7 +111,7 @@ def prune_within(
         run_dir: a run with at least one checkpoint; an interrupted one counts as finished there.
         out: must not exist, or be empty.
         max_loss: of PSNR on views that fine-tuning does not see, drawn from the file, dB.
-        overrides: ``prune.steps=N``, ``prune.score``, ``prune.rewind``, ``data.*`` and ``run.threads=N``.
+        overrides: ``prune.steps=N``, ``prune.score``, ``data.*`` and ``run.threads=N``.
         tell: is told what is tried and found.
 
     Raises:

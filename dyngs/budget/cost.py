@@ -117,7 +117,7 @@ class CostMeter:
         done, changes = num_changes(self.run.trainer.config, self.run.trainer.done), num_changes(config)
         match config.strategy:
             case McmcStrategy():
-                grown = (1 + growth_per_change(config.strategy, self.steps)) ** min(changes, 10_000)
+                grown = (1 + growth_per_change(self.steps)) ** min(changes, 10_000)
                 count = max(min(self.first * min(grown, 1e9), limit), now)
                 return Range(count, count, count)
             case DefaultStrategy() if config.strategy.grow:

@@ -18,7 +18,6 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from dyngs.config import Config
-from dyngs.config.renamed import PRESETS, present, require_present
 from dyngs.config.schema import (
     allowed_values,
     choices_of,
@@ -63,10 +62,7 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
     """
     layers = _Layers()
     if preset is not None:
-        leaves = read_file(find_preset(Path(preset)))
-        for leaf in leaves:
-            require_present(leaf)
-        layers.add(leaves)
+        layers.add(read_file(find_preset(Path(preset))))
     layers.add_overrides(overrides)
     config = _validate(layers)
     body = config.data.body
@@ -94,7 +90,7 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
     if file == path and command_for(path):
         raise DyngsError(f"{path}: not a run folder; {command_for(path)}")
     layers = _Layers()
-    layers.add(present(read_file(file)))
+    layers.add(read_file(file))
     if not layers.tree.get("data"):
         raise DyngsError(f"{file}: does not say which capture the run was trained on (data.root); restore the file")
     body = layers.value_at(("data", "body"))
@@ -135,8 +131,6 @@ def find_preset(path: Path) -> Path:
         raise DyngsError(f"{path}: no configuration; {found}")
     if path.exists() and not path.is_dir():
         raise DyngsError(f"{path}: not a regular file; give a YAML preset")
-    if path.stem in PRESETS:
-        raise DyngsError(f"{path}: this preset is called {PRESETS[path.stem]} now; write that")
     close = _close_presets(path.stem, packaged)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     raise DyngsError(f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}")
@@ -194,8 +188,6 @@ class _Layers:
 
     def add_overrides(self, overrides: Iterable[str]) -> None:
         leaves = [leaf for text in overrides for leaf in read_override(text)]
-        for leaf in leaves:
-            require_present(leaf)
         # what empties a section goes first, outer sections before inner ones
         for leaf in sorted(leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))):
             if leaf.keys[-1] == "kind":

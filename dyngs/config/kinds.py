@@ -19,6 +19,9 @@ from dyngs.config import (
     StaticModel,
 )
 
+MEASURED_AT = 0.6
+"""Fraction of a run after which it is measured whose harmonics pay."""
+
 
 def network_of(config: Config) -> HumanPredictorModel | None:
     """Return the section of a network that predicts scenes; None where a scene is trained."""
@@ -90,8 +93,7 @@ def harmonics_measured_after(config: Config) -> int | None:
     """Return the step after which it is measured whose harmonics pay; None where it never is."""
     match config.colour:
         case AutoColour():
-            steps = config.train.steps
-            return min(max(1, round(config.colour.measure_at * steps)), steps)
+            return max(1, round(MEASURED_AT * config.train.steps))
         case ShColour() | NetworkColour():
             return None
         case _:

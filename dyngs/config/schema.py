@@ -59,9 +59,10 @@ def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
             tables = [[k for k in _keys_below(v, f"{name}.") if k.name != f"{name}.kind"] for v in variants]
             shared = [k for k in tables[0] if all(k in table for table in tables)]
             yield from shared
-            for variant, table in zip(variants, tables, strict=True):
-                kind = str(variant.model_fields["kind"].default)
-                yield from (replace(k, kinds=(kind, *k.kinds)) for k in table if k not in shared)
+            kinds = [str(variant.model_fields["kind"].default) for variant in variants]
+            for key in dict.fromkeys(k for table in tables for k in table if k not in shared):
+                owners = " or ".join(kind for kind, table in zip(kinds, tables, strict=True) if key in table)
+                yield replace(key, kinds=(owners, *key.kinds))
 
 
 def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> ConfigKey:

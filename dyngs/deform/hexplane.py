@@ -13,6 +13,8 @@ from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen, key_ti
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
+WEIGHTS = (1e-4, 0.01, 1e-4)
+"""Of the smoothness of space planes, of that along time, and of the sparsity of planes with time (Wu et al.)."""
 LR_DECAY = 0.01
 """Ratio of the last to the first learning rate."""
 SPACE_RANGE = (0.1, 0.5)
@@ -58,9 +60,7 @@ class Hexplane(NetworkField):
         return split_heads(self.decoder(features, self.parameters), self.options)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        options = self.options
-        weights = (options.space_smoothness, options.time_smoothness, options.time_sparsity)
-        return {"plane smoothness": plane_penalty(self.levels, weights)} if any(weights) else {}
+        return {"plane smoothness": plane_penalty(self.levels, WEIGHTS)}
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:

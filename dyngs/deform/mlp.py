@@ -10,6 +10,8 @@ from dyngs.deform.decoder import Decoder, split_heads
 from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
 from dyngs.gaussians.parameters import Parameters
 
+SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6
+"""Octaves of the positional encodings."""
 LR_DECAY = 0.002
 """Ratio of the last to the first learning rate."""
 SKIP_LAYER = 5
@@ -25,7 +27,7 @@ class Mlp(NetworkField):
 
     def __init__(self, options: MlpField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
-        inputs = 3 * (1 + 2 * options.space_frequencies) + 1 + 2 * options.time_frequencies
+        inputs = 3 * (1 + 2 * SPACE_FREQUENCIES) + 1 + 2 * TIME_FREQUENCIES
         skip = SKIP_LAYER if options.depth > SKIP_LAYER else None
         self.decoder = Decoder(inputs, [options.width] * options.depth, options, skip=skip)
         weights = self.decoder.start_values(generator)
@@ -33,8 +35,8 @@ class Mlp(NetworkField):
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; no gradient flows to ``means``, as in the paper."""
-        space = encoded(self.setup.normalized(chosen(means.detach(), rows)), self.options.space_frequencies)
-        moment = encoded(space.new_full((1, 1), time), self.options.time_frequencies)
+        space = encoded(self.setup.normalized(chosen(means.detach(), rows)), SPACE_FREQUENCIES)
+        moment = encoded(space.new_full((1, 1), time), TIME_FREQUENCIES)
         features = torch.cat([space, moment.expand(len(space), -1)], dim=1)
         return split_heads(self.decoder(features, self.parameters), self.options)
 

@@ -29,7 +29,7 @@ from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.gaussians.scene import Moment, Scene, Variant
+from dyngs.gaussians.scene import Moment, Scene
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, fields_moved_to, with_role
 from dyngs.static.filters import FILTER_VARIANCE, filter_std
@@ -40,8 +40,6 @@ SURELY_MOVING = 1.5
 """Multiple of ``motion_threshold`` above which an error always counts as motion."""
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
-TRIAL, MIN_TRIAL = 0.015, 40
-"""Steps of a trial, as a fraction of the run, and fewest of them."""
 MIN_MOVING_FRACTION = 0.02
 """Fraction of surely moving Gaussians up to which the scene counts as still."""
 
@@ -57,7 +55,6 @@ class DeformSchedule:
         splits: steps after which Gaussians that do not move are frozen.
         rates: how the field's rates fall.
         groups: step after which what moves may form rigid groups.
-        lifetimes: step after which moving Gaussians may get time windows.
         matches: steps after which motion is corrected by block matching.
     """
 
@@ -68,7 +65,6 @@ class DeformSchedule:
     splits: tuple[int, ...]
     rates: Rates
     groups: int = 0
-    lifetimes: int = 0
     matches: tuple[int, ...] = ()
 
 
@@ -138,7 +134,7 @@ class DynamicTraining:
         """Return the moment drawn for ``image`` at its time, and the regularizers of motion."""
         if scene.field is None:
             return scene.moment(image.time)
-        time = self._jittered(image.time or 0.0, step)
+        time = image.time or 0.0
         gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
         penalties = scene.field.penalties(time) | self._sparsity(offsets)
         if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the images
@@ -171,10 +167,19 @@ class DynamicTraining:
             scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         return self._frozen(scene) if step in self.schedule.splits else scene
 
-    def grown(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene with random Gaussians to begin motion with; None where a static model explains all."""
-        if step != self.schedule.fine:
+    def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
+        """Return the scene where motion begins, nodes form rigid groups, or only motion that pays is to stay."""
+        if step == self.schedule.fine:
+            return self._with_motion(scene)
+        if scene.field is None:
             return None
+        if step == self.schedule.groups:
+            grouped = scene.field.with_groups(scene.gaussians.means.detach()[scene.moving])
+            return None if grouped is None else (replace(scene, field=grouped), EditResult(None))
+        return self._with_paid_motion(scene) if step in self.schedule.splits[-1:] else None
+
+    def _with_motion(self, scene: DynamicScene) -> tuple[DynamicScene, EditResult] | None:
+        """Return the scene with random Gaussians to begin motion with; None where a static model explains all."""
         now = scene.gaussians
         found = self.capture.still_errors(lambda _: now)
         floor = self.options.motion_threshold
@@ -202,26 +207,6 @@ class DynamicTraining:
         std = self._update.of(gaussians)
         field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
-
-    def variant(self, scene: DynamicScene, step: int) -> Variant[DynamicScene] | None:
-        """Return the scene with its nodes in rigid groups, or with time windows, once all times are seen.
-
-        After the last freezing, with motion only where it pays.
-        """
-        if scene.field is not None and step in self.schedule.splits[-1:]:
-            return self._with_paid_motion(scene)
-        if scene.field is None or step not in (self.schedule.groups, self.schedule.lifetimes):
-            return None
-        means = scene.gaussians.means.detach()[scene.moving]
-        if step == self.schedule.groups:
-            name, key, field = "rigid groups of control nodes", "rigid_groups", scene.field.with_groups(means)
-        else:
-            name, key, field = "time windows of moving Gaussians", "lifetimes", scene.field.with_lifetimes(means)
-        if field is None:
-            return None
-        steps = self.schedule.rates.steps
-        count = min(max(MIN_TRIAL, round(TRIAL * steps)), (steps - step) // 2)
-        return Variant(name, replace(scene, field=field), 0 if key in field.taken_untried else count)
 
     def all_moving(self, scene: DynamicScene, extent: float) -> DynamicScene:
         if not scene.is_static:
@@ -284,7 +269,7 @@ class DynamicTraining:
         before, after = (views.error(lambda time, x=x: x.deformed_at(time)[0], times) for x in (scene, tried))
         return tried if after < before else scene
 
-    def _with_paid_motion(self, scene: DynamicScene) -> Variant[DynamicScene] | None:
+    def _with_paid_motion(self, scene: DynamicScene) -> tuple[DynamicScene, EditResult] | None:
         """Return the scene in which only pieces move whose motion pays; None where no view is held out to tell."""
         field, scores = scene.field, self.capture.held_out
         if field is None or scores is None or not len(scene.moving):
@@ -294,15 +279,7 @@ class DynamicTraining:
         motion = measure_motion(field, now.select(scene.moving), self.times, torch.ones_like(means[:, 0]))
         part = MovingPart(now, scene.moving, lambda time: field.offsets(means, time), motion.mean, scene.filter_std)
         found = paid_motion(part, scores)
-        return Variant("motion", _with_frozen(scene, motion.mean, found.stays), 0, str(found))
-
-    def _jittered(self, time: float, step: int) -> float:
-        """Return ``time`` with the annealed noise of Deformable-3DGS (Yang et al. 2024), against overfitting."""
-        if self.options.time_jitter == 0:
-            return time
-        gap = 1 / max(len(self.times) - 1, 1)
-        noise = float(torch.randn((), generator=self._generator, device="cpu")) * self.options.time_jitter * gap
-        return min(max(time + noise * max(0.0, 1 - step / self.schedule.rates.steps), 0.0), 1.0)
+        return _with_frozen(scene, motion.mean, found.stays), EditResult(None, finding=f"motion {found}")
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
         """Return the mean motion as a penalty: what need not move should not. What was found to travel must."""

@@ -11,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -227,23 +227,6 @@ def render_options(model: SceneModel) -> RenderOptions:
     )
 
 
-@dataclass(frozen=True)
-class Variant(Generic[S]):
-    """A scene that training may go on with instead of the present one, with the same Gaussians.
-
-    Attributes:
-        name: of what is different, for a line about it.
-        scene: the other one.
-        steps: that each is to be trained for before they are compared; 0: the other one is taken.
-        reason: of a scene that is taken so.
-    """
-
-    name: str
-    scene: S
-    steps: int
-    reason: str = "taken, as asked for"
-
-
 class SceneTraining(Protocol[S]):
     """Training of a kind of scene: its images, what it learns beside the Gaussians, and when motion is frozen."""
 
@@ -282,12 +265,8 @@ class SceneTraining(Protocol[S]):
         """
         ...
 
-    def grown(self, scene: S, step: int) -> tuple[S, EditResult] | None:
-        """Return the scene with Gaussians that its kind adds after ``step``, and the edit; None: none are added."""
-        ...
-
-    def variant(self, scene: S, step: int) -> Variant[S] | None:
-        """Return another form of the scene to try out after ``step``; None at most steps."""
+    def revised(self, scene: S, step: int) -> tuple[S, EditResult] | None:
+        """Return the scene as its kind changes it after ``step``, and the edit of its Gaussians; None: it does not."""
         ...
 
     def window(self, step: int) -> tuple[float, float]:

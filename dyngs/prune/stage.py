@@ -36,6 +36,8 @@ MOVING_VIEWS, MOVING_TIMES = 8, 24
 STILL_VIEWS = 100
 PROBED_VIEWS = 16
 """Number of training images on which the loss is measured."""
+MASKED_BELOW = 0.5
+"""At a key time, Gaussians that contribute no more px to all views together are masked (docs/prune.md)."""
 
 
 @dataclass(frozen=True)
@@ -177,4 +179,4 @@ def _masks(trainer: Trainer, scene: Scene, kept: Tensor) -> VisibilityMasks:
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
     fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
-    return VisibilityMasks.pack(tuple(times), fractions[:, kept] > options.mask_below)
+    return VisibilityMasks.pack(tuple(times), fractions[:, kept] > MASKED_BELOW)

@@ -73,12 +73,9 @@ class StaticTraining:
             return replace(scene, filter_std=self._update.of(scene.gaussians))
         return scene
 
-    def grown(self, scene: Scene, step: int) -> tuple[Scene, EditResult] | None:
+    def revised(self, scene: Scene, step: int) -> tuple[Scene, EditResult] | None:
         """Return None: the set of Gaussians is left to the strategy."""
         return None
-
-    def variant(self, scene: Scene, step: int) -> None:
-        """Return None: there is nothing to choose from."""
 
     def all_moving(self, scene: StaticScene, extent: float) -> StaticScene:
         """Return ``scene``: nothing moves."""

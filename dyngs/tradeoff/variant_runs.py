@@ -180,7 +180,7 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
 
 def _pruning_overrides(wanted: Variant, own: PruneConfig) -> Sequence[str]:
     """Return overrides of the pruning stage; masks are those of the run where the variant has none."""
-    masks = (f"prune.mask_times={wanted.mask_times or own.mask_times}", f"prune.mask_below={own.mask_below}")
+    masks = (f"prune.mask_times={wanted.mask_times or own.mask_times}",)
     return (f"prune.fraction={wanted.prune}", *masks)
 
 

@@ -1,15 +1,15 @@
 """A run that goes on to another number of steps: its configuration from there on, and what that means in words.
 
 All schedules become those of the new length, but what has begun keeps the step at which it did: nothing is begun twice,
-images do not become small again, and what was decided stays decided.
+images do not become small again. Only harmonics (colour.kind=auto) may be measured a second time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dyngs.config import AutoColour, Config, DynamicModel, HumanModel, TrainConfig
-from dyngs.config.kinds import harmonics_measured_after, network_of
+from dyngs.config import Config, DynamicModel, HumanModel, TrainConfig
+from dyngs.config.kinds import network_of
 from dyngs.deform.training import DeformSchedule
 from dyngs.errors import DyngsError
 from dyngs.static.rates import Rates
@@ -23,9 +23,6 @@ from dyngs.training.schedule import (
     rates_of,
     scaled,
 )
-
-MOST_FRACTION = 1 - 1e-9
-"""Largest fraction of a run, for keys that must be below 1."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +78,6 @@ def with_length(config: Config, done: int, steps: int) -> Config:
         case HumanModel():
             fraction = length.share(config.model.refine_from)
             changed["model"] = config.model.model_copy(update={"refine_from": fraction})
-        case _:
-            pass
-    match config.colour:
-        case AutoColour():
-            fraction = min(_fraction_of_measure(config, length), MOST_FRACTION)
-            changed["colour"] = config.colour.model_copy(update={"measure_at": fraction})
         case _:
             pass
     return config.model_copy(update=changed)
@@ -157,12 +148,3 @@ def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> fl
         return length.kept(old.fine)
     new = deform_schedule(model, Rates(length.steps))
     return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from
-
-
-def _fraction_of_measure(config: Config, length: Length) -> float:
-    """Return the share after which harmonics are measured, likewise."""
-    longer = config.model_copy(update={"train": config.train.model_copy(update={"steps": length.steps})})
-    old, new = harmonics_measured_after(config) or 0, harmonics_measured_after(longer) or 0
-    if length.done >= old:
-        return length.kept(old)
-    return length.kept(length.done + 1) if new <= length.done else new / length.steps

@@ -354,7 +354,7 @@ def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE)
 
 def _mcmc_gaussians(config: Config, strategy: McmcStrategy, now: int) -> int:
     """Return how many Gaussians the strategy ends with: each change adds the same share, up to the cap."""
-    grown = now * (1 + growth_per_change(strategy, config.train.steps)) ** min(num_changes(config), 200)
+    grown = now * (1 + growth_per_change(config.train.steps)) ** min(num_changes(config), 200)
     return max(int(min(strategy.max_gaussians, grown)), now)
 
 

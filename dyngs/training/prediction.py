@@ -33,6 +33,8 @@ from dyngs.training.events import StepReport
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 
+SQUARED_WEIGHT = 1.0
+"""Weight of the mean squared error in the loss, which counts edges more."""
 WARM_UP = 0.05
 """Fraction of the run in which the highest learning rate is reached."""
 WEIGHT_DECAY = 1e-5
@@ -199,10 +201,10 @@ def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config
     """Return the loss of a rendering of one view against ``truth`` (H, W, 3), the image on the same background."""
     options, model = config.train, network_of(config)
     loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, image.mask)
-    if model is not None and model.squared_weight:
+    if model is not None:
         difference = rendering.rgb[0] - truth
         known = difference if image.mask is None else difference * image.mask[..., None]
-        loss = loss + model.squared_weight * known.square().mean()
+        loss = loss + SQUARED_WEIGHT * known.square().mean()
     if options.alpha_weight and image.alpha is not None:
         loss = loss + options.alpha_weight * (rendering.alpha[0] - image.alpha).abs().mean()
     return loss
@@ -327,10 +329,10 @@ def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
 def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
     """Return views to predict from, of a random moment each: one at random, the others chosen to see much.
 
-    Every other choice has fewer than ``model.source_views``, in turn each number from ``model.fewest_views``.
+    Every other choice has fewer than ``model.source_views``, in turn each number from 1.
     """
     firsts = torch.randint(len(sitter.views), (model.source_sets,), generator=generator, device="cpu").tolist()
-    fewer = list(range(model.fewest_views, model.source_views)) or [model.source_views]
+    fewer = list(range(1, model.source_views)) or [model.source_views]
     counts = [fewer[i // 2 % len(fewer)] if i % 2 else model.source_views for i in range(len(firsts))]
     return [spread_views(sitter, count, first) for count, first in zip(counts, firsts, strict=True)]
 

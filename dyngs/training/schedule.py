@@ -30,7 +30,8 @@ MIN_RESET_GAP = 400
 """Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)."""
 RESET_FRACTION = 0.2
 """Fraction of a short run between opacity resets."""
-MAX_GROWTH = 0.25
+GROWTH, MAX_GROWTH = 0.05, 0.25
+"""Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
 MIN_COARSE_STEPS = 1000
 """Steps that a static model needs to show where it fails; short runs spend at most a third on it."""
@@ -40,8 +41,6 @@ MATCH_FRACTION, MATCHES_UNTIL = 0.04, 0.85
 """Fraction of the run between two rounds of block matching, and after which there are no more."""
 GROUPS = 0.12
 """The step at which nodes may form rigid groups, likewise: after the first split."""
-LIFETIMES = 0.16
-"""The step at which Gaussians may get time windows, likewise."""
 
 
 def scaled(step: int, steps: int) -> int:
@@ -64,7 +63,7 @@ def hold_out_until(options: TrainConfig) -> int:
 
 def rates_of(config: Config) -> Rates:
     """Return the course of the learning rates of a run."""
-    return Rates(config.train.steps, config.prune.steps, config.prune.rewind)
+    return Rates(config.train.steps, config.prune.steps)
 
 
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
@@ -113,14 +112,14 @@ def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
     return strategy.grad_threshold * min(1.0, steps / PUBLISHED_STEPS) ** 0.25
 
 
-def growth_per_change(strategy: McmcStrategy, steps: int) -> float:
+def growth_per_change(steps: int) -> float:
     """Return the fraction of Gaussians that MCMC adds per change.
 
     Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; each then adds
     more, up to a quarter, and the count follows the same curve over the run.
     """
-    rate = math.log1p(strategy.growth) * max(PUBLISHED_STEPS / steps, 1.0)
-    return max(strategy.growth, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
+    rate = math.log1p(GROWTH) * max(PUBLISHED_STEPS / steps, 1.0)
+    return max(GROWTH, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
 
 
 def filter_steps(strategy: Strategy, steps: int) -> range:
@@ -143,8 +142,8 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
         sorted({full + round(fraction * (steps - full)) for fraction in SPLITS}) if model.freeze_below_px > 0 else []
     )
     splits = tuple(step for step in splits if step > full)
-    groups, lifetimes = (full + round(fraction * (steps - full)) for fraction in (GROUPS, LIFETIMES))
-    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, lifetimes, _matches(model, fine, steps))
+    groups = full + round(GROUPS * (steps - full))
+    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, _matches(model, fine, steps))
 
 
 def _matches(model: DynamicModel, fine: int, steps: int) -> tuple[int, ...]:

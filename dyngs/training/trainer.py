@@ -42,7 +42,6 @@ from dyngs.training.sampler import ViewSampler
 from dyngs.training.schedule import active_sh_degree, image_divisor, means_rate, rates_of
 from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.training.step_check import StepCheck
-from dyngs.training.trial import decide
 
 
 @dataclass
@@ -117,9 +116,6 @@ class Trainer:
                 reports.append(self._backward(step, index))
         loss = self._averaged(step, [report.loss for report in reports])
         found = (self.alpha.finding if step == 1 else None, self._update(step))
-        variant = self.training.variant(self.scene, step)
-        if variant is not None:
-            found = (*found, decide(self, variant))
         if self.optimizer.parameters is not before:
             self.processes.require_same(tensors_of(self.scene.state()), f"after step {step}")
         finding = "; ".join(text for text in found if text is not None) or None
@@ -308,14 +304,14 @@ class Trainer:
             self._apply(result)
         self.densifier.perturb(self.optimizer.parameters, lr_means, self.generator)
         self.scene = self.training.after_step(self.scene, step, result is not None)
-        grown = self.training.grown(self.scene, step)
-        if grown is not None:
-            self.scene, result = grown
+        revised = self.training.revised(self.scene, step)
+        if revised is not None:
+            self.scene, result = revised
             self.optimizer.apply(result)
             self.scene = self.scene.with_gaussians(self.optimizer.parameters)
             self._follow(result)
         self.done = step
-        findings = (self._drop_harmonics(step), None if grown is None else grown[1].finding)
+        findings = (self._drop_harmonics(step), None if revised is None else revised[1].finding)
         self.scene.changed()
         return self.priors.told("; ".join(text for text in findings if text) or None)
 

@@ -310,7 +310,7 @@ def test_a_resumed_moving_run_equals_an_uninterrupted_one(
 @pytest.mark.parametrize("steps", [2, 8, 11, 20], ids=["coarse", "begin", "fine", "split"])
 def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path: Path, kind: str, steps: int) -> None:
     """At any time, with the 3D filter."""
-    config = busy_config(moving_capture, tmp_path, kind, filter_3d=True, time_jitter=0.0, freeze_below_px=0.1)
+    config = busy_config(moving_capture, tmp_path, kind, filter_3d=True, freeze_below_px=0.1)
     trainer = assemble(config)
     for _ in range(steps):
         trainer.step()

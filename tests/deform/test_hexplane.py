@@ -16,8 +16,6 @@ from dyngs.deform.hexplane import Hexplane, time_rows
 from dyngs.gaussians import TopologyEdit
 from dyngs.state import tensors_of
 
-WITHOUT_PENALTIES = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_sparsity": 0.0}
-
 
 def field_with_rows(rows: int) -> Hexplane:
     """Planes whose row i over time holds the number i everywhere."""
@@ -156,8 +154,6 @@ def test_penalties_vanish_on_smooth_planes_only() -> None:
     assert not grad[2].any() or bool((field.parameters["time0"][2] != 1).any())
     field.levels[0].time.data[1, 2] += 0.1
     assert field.penalties(0.3)["plane smoothness"].detach() > rough.detach()
-    options = HexplaneField(channels=1, resolution=4, levels=(1,), **WITHOUT_PENALTIES)
-    assert Hexplane(options, tiny_setup(), torch.Generator()).penalties(0.3) == {}
 
 
 def test_select_changes_nothing() -> None:

@@ -31,10 +31,8 @@ def test_the_encoding_has_known_values() -> None:
 
 @pytest.mark.parametrize(("depth", "skips"), [(2, False), (SKIP_LAYER, False), (SKIP_LAYER + 1, True), (8, True)])
 def test_deep_networks_see_the_input_once_more(depth: int, skips: bool) -> None:
-    field = Mlp(
-        MlpField(depth=depth, width=6, space_frequencies=1, time_frequencies=1), tiny_setup(), torch.Generator()
-    )
-    num_inputs = 3 * 3 + 3
+    field = Mlp(MlpField(depth=depth, width=6), tiny_setup(), torch.Generator())
+    num_inputs = 3 * (1 + 2 * 10) + 1 + 2 * 6
     widths = [field.parameters[f"weight{i}"].shape[1] for i in range(depth + 1)]
     expected = [num_inputs] + [6] * depth
     if skips:

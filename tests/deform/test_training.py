@@ -92,7 +92,7 @@ class Run:
         return int(left_out)
 
     def grow(self, step: int) -> EditResult | None:
-        grown = self.training.grown(self.scene, step)
+        grown = self.training.revised(self.scene, step)
         if grown is None:
             return None
         self.scene, result = grown
@@ -333,23 +333,6 @@ def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
     assert begun(gaussians).moment(1.0, FINE + 1).penalties == {}
 
 
-def test_time_jitter_shrinks_and_stays_in_the_clip() -> None:
-    gaussians = flat_cloud()
-    run = begun(gaussians, time_jitter=3.0)
-    move(run, torch.ones(9))
-
-    def spread(step: int, time: float) -> tuple[float, float, float]:
-        drawn = [run.moment(time, step).gaussians.means.detach() for _ in range(60)]
-        x = torch.stack([(means - gaussians.means.detach())[0, 0] for means in drawn])
-        return float(x.std()), float(x.min()), float(x.max())
-
-    first, later, last = (spread(step, 0.5)[0] for step in (FINE + 1, STEPS // 2, STEPS))
-    assert first > later > last == 0.0
-    assert first == pytest.approx(2 * 3 / 20 * (1 - (FINE + 1) / STEPS), rel=0.4)
-    _, low, high = spread(FINE + 1, 1.0)
-    assert -1 <= low < high <= 1 + 1e-6
-
-
 # --- freezing ---------------------------------------------------------------------------------------------------------
 
 
@@ -576,7 +559,7 @@ def test_motion_begins_on_a_gpu_as_on_the_cpu() -> None:
 
         run = new_run(flat_cloud(), times, errors, deform=ControlNodesField(nodes=32), num_random_moving=300)
         run.training.capture = replace(run.training.capture, standing=lambda: footage)
-        grown = run.training.grown(run.scene.to(device), FINE)
+        grown = run.training.revised(run.scene.to(device), FINE)
         assert grown is not None
         assert grown[0].gaussians.means.device == device
         return grown[0].at(0.3).means.detach().cpu()

@@ -35,7 +35,7 @@ from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-STAGE = PruneConfig(fraction=0.5, steps=6, mask_times=3, mask_below=1.0)
+STAGE = PruneConfig(fraction=0.5, steps=6, mask_times=3)
 
 
 def moving_config(capture: Path, run_dir: Path, kind: str = "control_nodes", stage: PruneConfig = STAGE) -> Config:

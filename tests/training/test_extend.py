@@ -12,7 +12,6 @@ from tiny_people import TINY
 
 from dyngs.api.train import train
 from dyngs.config import (
-    AutoColour,
     BudgetConfig,
     Config,
     DataConfig,
@@ -26,7 +25,6 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.config.kinds import harmonics_measured_after
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.human.synthetic.capture import write_human_capture
@@ -162,7 +160,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path:
 def test_what_has_begun_keeps_its_step() -> None:
     options = TrainConfig(steps=1000, initial_downscale=4, hold_out_every=8)
     model = DynamicModel(time_window=0.1, time_window_grows_from=0.4, time_window_full_at=0.6, motion_from=0.35)
-    config = Config(data=DataConfig(root=Path("x")), model=model, colour=AutoColour(measure_at=0.3), train=options)
+    config = Config(data=DataConfig(root=Path("x")), model=model, train=options)
     old = deform_schedule(model, Rates(1000))
     assert old.fine == 350
     for done in (360, 500, 700, 1000):
@@ -175,7 +173,6 @@ def test_what_has_begun_keeps_its_step() -> None:
             assert isinstance(new.model, DynamicModel)
             now = deform_schedule(new.model, Rates(steps))
             assert now.fine == (350 if steps < 9000 else 1000)
-            assert harmonics_measured_after(new) == 300
             assert image_divisor(new.train, done) <= image_divisor(options, done)
             assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
             if done >= old.opens and steps < 9000:
@@ -194,8 +191,7 @@ def test_exposures_that_are_learned_stay_so() -> None:
 
 def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
     model = DynamicModel(motion_from=0.5)
-    config = Config(data=DataConfig(root=Path("x")), model=model, colour=AutoColour(), train=TrainConfig(steps=10_000))
+    config = Config(data=DataConfig(root=Path("x")), model=model, train=TrainConfig(steps=10_000))
     new = with_length(config, 4000, 5000)
     assert isinstance(new.model, DynamicModel)
     assert deform_schedule(new.model, Rates(5000)).fine == 4001
-    assert harmonics_measured_after(new) == 4001

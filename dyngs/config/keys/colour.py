@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -37,14 +37,9 @@ class NetworkColour(ColourSection):
     )
     width: int = Field(default=32, ge=1, description="neurons per hidden layer; MEGA: 64")
     depth: int = Field(default=2, ge=1, le=8, description="hidden layers")
-    normals: bool = Field(
-        default=True,
-        description="the network also sees the angle to each Gaussian's shortest axis and the direction mirrored there",
-    )
     lr: Positive = Field(
         default=0.01, description="learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run"
     )
-    warm_up: int = Field(default=100, ge=1, description="steps in which that rate is reached")
 
 
 class AutoColour(ColourSection):
@@ -52,10 +47,7 @@ class AutoColour(ColourSection):
 
     kind: Literal["auto"] = Field(
         default="auto",
-        description="harmonics only for the Gaussians where dependence on the view pays on held-out training views",
-    )
-    measure_at: Annotated[float, Field(gt=0, lt=1)] = Field(
-        default=0.6,
-        description="fraction of the run after which that is measured; until then every 8th view is held out",
+        description="harmonics only for the Gaussians where dependence on the view pays, measured after 0.6 of the run "
+        "on every 8th training view",
     )
     tolerance: float = Field(default=0.05, ge=0, description="PSNR that may be lost by it, dB")

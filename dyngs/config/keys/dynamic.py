@@ -39,15 +39,6 @@ class HexplaneField(FieldSection):
     depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")
     lr_planes: Positive = Field(default=1.6e-3, description="learning rate of the planes, times the scene extent")
     lr_decoder: Positive = Field(default=1.6e-4, description="learning rate of the decoder, times the scene extent")
-    space_smoothness: float = Field(
-        default=1e-4, ge=0, description="weight of the mean squared second difference of the space planes"
-    )
-    time_smoothness: float = Field(
-        default=0.01, ge=0, description="weight of the mean squared second difference along t of the planes with time"
-    )
-    time_sparsity: float = Field(
-        default=1e-4, ge=0, description="weight of the mean of |1 - value| over the planes with time"
-    )
 
 
 class MlpField(FieldSection):
@@ -58,8 +49,6 @@ class MlpField(FieldSection):
     )
     depth: int = Field(default=8, ge=2, description="hidden layers")
     width: int = Field(default=256, ge=1, description="neurons per hidden layer")
-    space_frequencies: int = Field(default=10, ge=0, le=16, description="octaves of the positional encoding of places")
-    time_frequencies: int = Field(default=6, ge=0, le=16, description="octaves of the positional encoding of time")
     lr: Positive = Field(default=8e-4, description="learning rate")
 
 
@@ -81,21 +70,13 @@ class ControlNodesField(FieldSection):
         description="weight of the as-rigid-as-possible term: squared strain between neighbouring nodes, in node "
         "spacings; lower where things bend",
     )
-    smoothness: float = Field(default=0.01, ge=0, description="weight of the nodes' squared acceleration")
     block_matching: bool = Field(
         default=False,
         description="now and then look up to three small pixels around for where moving blocks of the drawn image "
         "belong in the true one, and correct the splines by that where it lowers the error",
     )
-    rigid_groups: Literal["never", "auto", "always"] = Field(
-        default="never",
-        description="nodes that move rigidly get one motion per body once all times are seen; auto: if that wins a "
-        "trial",
-    )
-    lifetimes: Literal["never", "auto", "always"] = Field(
-        default="never",
-        description="each moving Gaussian gets a time window and a velocity once all times are seen, for things that "
-        "come and go; auto: if that wins a trial",
+    rigid_groups: bool = Field(
+        default=False, description="nodes that move rigidly get one motion per body once all times are seen"
     )
 
 
@@ -166,10 +147,4 @@ class DynamicModel(SceneModel):
     )
     motion_sparsity: float = Field(
         default=0.01, ge=0, description="weight of the mean displacement of the moving Gaussians, in scene extents"
-    )
-    time_jitter: float = Field(
-        default=0.0,
-        ge=0,
-        description="noise on the time of a training view, in intervals between times, falling to 0 over the run "
-        "(Deformable-3DGS); 0.1 suits videos with inexact times",
     )

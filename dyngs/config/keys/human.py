@@ -34,10 +34,6 @@ class HumanModel(_OnTemplate):
         default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"
     )
     refine_from: Fraction = Field(default=0.1, description="fraction of the run after which these are learned")
-    refine_frames_from: Fraction = Field(
-        default=0.25,
-        description="fraction of the run after which poses of single frames are, too: what frames share comes first",
-    )
     light: bool = Field(
         default=True,
         description="learn light that is fixed in the world: colours depend on where the surface faces (with "
@@ -84,18 +80,16 @@ class HumanPredictorModel(_OnTemplate):
         description="Gaussians above the lowest scaffold must lie inside at least this fraction of the silhouettes "
         "(visual hull); 0: all are kept",
     )
-    source_views: int = Field(default=3, ge=1, description="images of a person that it is predicted from, at most")
-    fewest_views: int = Field(
-        default=1, ge=1, description="every other training example is predicted from fewer images, at least so many"
+    source_views: int = Field(
+        default=3,
+        ge=1,
+        description="images of a person that it is predicted from, at most; every other training example has fewer",
     )
     source_sets: int = Field(
         default=6, ge=1, description="different choices of source views per person in training; their maps are cached"
     )
     target_views: int = Field(
         default=2, ge=1, description="images of one moment that a prediction is compared with in each step"
-    )
-    squared_weight: float = Field(
-        default=1.0, ge=0, description="weight of the mean squared error in the loss, which counts edges more"
     )
     widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
         default=(24, 32, 48, 64),

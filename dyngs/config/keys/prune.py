@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Fraction, Section
+from dyngs.config.keys.section import Section
 
 
 class PruneConfig(Section):
@@ -17,18 +17,11 @@ class PruneConfig(Section):
         default="sensitivity", description="importance of a Gaussian (docs/prune.md); the lowest are removed"
     )
     mask_times: int = Field(
-        default=0, ge=0, description="key times of visibility masks over time (4DGS-1K); 0 or 1: no masks"
-    )
-    mask_below: float = Field(
-        default=0.0,
+        default=0,
         ge=0,
-        description="at a key time, Gaussians that contribute no more than so many px to all views together are masked",
+        description="key times of masks over time (4DGS-1K), which leave out what hardly shows then; 0, 1: none",
     )
     steps: int = Field(default=2000, ge=1, description="steps of fine-tuning after pruning")
-    rewind: Fraction = Field(
-        default=0.3,
-        description="fraction of training whose learning rates fine-tuning goes back to (Renda et al. 2020)",
-    )
 
     @property
     def is_wanted(self) -> bool:

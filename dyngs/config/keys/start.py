@@ -20,9 +20,12 @@ class PointsInit(Section):
         ge=0,
         description="images of one moment to triangulate points from where the capture has none; 0: do not",
     )
-    num_random: int = Field(default=100_000, ge=1, description="random points where there are no others")
+    num_random: int = Field(
+        default=100_000, ge=1, description="number of random points; auto: where there are no others"
+    )
     half_extent: Positive = Field(
-        default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
+        default=1.3,
+        description="half the side of their cube around the origin, world units (Blender scenes)",
     )
 
 
@@ -30,5 +33,10 @@ class RandomInit(Section):
     """Start from uniformly random points in a cube around the origin (Blender scenes of 3DGS)."""
 
     kind: Literal["random"] = Field(default="random", description="points drawn uniformly in a cube around the origin")
-    num_random: int = Field(default=100_000, ge=1, description="number of random points")
-    half_extent: Positive = Field(default=1.3, description="half the cube's side, world units")
+    num_random: int = Field(
+        default=100_000, ge=1, description="number of random points; auto: where there are no others"
+    )
+    half_extent: Positive = Field(
+        default=1.3,
+        description="half the side of their cube around the origin, world units (Blender scenes)",
+    )

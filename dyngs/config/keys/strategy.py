@@ -59,7 +59,6 @@ class McmcStrategy(Section):
     start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
     stop: int = Field(default=25_000, description=f"step {_OF_30000}, from which their number is fixed")
     every: int = Field(default=100, ge=1, description="steps between these changes; not scaled")
-    growth: Positive = Field(default=0.05, description="fraction of Gaussians that is added each time")
     min_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are relocated")
     noise: float = Field(
         default=5e5, ge=0, description="strength of the noise on positions, times their learning rate; 0: none"

@@ -43,19 +43,10 @@ class TrainConfig(Section):
         description="weight of the mean error of alpha, where images have alpha; null: 0.1 for a moving scene in "
         "front of a background of its own colours, else 0",
     )
-    depth_weight: float = Field(
-        default=0.1, ge=0, description="weight of the error against depth maps, where the capture has any; 0: not used"
-    )
-    flow_weight: float = Field(
-        default=1.0,
-        ge=0,
-        description="weight of the error against optical flow, where there is any; 0: not used",
-    )
-    tracks_weight: float = Field(
-        default=1.0, ge=0, description="weight of the error against 2D tracks, where the capture has any; 0: not used"
-    )
-    motion_masks: bool = Field(
-        default=True, description="let motion masks say what moves, where the capture has any and they fit its images"
+    priors: tuple[Literal["depth", "flow", "tracks", "motion_masks"], ...] = Field(
+        default=("depth", "flow", "tracks", "motion_masks"),
+        description="what is used beside images where the capture has it and it agrees with them: depth maps, optical "
+        "flow, 2D tracks, and masks that say what moves (docs/priors.md)",
     )
     robust: Literal["never", "auto", "always"] = Field(
         default="never",

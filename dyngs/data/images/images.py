@@ -166,7 +166,7 @@ def read_mask(path: Path) -> Tensor:
 
 
 def check_image(path: Path) -> ImageHeader:
-    """Read the header and check that the file is very likely complete; a JPEG without end marker is decoded for that."""
+    """Read the header and check that the file is very likely complete: a JPEG without end marker is decoded."""
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
     marker = END_MARKERS.get(path.suffix.lower())

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from dyngs.config import AutoColour, ColourSection, NetworkColour
+from dyngs.config.kinds import MEASURED_AT
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
@@ -23,6 +24,8 @@ from dyngs.ops.shading import num_inputs
 from dyngs.state import Role, State, StateTensor
 from dyngs.tensor_checks import require_tensor
 
+WARM_UP = 100
+"""Steps in which the network's rate is reached."""
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)
 """Fractions of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k steps)."""
 HELD_OUT_EVERY = 8
@@ -135,7 +138,7 @@ class NetworkTraining(ColourTraining):
     ) -> None:
         super().__init__(options)
         self.options, self.steps, self.box, self.sees_time = options, steps, box, sees_time
-        inputs = num_inputs(sees_time=sees_time, sees_normals=options.normals)
+        inputs = num_inputs(sees_time=sees_time, sees_normals=True)
         values = _start_values([inputs, *[options.width] * options.depth, 3], generator)
         self.parameters = Parameters(values, dict.fromkeys(values, options.lr))
 
@@ -143,14 +146,14 @@ class NetworkTraining(ColourTraining):
     def network(self) -> ColourNetwork:
         count = self.options.depth + 1
         layers = (Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count))
-        return ColourNetwork(tuple(layers), self.box, self.sees_time, self.options.normals)
+        return ColourNetwork(tuple(layers), self.box, self.sees_time, sees_normals=True)
 
     @property
     def learned(self) -> Parameters:
         return self.parameters
 
     def optimize(self, step: int) -> Count:
-        return self.parameters.update(step, rate_factor(step, self.steps, self.options.warm_up))
+        return self.parameters.update(step, rate_factor(step, self.steps))
 
     def place(self, device: torch.device) -> None:
         self.box, self.parameters = self.box.to(device), self.parameters.to(device)
@@ -167,7 +170,7 @@ class AutoTraining(ColourTraining):
     """Harmonics for all Gaussians at first, later only for those where they are measured to improve images.
 
     Args:
-        options: when, and what may be given away.
+        options: what may be given away.
         steps: length of the run.
         num_views: training views.
     """
@@ -175,7 +178,7 @@ class AutoTraining(ColourTraining):
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)
         self.tolerance = options.tolerance
-        self.measured_after = min(max(1, round(options.measure_at * steps)), steps)
+        self.measured_after = max(1, round(MEASURED_AT * steps))
         self.held_out = tuple(range(_HELD_OUT, num_views, HELD_OUT_EVERY))
         self._frozen: Tensor | None = None
 
@@ -231,10 +234,10 @@ def opacity_entropy(logits: Tensor) -> Tensor:
     return -(logits.sigmoid() * logsigmoid(logits)).mean()
 
 
-def rate_factor(step: int, steps: int, warm_up: int) -> float:
+def rate_factor(step: int, steps: int) -> float:
     """Return the factor on the rate of ``step``, from 1: a linear warm-up, then a third after each milestone."""
     passed = sum(step > fraction * steps for fraction in _MILESTONES)
-    return min(1.0, step / warm_up) / 3**passed
+    return min(1.0, step / WARM_UP) / 3**passed
 
 
 def _start_values(widths: list[int], generator: torch.Generator) -> dict[str, Tensor]:

@@ -27,6 +27,8 @@ from dyngs.state import Role, State, StateTensor
 from dyngs.static.rates import Rates
 
 NEIGHBOURS = 5
+FRAMES_FROM = 0.25
+"""Fraction of the run after which poses of single frames are learned: what all frames share comes first."""
 CENTIMETRE = 0.01
 SIDES_WEIGHT = 0.1
 """Of the squared difference between colours of both sides, where light is learned, in the loss."""
@@ -49,7 +51,7 @@ class HumanTraining:
     ) -> None:
         self.options, self.rates, self.views = options, rates, views
         self.refines_from = round(options.refine_from * rates.steps)
-        self.frames_from = round(options.refine_frames_from * rates.steps)
+        self.frames_from = round(FRAMES_FROM * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
@@ -116,7 +118,7 @@ class HumanTraining:
     def after_step(self, scene: HumanScene, step: int, edited: bool) -> HumanScene:
         return scene
 
-    def grown(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
+    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene as it is, and after the last step new values for what the images hardly show."""
         if step != self.rates.steps or not self.options.fill_unseen or not self.views or not len(scene):
             return None
@@ -137,9 +139,6 @@ class HumanTraining:
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
         return scene, EditResult(None, changes, finding=line if hardly >= WORTH_TELLING else None)
-
-    def variant(self, scene: Scene, step: int) -> None:
-        """Return None: there is nothing to choose from."""
 
     def all_moving(self, scene: HumanScene, extent: float) -> HumanScene:
         """Return ``scene``: they do."""

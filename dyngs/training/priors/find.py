@@ -36,7 +36,7 @@ def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves:
     """Return the priors of a capture that agree with its images; nothing is read where it has none.
 
     Args:
-        config: whose weights of 0 leave a prior out.
+        config: names the priors that may be used.
         capture: of the run.
         images: of its training views, with maps.
         moves: whether anything may move in the model: without that, depth alone is of use.
@@ -44,29 +44,28 @@ def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves:
     Raises:
         DyngsError: a file that is damaged.
     """
-    options, views, lines = config.train, images.views, list[str]()
-    weights = {"depth": options.depth_weight, "flow": options.flow_weight, "tracks": options.tracks_weight}
+    wanted, views, lines = config.train.priors, images.views, list[str]()
     kind: Kind | None = None
     flow_to: dict[int, Glance] = {}
     tracks: PointTracks | None = None
-    if options.depth_weight > 0 and any(view.depth_path for view in views):
+    if "depth" in wanted and any(view.depth_path for view in views):
         kind, agreement = _judged_depth(config, images)
         lines.append(_line(f"depth maps (aligned in {_NAMES[kind]})", agreement, "one depth for a whole image"))
         kind = kind if agreement.holds else None
-    if moves and options.flow_weight > 0 and any(view.flow_path for view in views):
+    if moves and "flow" in wanted and any(view.flow_path for view in views):
         flow_to, agreement = _judged_flow(config, capture, images)
         lines.append(_line("optical flow", agreement, "no motion, its reverse or flow of other places"))
         flow_to = flow_to if agreement.holds else {}
-    if moves and options.tracks_weight > 0 and capture.tracks_path is not None:
+    if moves and "tracks" in wanted and capture.tracks_path is not None:
         tracks, agreement = _judged_tracks(config, read_tracks(capture.tracks_path), images)
         lines.append(_line("tracks", agreement, "tracks at random"))
         tracks = tracks if agreement.holds else None
-    masks = moves and options.motion_masks and any(view.motion_mask_path for view in views)
+    masks = moves and "motion_masks" in wanted and any(view.motion_mask_path for view in views)
     if masks:
         agreement = _judged_masks(config, images)
         lines.append(_line("motion masks", agreement, "the same masks the other way round"))
         masks = agreement.holds
-    return UsedPriors(kind, flow_to, tracks, masks, weights, lines)
+    return UsedPriors(kind, flow_to, tracks, masks, lines)
 
 
 _NAMES: dict[Kind, str] = {"depth": "depth", "inverse": "inverse depth"}

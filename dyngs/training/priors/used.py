@@ -17,6 +17,8 @@ from dyngs.training.priors.point_motion import Glance, displacements, flow_error
 
 MIN_POINTS = 4
 """Fewest points that two images must share for their tracks to be compared."""
+WEIGHTS = {"depth": 0.1}
+"""Weight of a loss term where it is not 1."""
 _NEAREST = 8
 """The other image of tracks is one of so many nearest in time."""
 
@@ -62,14 +64,13 @@ class PointTracks:
 
 @dataclass(frozen=True)
 class UsedPriors:
-    """Priors that agree with the images, with their weights.
+    """Priors that agree with the images.
 
     Attributes:
         depth: what the depth maps are affine in; None: none are used.
         flow_to: by training view, the camera and time that its flow leads to; empty: no flow is used.
         tracks: None: none are used.
         masks: whether motion masks say what may move.
-        weights: of the loss terms "depth", "flow" and "tracks".
         lines: what was found, for people, told once; whoever tells them removes them.
     """
 
@@ -77,7 +78,6 @@ class UsedPriors:
     flow_to: Mapping[int, Glance] = field(default_factory=dict)
     tracks: PointTracks | None = None
     masks: bool = False
-    weights: Mapping[str, float] = field(default_factory=dict)
     lines: list[str] = field(default_factory=list)
 
     def options(self, options: RenderOptions, image: Image) -> RenderOptions:
@@ -108,7 +108,7 @@ class UsedPriors:
             found["depth"] = depth_error(drawn, alpha, image.depth, self.depth, image.mask)
         if not scene.is_static and image.time is not None:
             found |= self._motion(scene, image, view, generator)
-        return {name: self.weights[name] * x for name, x in found.items() if x is not None}
+        return {name: WEIGHTS.get(name, 1.0) * x for name, x in found.items() if x is not None}
 
     def _motion(
         self, scene: Scene, image: Image, view: StepView, generator: torch.Generator

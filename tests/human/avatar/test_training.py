@@ -130,7 +130,7 @@ def test_anchors_and_weights_follow_the_set(capture: Path) -> None:
 
 
 def test_what_all_frames_share_is_learned_before_poses_of_single_ones(capture: Path) -> None:
-    trainer = assemble(tiny(capture, steps=10, refine_from=0.1, refine_frames_from=0.5))
+    trainer = assemble(tiny(capture, steps=20, refine_from=0.05))
     early = tensors_after(trainer, 5)
     names = [f"model.learned.{name}" for name in ("turns", "joints", "poses", "trans")]
     assert [bool(early[name].any()) for name in names] == [True, True, False, False]

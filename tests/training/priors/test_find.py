@@ -43,11 +43,11 @@ def test_priors_of_noise_are_ignored_with_one_line_each(tmp_path: Path) -> None:
     assert all(": ignored" in line for line in priors.lines)
 
 
-def test_weights_of_zero_read_nothing(tmp_path: Path) -> None:
-    zero = [f"train.{name}_weight=0" for name in ("depth", "flow", "tracks")]
+def test_priors_that_are_not_requested_are_not_read(tmp_path: Path) -> None:
     with_priors(tmp_path)
     (tmp_path / "tracks.npz").write_bytes(b"")
-    assert found(tmp_path, *zero, "train.motion_masks=false").lines == []
+    assert found(tmp_path, "train.priors=[]").lines == []
+    assert [line[:5] for line in found(tmp_path, "train.priors=[depth]").lines] == ["depth"]
 
 
 def test_where_nothing_moves_depth_alone_is_looked_at(tmp_path: Path) -> None:
