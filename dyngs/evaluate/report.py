@@ -30,6 +30,7 @@ from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
+from dyngs.runs.inputs import inputs_of
 from dyngs.training.background import evaluation_background
 from dyngs.training.views import training_cameras
 
@@ -159,6 +160,7 @@ def evaluate_run(
     """
     draws_on = device_for(device)
     _require_untrained(run_dir, split, refine_poses)
+    inputs_of(run_dir).require_output(report_path(run_dir, split))
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)

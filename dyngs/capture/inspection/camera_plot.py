@@ -10,6 +10,7 @@ import numpy as np
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry.poses import inverse_rigid, pose_fault
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import Inputs
 from dyngs.files.write import write_image
 
 BACKGROUND = np.array([24, 26, 30], np.uint8)
@@ -25,6 +26,7 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     Raises:
         DyngsError: no view has a usable pose, or the file cannot be written.
     """
+    Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
     usable = [(split, view) for split, view in views if pose_fault(view) is None]
     if not usable:

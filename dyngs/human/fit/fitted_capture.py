@@ -18,7 +18,7 @@ from dyngs.data.capture import Capture, Split
 from dyngs.data.fitted_body import numbered
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import ImageLoader
-from dyngs.data.synthetic.captures import require_new_folder
+from dyngs.files.outputs import require_new_folder
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar.posing import frame_pose
