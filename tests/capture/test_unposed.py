@@ -12,7 +12,9 @@ from dyngs.capture import unposed
 from dyngs.capture.multi_video.estimate import VideosOptions, VideosResult
 from dyngs.capture.sfm import SfmOptions, SfmResult
 from dyngs.capture.unposed import with_poses
-from dyngs.config import DataConfig
+from dyngs.cli import main
+from dyngs.config import Config, DataConfig
+from dyngs.config.io import save_config
 from dyngs.errors import DyngsError
 from dyngs.files.cache import cache_folder
 from dyngs.files.write import write_image
@@ -89,6 +91,20 @@ def test_a_video_gets_poses_and_has_times(tmp_path: Path, asked: list[Path]) -> 
             video.add(np.full((16, 16, 3), 50 * i, np.uint8))
     with_poses(DataConfig(root=tmp_path / "clip.mp4"), needs_times=True, say=lambda _: None)
     assert asked == [tmp_path / "clip.mp4"]
+
+
+def test_no_output_replaces_the_video_that_a_run_is_made_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The run knows only the folder in the cache, which names the video; also where that was copied since."""
+    for name in ("clip.mp4", "copy.mp4"):
+        with VideoWriter(tmp_path / name, fps=10) as video:
+            video.add(np.zeros((16, 16, 3), np.uint8))
+        data = with_poses(DataConfig(root=tmp_path / name), say=lambda _: None)
+        save_config(Config(data=data), tmp_path / "run" / "config.yaml")
+    for name in ("clip.mp4", "copy.mp4"):
+        before = (tmp_path / name).read_bytes()
+        assert main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(tmp_path / name)]) == 2
+        assert f"{name}: is the file that is read" in capsys.readouterr().err
+        assert (tmp_path / name).read_bytes() == before
 
 
 def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from dyngs.data.capture import Capture, Lens, PointCloud, Splits, View
 from dyngs.data.frame_seconds import read_seconds
 from dyngs.data.geometry.intrinsics import match_size, pinhole_matrix, rescale_warning
-from dyngs.data.geometry.poses import checked_pose, repair_warning
+from dyngs.data.geometry.poses import ROTATION_TOLERANCE, checked_pose, repair_warning
 from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.shared.capture_format import CaptureFormat
 from dyngs.data.readers.shared.colmap_check import check_model_file
@@ -81,7 +81,11 @@ def read_colmap(root: Path) -> Capture:
     for image in posed:
         where = f"{folder}, image {image.name}"
         camera = model.cameras[image.camera_id]
-        pose, repaired[where] = checked_pose(np.asarray(image.cam_from_world().matrix()), where)
+        found = image.cam_from_world()
+        length = float(np.linalg.norm(found.rotation.quat))
+        if not abs(length - 1) <= ROTATION_TOLERANCE:  # COLMAP takes zeros for no rotation
+            raise DyngsError(f"{where}: the quaternion of its rotation has length {length:.6g}, not 1; export it again")
+        pose, repaired[where] = checked_pose(np.asarray(found.matrix()), where)
         intrinsics, lens = pinhole_and_lens(camera, where)
         path = root / "images" / image.name
         header = header_if_readable(path)
