@@ -53,12 +53,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "source",
-        type=input_path,
-        metavar="RUN_OR_FILE",
-        help="run folder, avatar file (.safetensors), or any 3DGS .ply",
-    )
+    source_help = "run folder, avatar file (.safetensors), or any 3DGS .ply"
+    parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help=source_help)
     parser.add_argument("--out", type=output_path, metavar="DIR", help="folder for the images")
     cameras = parser.add_mutually_exclusive_group()
     cameras.add_argument(

@@ -159,8 +159,7 @@ def evaluate_run(
             poses of training views that are to be refined, no GPU that can be used.
     """
     draws_on = device_for(device)
-    _require_untrained(run_dir, split, refine_poses)
-    inputs_of(run_dir).require_output(report_path(run_dir, split))
+    _require_possible(run_dir, split, refine_poses)
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
@@ -202,7 +201,8 @@ def _written(run_dir: Path, report: EvalReport) -> EvalReport:
     return report
 
 
-def _require_untrained(run_dir: Path, split: str, refine_poses: bool) -> None:
+def _require_possible(run_dir: Path, split: str, refine_poses: bool) -> None:
+    inputs_of(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(
             f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"

@@ -293,9 +293,11 @@ def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
         DyngsError: naming the first camera whose rotation is mirrored, scaled, sheared or zero.
     """
     poses = cam_from_world.detach().double()
-    x, y, z = poses[:, :3, :3].unbind(2)
-    error = (poses[:, :3, :3].mT @ poses[:, :3, :3] - torch.eye(3, device=poses.device, dtype=poses.dtype)).abs().amax((1, 2))
-    is_mirrored = (torch.linalg.cross(x, y) * z).sum(1) < 0
+    rotations = poses[:, :3, :3]
+    unit = torch.eye(3, device=poses.device, dtype=poses.dtype)
+    error = (rotations.mT @ rotations - unit).abs().amax((1, 2))
+    x, y, z = rotations.unbind(2)
+    is_mirrored = ((x.roll(-1, 1) * y.roll(1, 1) - x.roll(1, 1) * y.roll(-1, 1)) * z).sum(1) < 0
     fits = (error <= ROTATION_TOLERANCE) & ~is_mirrored & poses.isfinite().all(2).all(1)
     bad = torch.nonzero(~fits)[:, 0]
     if not len(bad):
