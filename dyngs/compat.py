@@ -14,7 +14,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE
 from dyngs.errors import DyngsError
-from dyngs.gaussians.rendering import check_focal_lengths
+from dyngs.gaussians.rendering import check_focal_lengths, check_poses
 from dyngs.ops.checks import LARGEST_COUNT, check_choice, check_count, check_finite, check_near_and_far, check_number
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
@@ -116,6 +116,7 @@ def rasterization(
     _check_shapes(tensors, sh_degree, with_colors="RGB" in render_mode)
     check_finite(tensors)
     check_focal_lengths(Ks, "Ks")
+    check_poses(viewmats, "viewmats")
     cameras = Cameras(viewmats, Ks, width, height)
     limits = ProjectionOptions(eps2d, near_plane, far_plane, 1 / 255, radius_clip, rasterize_mode == "antialiased")
     splats = _project(means, quats, scales, opacities, cameras, limits, packed=packed)

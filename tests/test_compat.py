@@ -349,6 +349,14 @@ def test_numbers_out_of_range_are_refused_by_name(name: str, value: Any) -> None
         call(replace(scene, **sizes), **({"colors": scene.sh} | options if name == "sh_degree" else options))
 
 
+@pytest.mark.parametrize("factors", [(1.0, 1.0, -1.0), (2.0, 2.0, 2.0), (0.0, 0.0, 0.0)])
+def test_poses_are_rigid(factors: tuple[float, float, float], scene: Scene) -> None:
+    poses = scene.cam_from_world.clone()
+    poses[1, :3, :3] @= torch.diag(torch.tensor(factors)).to(poses)
+    with pytest.raises(DyngsError, match=r"viewmats: the matrix of camera 1 (is mirrored|differs from a rotation)"):
+        call(replace(scene, cam_from_world=poses))
+
+
 @pytest.mark.parametrize("position", [(0, 0), (1, 1)])
 @pytest.mark.parametrize("focal", [0.0, -0.0, -30.0])
 def test_focal_lengths_are_positive(position: tuple[int, int], focal: float, scene: Scene) -> None:

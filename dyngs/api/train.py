@@ -54,6 +54,7 @@ from dyngs.runs.folder import (
     tidy,
     was_only_begun,
 )
+from dyngs.runs.inputs import inputs_of
 from dyngs.runs.lock import writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
@@ -112,6 +113,8 @@ def train(
     config = shared(config, processes)
     require_possible(config)
     device_for(config.run.device)
+    if resume_from is None and not (folder / RESOLVED_NAME).is_file():
+        inputs_of(config).require_output(folder)
     if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
         latest_checkpoint(folder)
         return folder

@@ -38,6 +38,7 @@ from dyngs.data.times import write_seconds
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.fields import read_json_object
+from dyngs.files.outputs import require_new_folder
 from dyngs.files.write import write_image, write_text
 
 if TYPE_CHECKING:
@@ -70,8 +71,7 @@ def estimate_poses(
         DyngsError: too few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
             registered, with advice.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DyngsError(f"{out} exists already; name a new folder for the poses")
+    require_new_folder(out)
     if not source.exists():
         raise DyngsError(f"no such folder of photos or video: {source}")
     if options.masks is not None and not options.masks.is_dir():

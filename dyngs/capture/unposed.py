@@ -15,6 +15,7 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.read import FORMATS
 from dyngs.errors import DyngsError, reading
+from dyngs.files.outputs import note_sources
 from dyngs.files.temporary import cache_folder
 
 FEWEST_PHOTOS = 3
@@ -61,6 +62,7 @@ def with_poses(
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
     if folder.is_dir():
         say(f"{source} has no poses; those of before are in {folder}")
+        note_sources(folder, data.root)
         return data.model_copy(update={"root": folder})
     say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
     if videos:
@@ -69,6 +71,7 @@ def with_poses(
     else:
         options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         say(estimate_poses(source, folder, options, report).summary())
+    note_sources(folder, data.root)
     return data.model_copy(update={"root": folder})
 
 

@@ -18,7 +18,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 from dyngs import __version__
 from dyngs.cli import (
@@ -39,6 +39,7 @@ from dyngs.cli import (
     train,
     view,
 )
+from dyngs.cli.arguments import require_outputs_apart
 from dyngs.errors import DyngsError, printable, require_name
 
 EXIT_ERROR = 2
@@ -108,6 +109,7 @@ def _dispatch(arguments: list[str]) -> int:
     if "run" not in parsed:
         parser.print_help()
         return 0
+    require_outputs_apart(parsed.parser, parsed)
     return parsed.run(parsed)
 
 
@@ -124,7 +126,13 @@ def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.N
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line."""
+    """A parser whose errors are one line; what it returns also holds the ``parser`` of the command itself."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[argparse.Namespace, list[str]]:
+        parsed, rest = super().parse_known_args(args, namespace)
+        if "parser" not in parsed:
+            parsed.parser = self
+        return parsed, rest
 
     def error(self, message: str) -> NoReturn:
         raise DyngsError(f"{printable(message, 400)} (see `{self.prog} --help`)")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,49 @@ if TYPE_CHECKING:
     from dyngs.config import DataConfig
 
 MAX_THREADS = 1024
+
+
+def input_path(text: str) -> Path:
+    """Type of an argument that names what a command reads."""
+    return Path(text)
+
+
+def input_word(text: str) -> str:
+    """Type of an argument that names what a command reads, or something else, as a preset."""
+    return text
+
+
+def output_path(text: str) -> Path:
+    """Type of an argument that names what a command writes."""
+    return Path(text)
+
+
+def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Check that no output of a command would replace what it reads, as far as its arguments and overrides say.
+
+    Raises:
+        DyngsError: see ``dyngs.files.outputs.Inputs.require_output``.
+    """
+    words = [word.partition("=") for word in getattr(arguments, "overrides", ())]
+    outputs = [*_values(parser, arguments, output_path), *(value for key, _, value in words if key == "run.dir")]
+    existing = [Path(out) for out in outputs if os.path.lexists(out)]
+    if not existing:
+        return
+    from dyngs.runs.inputs import inputs_of
+
+    named = (value if equals else key for key, equals, value in words if key != "run.dir")
+    read = [*_values(parser, arguments, input_path), *_values(parser, arguments, input_word), *named]
+    inputs = inputs_of(*(Path(one) for one in read if os.path.lexists(one)))
+    for out in existing:
+        inputs.require_output(out)
+
+
+def _values(parser: argparse.ArgumentParser, arguments: argparse.Namespace, kind: object) -> Iterator[str | Path]:
+    """Yield the values of the arguments of a type."""
+    for action in parser._actions:
+        value = getattr(arguments, action.dest, None)
+        if action.type is kind and value is not None:
+            yield from value if isinstance(value, list) else (value,)
 
 
 def threads(text: str) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyngs.cli.arguments import add_device, computing_device
+from dyngs.cli.arguments import add_device, computing_device, input_path, output_path
 from dyngs.errors import DyngsError
 
 
@@ -15,7 +15,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     stages = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     raster = stages.add_parser("rasterize", help="projection, binning and blending, forward and backward")
     raster.add_argument(
-        "--points", type=Path, metavar="NPZ", help="points and cameras of gsplat's benchmark (default: random points)"
+        "--points",
+        type=input_path,
+        metavar="NPZ",
+        help="points and cameras of gsplat's benchmark (default: random points)",
     )
     raster.add_argument(
         "--threads", type=int, nargs="+", metavar="N", help="numbers of threads (default: 1 and all cores)"
@@ -27,7 +30,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "deform", help="fraction of the field in a training step, with and without the static split"
     )
     deform.add_argument(
-        "run_dir", type=Path, nargs="?", metavar="RUN", help="run folder of a dynamic model (default: random Gaussians)"
+        "run_dir",
+        type=input_path,
+        nargs="?",
+        metavar="RUN",
+        help="run folder of a dynamic model (default: random Gaussians)",
     )
     deform.add_argument(
         "--kind",
@@ -53,7 +60,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     deform.add_argument("--repeats", type=int, default=10, metavar="N", help="repetitions of five steps (default 10)")
     deform.set_defaults(run=run_deform)
     for one in (raster, deform):
-        one.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON as well")
+        one.add_argument("--json", type=output_path, metavar="FILE", help="write the results as JSON as well")
 
 
 def run_rasterize(arguments: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from dyngs.cli.arguments import input_path, input_word, output_path
 from dyngs.cli.docs import docs_folder
 
 _BASH = """\
@@ -159,7 +160,7 @@ def _values(action: argparse.Action, word: str) -> Iterator[str]:
     yield from runs
     if "CONFIG" in metavar:
         yield from _presets()
-    if action.type is None or action.type is Path:
+    if action.type in (None, input_path, input_word, output_path):
         only_folders = metavar in ("RUN", "NET_RUN")
         found = (path for path in _paths(word) if path.endswith("/") or not only_folders)
         yield from (path for path in found if path.removesuffix("/") not in runs)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+
+from dyngs.cli.arguments import input_path
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -14,7 +15,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Print the configuration of a preset, a YAML file or a run: every key with its value, its default "
         "and what it means. The output is a preset itself: save it, change it, train with it.",
     )
-    parser.add_argument("source", type=Path, metavar="CONFIG_OR_RUN", help="preset, YAML file or run folder")
+    parser.add_argument("source", type=input_path, metavar="CONFIG_OR_RUN", help="preset, YAML file or run folder")
     parser.add_argument("overrides", nargs="*", default=[], metavar="key=value", help="overrides, as for `dyngs train`")
     parser.set_defaults(run=run)
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from dyngs.cli.arguments import print_notes
+from dyngs.cli.arguments import input_path, output_path, print_notes
 from dyngs.cli.splats import add_axes, print_redrawn
 
 _EPILOG = """\
@@ -26,8 +25,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("source", type=Path, metavar="IN", help="file to read, such as a .ply or .spz")
-    parser.add_argument("target", type=Path, metavar="OUT", help="file to write, such as a .glb or .sog")
+    parser.add_argument("source", type=input_path, metavar="IN", help="file to read, such as a .ply or .spz")
+    parser.add_argument("target", type=output_path, metavar="OUT", help="file to write, such as a .glb or .sog")
     add_axes(parser)
     parser.set_defaults(run=run)
 
@@ -36,14 +35,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Convert the file, and print how much that changes what it shows."""
     from dataclasses import replace
 
-    from dyngs.errors import DyngsError
     from dyngs.output.roundtrip import compare_splats
     from dyngs.splats.formats import format_of, read_splats, upright, write_splats
 
     format_of(arguments.target)  # before a large file is read
     splat = read_splats(arguments.source, nonfinite="skip")
-    if arguments.target.exists() and arguments.target.samefile(arguments.source):
-        raise DyngsError(f"{arguments.target}: is the file that is read; give another name")
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
     turned = upright(splat, arguments.up, arguments.target)

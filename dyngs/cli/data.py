@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import data_fit
-from dyngs.cli.arguments import data_section, threads
+from dyngs.cli.arguments import data_section, input_path, output_path, threads
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError
 
@@ -39,7 +39,7 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         description="Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos "
         "without poses: size, rate, length, sound, sharpness, motion, and what to run next.",
     )
-    parser.add_argument("path", type=Path, metavar="PATH", help="capture folder, video file, or folder of videos")
+    parser.add_argument("path", type=input_path, metavar="PATH", help="capture folder, video file, or folder of videos")
     parser.add_argument(
         "overrides",
         nargs="*",
@@ -48,7 +48,7 @@ def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         help="keys of data, such as data.follow_links=true",
     )
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
-    parser.add_argument("--image", type=Path, metavar="FILE", help="draw cameras and points to this image file")
+    parser.add_argument("--image", type=output_path, metavar="FILE", help="draw cameras and points to this image file")
     parser.add_argument("--deep", action="store_true", help="decode every image in full (slow)")
     parser.set_defaults(run=run_inspect)
 
@@ -61,14 +61,14 @@ def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None
     )
     parser.add_argument(
         "images",
-        type=Path,
+        type=input_path,
         metavar="IMAGES",
         help="folder of photos, a video file, or folder of videos that ran at once",
     )
-    parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
+    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument("--mapper", choices=("auto", "global", "incremental"), default="auto", help="COLMAP's mapping")
-    parser.add_argument("--masks", type=Path, metavar="DIR", help="masks of the photos, white = keep")
+    parser.add_argument("--masks", type=input_path, metavar="DIR", help="masks of the photos, white = keep")
     parser.add_argument(
         "--frames", type=int, metavar="N", help="frames to take of a video (default 100; of each of several: up to 300)"
     )
@@ -93,12 +93,14 @@ def _add_motion(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         description="Read a motion, retarget it to the template if it has another skeleton, and write it as .npz in "
         "the layout of AMASS SMPL-X, y up.",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="AMASS or SMPL-X .npz, .bvh, .glb, .gltf, .vrma")
-    parser.add_argument("out", type=Path, metavar="OUT.npz", help="a new file")
+    parser.add_argument("file", type=input_path, metavar="FILE", help="AMASS or SMPL-X .npz, .bvh, .glb, .gltf, .vrma")
+    parser.add_argument("out", type=output_path, metavar="OUT.npz", help="a new file")
     parser.add_argument("--fps", type=float, metavar="F", help="resample to F frames per second (default: as in FILE)")
     parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")
     parser.add_argument("--clip", metavar="NAME", help="name of the animation if a glTF file has several")
-    parser.add_argument("--body", type=Path, metavar="BODY", help="body template file (default: the template of dyngs)")
+    parser.add_argument(
+        "--body", type=input_path, metavar="BODY", help="body template file (default: the template of dyngs)"
+    )
     parser.set_defaults(run=run_motion)
 
 
@@ -112,7 +114,7 @@ def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
         "walking person from all around, with exact body parameters.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
-    parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
+    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
     parser.add_argument(
         "--views", type=int, metavar="N", help="training views; for room and human: times (default 48, for human 12)"
@@ -268,6 +270,7 @@ def _summary(motion: Motion) -> str:
 def run_synth(arguments: argparse.Namespace) -> int:
     """Write the capture and print the command that trains on it."""
     from dyngs.data.synthetic import captures as synthetic
+    from dyngs.files.outputs import require_new_folder
 
     out: Path = arguments.out
     scene, size, seed = arguments.scene, arguments.size, arguments.seed
@@ -279,7 +282,7 @@ def run_synth(arguments: argparse.Namespace) -> int:
     if (arguments.varied or arguments.usual_clothes) and scene != "human":
         raise DyngsError("--varied and --usual-clothes are for the scene human only")
     cameras = 8 if arguments.cameras is None else arguments.cameras
-    synthetic.require_new_folder(out)
+    require_new_folder(out)
     if scene == "human":
         from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import data_section
+from dyngs.cli.arguments import data_section, input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
@@ -25,31 +25,35 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     )
     parser.add_argument(
         "capture",
-        type=Path,
+        type=input_path,
         metavar="CAPTURE",
         help="folder of a capture; or a video, or a folder of images, of one camera that stands",
     )
-    parser.add_argument("out", type=Path, metavar="OUT", help="a new folder")
+    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
     parser.add_argument(
-        "--keypoints", type=Path, metavar="PATH", help="key points: a folder of OpenPose files, or a COCO file"
+        "--keypoints", type=input_path, metavar="PATH", help="key points: a folder of OpenPose files, or a COCO file"
     )
-    parser.add_argument("--masks", type=Path, metavar="DIR", help="masks of the person (white), named as the images")
+    parser.add_argument(
+        "--masks", type=input_path, metavar="DIR", help="masks of the person (white), named as the images"
+    )
     parser.add_argument(
         "--background",
-        type=Path,
+        type=input_path,
         metavar="PATH",
         help="an image of the place without the person, or a folder of one for each camera: masks are made by it",
     )
     parser.add_argument(
         "--joints",
-        type=Path,
+        type=input_path,
         metavar="PATH",
         help="a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
     )
-    parser.add_argument("--body", type=Path, metavar="FILE", help="body file (SMPL, ...) that posed vertices belong to")
+    parser.add_argument(
+        "--body", type=input_path, metavar="FILE", help="body file (SMPL, ...) that posed vertices belong to"
+    )
     parser.add_argument(
         "--person",
-        type=Path,
+        type=input_path,
         metavar="PATH",
         help="a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found, by "
         "the avatar's silhouette if there is one",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyngs.cli.arguments import threads
+from dyngs.cli.arguments import output_path, threads
 from dyngs.errors import DyngsError
 
 
@@ -17,7 +17,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Ray trace a small moving scene, train on it, evaluate, render images and a video, write a .ply.",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("dyngs-demo"), metavar="DIR", help="output folder (default dyngs-demo)"
+        "--out", type=output_path, default=Path("dyngs-demo"), metavar="DIR", help="output folder (default dyngs-demo)"
     )
     parser.add_argument("--steps", type=int, default=3000, metavar="N", help="training steps (default 3000)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_device, computing_device, threads
+from dyngs.cli.arguments import add_device, computing_device, input_path, threads
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,7 +24,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="evaluate a run on held-out views",
         description="Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split).",
     )
-    parser.add_argument("run_dir", type=Path, metavar="RUN", help="run folder written by `dyngs train`")
+    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
     parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test", help="default test")
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")

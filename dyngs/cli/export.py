@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import is_avatar_file, print_notes, run_of_scene_file, scene_time
+from dyngs.cli.arguments import input_path, is_avatar_file, output_path, print_notes, run_of_scene_file, scene_time
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, known_suffix, print_redrawn
 from dyngs.errors import DyngsError
 
@@ -49,7 +49,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run_dir", type=Path, metavar="RUN", help="run folder, or an avatar file (.safetensors)")
+    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder, or an avatar file (.safetensors)")
     parser.add_argument(
         "--format",
         type=_format,
@@ -57,14 +57,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="file format (default: what the suffix of --out names, else ply)",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="PATH", help="file, or folder of a sequence (default: splats... in RUN)"
+        "--out", type=output_path, metavar="PATH", help="file, or folder of a sequence (default: splats... in RUN)"
     )
     when = parser.add_mutually_exclusive_group()
     when.add_argument("--time", type=scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
     parser.add_argument(
         "--motion",
-        type=Path,
+        type=input_path,
         metavar="FILE",
         help="motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma",
     )

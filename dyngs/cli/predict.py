@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dyngs.cli.arguments import input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
 
 _EPILOG = """\
@@ -28,9 +29,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("network", type=Path, metavar="NET_RUN", help="run folder of model.kind=human_predictor")
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture of a person")
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="new run folder")
+    parser.add_argument("network", type=input_path, metavar="NET_RUN", help="run folder of model.kind=human_predictor")
+    parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
+    parser.add_argument("--out", type=output_path, required=True, metavar="RUN", help="new run folder")
     parser.add_argument(
         "--views",
         type=parse_views,

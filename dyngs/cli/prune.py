@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_run_device, computing_device, run_device, threads
+from dyngs.cli.arguments import add_run_device, computing_device, input_path, output_path, run_device, threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run_dir", type=Path, metavar="RUN", help="run folder written by `dyngs train`")
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN2", help="folder of the new run")
+    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
+    parser.add_argument("--out", type=output_path, required=True, metavar="RUN2", help="folder of the new run")
     parser.add_argument(
         "--max-loss",
         type=_decibels,

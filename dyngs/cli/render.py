@@ -12,7 +12,10 @@ from dyngs.cli.arguments import (
     computing_device,
     frame_count,
     image_size,
+    input_path,
+    input_word,
     is_avatar_file,
+    output_path,
     print_notes,
     run_of_scene_file,
     scene_time,
@@ -50,16 +53,16 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "source", type=Path, metavar="RUN_OR_FILE", help="run folder, avatar file (.safetensors), or any 3DGS .ply"
-    )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the images")
+    source_help = "run folder, avatar file (.safetensors), or any 3DGS .ply"
+    parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help=source_help)
+    parser.add_argument("--out", type=output_path, metavar="DIR", help="folder for the images")
     cameras = parser.add_mutually_exclusive_group()
     cameras.add_argument(
         "--split", choices=("test", "val", "train", "pose"), help="render the views of this split (default: test)"
     )
     cameras.add_argument(
         "--path",
+        type=input_word,
         metavar="PATH",
         help="camera path: orbit (default for a file), spiral, along (as the capture was filmed), or a .json file",
     )
@@ -70,7 +73,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--view", metavar="NAME|N", help="without --path: render from the camera of this view (default: the first one)"
     )
     _add_person(parser)
-    parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video as well")
+    parser.add_argument("--video", type=output_path, metavar="FILE.mp4", help="write a video as well")
     parser.add_argument(
         "--frames", type=frame_count, metavar="N", help="number of frames of orbit, spiral and along (default 120)"
     )
@@ -105,7 +108,7 @@ def _add_person(parser: argparse.ArgumentParser) -> None:
     person = parser.add_mutually_exclusive_group()
     person.add_argument(
         "--motion",
-        type=Path,
+        type=input_path,
         metavar="FILE",
         help="motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma",
     )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_device, computing_device, threads
+from dyngs.cli.arguments import add_device, computing_device, input_word, output_path, threads
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
@@ -43,9 +43,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("target", metavar="RUN_OR_CONFIG", help="run folder, or a config to train first")
+    parser.add_argument(
+        "target", type=input_word, metavar="RUN_OR_CONFIG", help="run folder, or a config to train first"
+    )
     parser.add_argument("overrides", nargs="*", default=[], metavar="key=value", help="overrides of the config")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="output folder (default RUN/tradeoff)")
+    parser.add_argument("--out", type=output_path, metavar="DIR", help="output folder (default RUN/tradeoff)")
     parser.add_argument(
         "--vary",
         action="append",

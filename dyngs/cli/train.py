@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_run_device, computing_device, run_device
+from dyngs.cli.arguments import add_run_device, computing_device, input_path, run_device
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
 from dyngs.errors import DyngsError
@@ -62,7 +62,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument(
         "--resume",
-        type=Path,
+        type=input_path,
         metavar="RUN",
         help="continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one",
     )

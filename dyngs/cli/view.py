@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import threading
-from pathlib import Path
 
-from dyngs.cli.arguments import add_device, computing_device, threads
+from dyngs.cli.arguments import add_device, computing_device, input_path, threads
 from dyngs.errors import DyngsError
 
 _EPILOG = """\
@@ -31,11 +30,16 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("source", type=Path, metavar="RUN_OR_FILE", help="run folder, file, or a folder of runs")
+    parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help="run folder, file, or a folder of runs")
     add_serving_arguments(parser)
-    parser.add_argument("--motion", type=Path, metavar="PATH", help="motion file for a person, or a folder of them")
     parser.add_argument(
-        "--capture", type=Path, metavar="PATH", help="for a network of people: whom to predict, or a folder of people"
+        "--motion", type=input_path, metavar="PATH", help="motion file for a person, or a folder of them"
+    )
+    parser.add_argument(
+        "--capture",
+        type=input_path,
+        metavar="PATH",
+        help="for a network of people: whom to predict, or a folder of people",
     )
     parser.add_argument(
         "--up",

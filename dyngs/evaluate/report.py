@@ -31,6 +31,7 @@ from dyngs.human.motion.clip import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
+from dyngs.runs.inputs import inputs_of
 from dyngs.training.background import evaluation_background
 from dyngs.training.views import training_cameras
 
@@ -129,7 +130,7 @@ def evaluate_run(
         device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
     """
     draws_on = device_for(device)
-    _require_untrained(run_dir, split, refine_poses)
+    _require_possible(run_dir, split, refine_poses)
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
@@ -168,7 +169,8 @@ def evaluate_run(
     return report
 
 
-def _require_untrained(run_dir: Path, split: str, refine_poses: bool) -> None:
+def _require_possible(run_dir: Path, split: str, refine_poses: bool) -> None:
+    inputs_of(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(
             f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"

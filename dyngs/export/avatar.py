@@ -28,6 +28,7 @@ from dyngs.human.motion.clip import MotionClip
 from dyngs.human.motion.placement import rest_clip
 from dyngs.human.template.body_reader import template_path
 from dyngs.runs.checkpoint import LoadedRun, info_of
+from dyngs.runs.inputs import inputs_of
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 SUFFIX = ".safetensors"
@@ -70,6 +71,7 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         )
     if path.suffix.lower() != SUFFIX:
         raise DyngsError(f"{path}: an avatar is written as {SUFFIX}")
+    inputs_of(run).require_output(path)
     if scene.colour is not None:
         raise DyngsError("an avatar file holds harmonics, this run's colours are a network; train with colour.kind=sh")
     reference = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)

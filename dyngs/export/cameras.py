@@ -12,6 +12,7 @@ import numpy as np
 from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.files.write import atomic_file, write_text
+from dyngs.runs.inputs import inputs_of
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -32,6 +33,8 @@ def write_cameras(path: Path, capture: Capture, splits: Mapping[Split, Sequence[
     Raises:
         DyngsError: the folder cannot be written.
     """
+    for out in (path, path.with_name(POINTS_NAME)):
+        inputs_of(capture).require_output(out)
     folder = Path(os.path.abspath(path.parent))
     frames: list[dict[str, object]] = []
     content: dict[str, object] = {}

@@ -21,6 +21,7 @@ from dyngs.export.run_to_splats import AS_THEY_ARE, Part, Writing, scene_part, s
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.runs.checkpoint import LoadedRun
+from dyngs.runs.inputs import inputs_of
 from dyngs.splats.packing import logit
 from dyngs.splats.splat_file import SplatFile, drawable, unit_rotations
 
@@ -62,6 +63,7 @@ def write_moving(
     Raises:
         DyngsError: the package is missing, the part is empty, or the file cannot be written.
     """
+    inputs_of(run).require_output(path)
     model, delta = _packages(path)
     scene = scene_part(run.scene, part)
     splats = tuple(splats_at(run, scene, time, how) for time in times)

@@ -17,6 +17,7 @@ from dyngs.files.temporary import temporary_folder_beside
 from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import LoadedRun, load_run
+from dyngs.runs.inputs import inputs_of
 from dyngs.splats.formats import Written, turned_file, write_splats
 from dyngs.splats.splat_file import SplatFile
 
@@ -68,6 +69,7 @@ def write_run_splats(
     Raises:
         DyngsError: the part is empty, an unknown suffix, or the file cannot be written.
     """
+    inputs_of(run).require_output(path)
     return _write(run, scene_part(run.scene, part), path, time, how)
 
 
@@ -97,6 +99,9 @@ def write_run_sequence(
     """
     scene = scene_part(run.scene, part)
     names = frame_names(len(times), suffix)
+    inputs = inputs_of(run)
+    for path in (folder, *(folder / name for name in names)):
+        inputs.require_output(path)
     _require_no_others(folder, names, suffix)
     is_new = not folder.exists()
     staging = temporary_folder_beside(folder / "frames")

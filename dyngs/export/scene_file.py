@@ -16,6 +16,7 @@ from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
+from dyngs.runs.inputs import inputs_of
 from dyngs.storage.drawable import FIELD, drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
@@ -58,6 +59,7 @@ def write_scene_file(run_dir: Path, out: Path, max_change: float | None = None, 
             the file cannot be written. Nothing is written then.
     """
     config = load_resolved(run_dir)
+    inputs_of(run_dir).require_output(out)
     with folder_of_export(out, run_dir, config) as folder:
         checkpoint = latest_checkpoint(run_dir)
         scene = restored_scene(checkpoint, config.model)

@@ -20,6 +20,8 @@ from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 
 FOCAL_LENGTHS = (1e-6, 1e12)
 """Smallest and largest allowed, px; beyond them gradients leave the range of float32."""
+ROTATION_TOLERANCE = 0.01
+"""Largest entry of ``R^T R - I`` of a pose that is drawn; half precision rounds by a tenth of that."""
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
 """Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour models other than
@@ -262,7 +264,8 @@ def _checked(
 
 
 def _check_views(cameras: Cameras, background: Tensor | None) -> None:
-    check_finite({"cam_from_world": cameras.cam_from_world, "intrinsics": cameras.intrinsics})
+    check_poses(cameras.cam_from_world)
+    check_finite({"intrinsics": cameras.intrinsics})
     check_focal_lengths(cameras.intrinsics)
     if background is not None:
         check_finite({"background": background.to(cameras.intrinsics.dtype)})
@@ -280,6 +283,28 @@ def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
         fx, fy = (float(x) for x in focal[bad[0]])
         wanted = f"{name}: focal lengths must be positive, from {shortest:g} to {longest:g} px"
         raise DyngsError(f"{wanted}, but camera {int(bad[0])} has {fx:g} and {fy:g}")
+
+
+def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
+    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``.
+
+    Raises:
+        DyngsError: naming the first camera whose rotation is mirrored, scaled, sheared or zero.
+    """
+    poses = cam_from_world.detach().double()
+    rotations = poses[:, :3, :3]
+    unit = torch.eye(3, device=poses.device, dtype=poses.dtype)
+    error = (rotations.mT @ rotations - unit).abs().amax((1, 2))
+    x, y, z = rotations.unbind(2)
+    is_mirrored = ((x.roll(-1, 1) * y.roll(1, 1) - x.roll(1, 1) * y.roll(-1, 1)) * z).sum(1) < 0
+    fits = (error <= ROTATION_TOLERANCE) & ~is_mirrored & poses.isfinite().all(2).all(1)
+    bad = torch.nonzero(~fits)[:, 0]
+    if not len(bad):
+        return
+    check_finite({name: cam_from_world})
+    row = int(bad[0])
+    fault = "is mirrored" if is_mirrored[row] else f"differs from a rotation by {float(error[row]):.2g} (R^T R - I)"
+    raise DyngsError(f"{name}: the matrix of camera {row} {fault}; only the position may be scaled: export it again")
 
 
 def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
+from dyngs.files.outputs import Inputs
 from dyngs.files.write import to_uint8, write_image
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import psnr
@@ -26,6 +26,7 @@ from dyngs.output.contact_sheet import SheetRow, contact_sheet, depth_limits, de
 from dyngs.output.render_job import Frame, RenderJob, job_frames, render_frame
 from dyngs.output.video import VideoWriter
 from dyngs.runs.checkpoint import load_run
+from dyngs.runs.inputs import inputs_of
 
 _SHEET_ROWS = 12
 _DEPTH_SAMPLES = 8
@@ -74,7 +75,7 @@ def write_job_images(
     if output.depth and out_dir is not None:
         limits = _shared_depth_limits(job_frames(replace(job, path=_sample(job.path))))
     digits = max(4, len(str(len(job.path) - 1)))
-    with _FrameWriter(out_dir, output, job.protected, limits) as writer:
+    with _FrameWriter(out_dir, output, job.inputs, limits) as writer:
         for i, frame in enumerate(job_frames(job)):
             writer.write(f"frame_{i:0{digits}d}", frame)
             report("frames", i + 1, len(job.path))
@@ -107,6 +108,8 @@ def write_split_images(
     """
     run = load_run(run_dir)
     capture = read_capture(run.config.data)
+    inputs = inputs_of(run_dir, capture)
+    inputs.require_output(out_dir)
     views = split_views(capture, split)
     loader = ImageLoader(views, run.config.data)
     _, background = evaluation_background(run.config.data.background, capture.has_alpha)
@@ -114,7 +117,7 @@ def write_split_images(
     scene = scene_of_split(run, capture, split).to(device)
     shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
     rows: list[SheetRow] = []
-    with _FrameWriter(out_dir, output, files_of(capture)) as writer:
+    with _FrameWriter(out_dir, output, inputs) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             image = loader[i]
             frame = render_frame(scene, scene.moment(image.time), image.cameras, options, background)
@@ -126,14 +129,6 @@ def write_split_images(
                 rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), image.mask))
     writer.write_image(out_dir / "sheet.png", contact_sheet(rows))
     return writer.written
-
-
-def files_of(capture: Capture) -> frozenset[Path]:
-    """Return the paths of the images, masks and maps of a capture, with symbolic links resolved."""
-    views = [view for split in capture.splits.values() for view in split]
-    own = ("image_path", "mask_path", "depth_path", "motion_mask_path", "flow_path")
-    files = (path for view in views for name in own if (path := getattr(view, name)) is not None)
-    return frozenset(path.resolve() for path in files)
 
 
 def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
@@ -172,17 +167,20 @@ class _FrameWriter:
         self,
         out_dir: Path | None,
         output: OutputOptions,
-        protected: frozenset[Path],
+        inputs: Inputs,
         limits: tuple[float, float] | None = None,
     ) -> None:
         self.written: list[Path] = []
-        self._protected = protected
+        self._inputs = inputs
         self._out_dir, self._output, self._limits = out_dir, output, limits
         self._stack = ExitStack()
         self._video: VideoWriter | None = None
         self._size: tuple[int, ...] | None = None
 
     def __enter__(self) -> _FrameWriter:
+        for out in (self._out_dir, self._output.video):
+            if out is not None:
+                self._inputs.require_output(out)
         if self._output.video is not None:
             self._video = self._stack.enter_context(VideoWriter(self._output.video, fps=self._output.fps))
         return self
@@ -209,8 +207,7 @@ class _FrameWriter:
             self.write_image(self._out_dir / f"{stem}_depth.exr", frame.depth)
 
     def write_image(self, path: Path, pixels: np.ndarray) -> None:
-        if self._protected and path.resolve() in self._protected:
-            raise DyngsError(f"{path}: is an image of the capture and would be overwritten; give another --out")
+        self._inputs.require_output(path)
         write_image(path, pixels)
         self.written.append(path)
 

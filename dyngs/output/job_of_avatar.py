@@ -11,6 +11,7 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options
 from dyngs.export.avatar import read_avatar
+from dyngs.files.outputs import Inputs
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.output.animation import with_motion
@@ -53,7 +54,8 @@ def job_of_avatar(file: Path, options: RenderJobOptions) -> RenderJob:
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or run.info.background, has_alpha=True)
-    return RenderJob(scene, path, render_options(run.config.model), background)
+    inputs = Inputs((file, options.motion, None if options.path is None else path_file(options.path)))
+    return RenderJob(scene, path, render_options(run.config.model), background, inputs=inputs)
 
 
 def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: RenderJobOptions) -> CameraPath:

@@ -10,6 +10,7 @@ import numpy as np
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background
+from dyngs.files.outputs import Inputs
 from dyngs.output.camera_paths import CameraPath, read_path
 from dyngs.output.orbit import frame_orbit_for_points, spiral_path
 from dyngs.output.render_job import (
@@ -53,7 +54,7 @@ def job_of_ply(file: Path, options: RenderJobOptions) -> RenderJob:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or "black", has_alpha=False)
     scene = StaticScene(gaussians=splat.gaussians)
-    return RenderJob(scene, path, splat_options(splat), background, splat.notes)
+    return RenderJob(scene, path, splat_options(splat), background, splat.notes, Inputs((file, named)))
 
 
 def _around_points(splat: SplatFile, options: RenderJobOptions) -> Cameras:

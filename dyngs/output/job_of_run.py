@@ -19,11 +19,12 @@ from dyngs.human.avatar.scene import avatar_of
 from dyngs.output.along import path_along
 from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.output.camera_paths import CameraPath, read_path, static_path, with_times
-from dyngs.output.image_files import file_stems, files_of
+from dyngs.output.image_files import file_stems
 from dyngs.output.orbit import orbit_of, orbit_path, spiral_path
 from dyngs.output.person_orbit import person_orbit
 from dyngs.output.render_job import DEFAULT_FRAMES, RenderJob, RenderJobOptions, axis, path_file, resize_cameras
 from dyngs.runs.checkpoint import LoadedRun, load_run
+from dyngs.runs.inputs import inputs_of
 
 
 def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
@@ -53,9 +54,8 @@ def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     if fps is not None:
         path = replace(path, fps=fps)
-    return RenderJob(
-        run.scene, path, render_options(run.config.model), background, path.notes + notes, files_of(capture)
-    )
+    inputs = inputs_of(run_dir, capture, options.motion, path_file(options.path or "orbit"))
+    return RenderJob(run.scene, path, render_options(run.config.model), background, path.notes + notes, inputs)
 
 
 def cameras_for_paths(capture: Capture, data: DataConfig) -> Cameras:

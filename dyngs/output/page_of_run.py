@@ -24,6 +24,7 @@ from dyngs.output.job_of_run import cameras_for_paths, view_to_show
 from dyngs.output.orbit import frame_orbit_for_points
 from dyngs.output.render_job import RenderJobOptions, axis
 from dyngs.runs.checkpoint import LoadedRun, load_run
+from dyngs.runs.inputs import inputs_of
 
 MOST_VIEWS = 24
 """Cameras of the capture that a page offers, evenly chosen."""
@@ -58,6 +59,7 @@ def write_run_page(
     Raises:
         DyngsError: no such run or file, a motion for a scene that is no person, or the file cannot be written.
     """
+    inputs_of(source, options.motion).require_output(path)
     title = options.title or source.resolve().stem
     if source.is_file():
         return _avatar_page(source, path, replace(options, title=title)), ()

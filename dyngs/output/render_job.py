@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import NOTHING_READ, Inputs
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import Moment, Scene
 from dyngs.output.camera_paths import CameraPath
@@ -47,7 +48,7 @@ class RenderJob:
         options: render options of the scene.
         background: (3,) colour; None is black.
         notes: messages about defaults that were chosen.
-        protected: files of the capture, which must not be overwritten.
+        inputs: what no output may replace.
     """
 
     scene: Scene
@@ -55,7 +56,7 @@ class RenderJob:
     options: RenderOptions = DEFAULT_OPTIONS
     background: Tensor | None = None
     notes: tuple[str, ...] = ()
-    protected: frozenset[Path] = frozenset()
+    inputs: Inputs = NOTHING_READ
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from dyngs.metrics import load_lpips
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.inputs import inputs_of
 from dyngs.tradeoff.measure import measure_quality, render_options_of, time_interleaved
 from dyngs.tradeoff.measurements import Measurement, read_measurement, write_measurement
 from dyngs.tradeoff.memory import MemoryMeter
@@ -136,6 +137,7 @@ def sweep(
     Raises:
         DyngsError: no such run or split, or the folder holds measurements of another run.
     """
+    inputs_of(runs.run_dir).require_output(runs.out)
     with MemoryMeter() as meter:
         session = _Session(runs, plan, meter, log)
         _require_same_source(runs, plan, is_first=group.is_first)

@@ -12,8 +12,11 @@ from dyngs.capture import unposed
 from dyngs.capture.multi_video.estimate import VideosOptions, VideosResult
 from dyngs.capture.sfm import SfmOptions, SfmResult
 from dyngs.capture.unposed import with_poses
-from dyngs.config import DataConfig
+from dyngs.cli import main
+from dyngs.config import Config, DataConfig
+from dyngs.config.io import save_config
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import SOURCES_NAME
 from dyngs.files.temporary import cache_folder
 from dyngs.files.write import write_image
 from dyngs.output.video import VideoWriter
@@ -89,6 +92,21 @@ def test_a_video_gets_poses_and_has_times(tmp_path: Path, asked: list[Path]) -> 
             video.add(np.full((16, 16, 3), 50 * i, np.uint8))
     with_poses(DataConfig(root=tmp_path / "clip.mp4"), needs_times=True, say=lambda _: None)
     assert asked == [tmp_path / "clip.mp4"]
+
+
+def test_no_output_replaces_the_video_that_a_run_is_made_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The run knows only the folder in the cache, which names the video."""
+    video = tmp_path / "clip.mp4"
+    with VideoWriter(video, fps=10) as writer:
+        writer.add(np.zeros((16, 16, 3), np.uint8))
+    before = video.read_bytes()
+    for _ in ("estimated", "of before"):
+        data = with_poses(DataConfig(root=video), say=lambda _: None)
+        save_config(Config(data=data), tmp_path / "run" / "config.yaml")
+        assert main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
+        assert "clip.mp4: is the file that is read" in capsys.readouterr().err
+        (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
+    assert video.read_bytes() == before
 
 
 def test_several_videos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:

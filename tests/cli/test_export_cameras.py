@@ -70,5 +70,7 @@ def test_cameras_of_the_capture_are_not_written_over(
     refined: Path, still: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(refined), "--format", "cameras", "--out", str(still)]) == 2
+    assert "is the folder that is read" in capsys.readouterr().err
+    assert main(["export", str(refined), "--format", "cameras", "--out", str(still / "transforms.json")]) == 2
     assert "stand in for the cameras of the capture" in capsys.readouterr().err
     assert not (still / "transforms.json").exists()

@@ -296,6 +296,25 @@ def test_compiles_into_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
 VERBS = [render, contributions, sensitivities]
 
 
+NO_ROTATIONS = {
+    "mirrored": (torch.diag(torch.tensor([1.0, 1.0, -1.0])), "is mirrored"),
+    "scaled": (2 * torch.eye(3), "differs from a rotation by 3"),
+    "sheared": (torch.tensor([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "differs from a rotation by 0.1"),
+    "zero": (torch.zeros(3, 3), "differs from a rotation by 1"),
+}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("fault", NO_ROTATIONS)
+def test_a_pose_that_is_no_rotation_is_refused(verb: Callable[..., object], fault: str) -> None:
+    scene = random_scene()
+    matrix, reason = NO_ROTATIONS[fault]
+    scene.cam_from_world[1, :3, :3] = matrix.to(scene.cam_from_world)
+    with pytest.raises(DyngsError, match=rf"cam_from_world: the matrix of camera 1 {reason}") as caught:
+        verb(scene.gaussians, scene.cameras)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("focal", [0.0, -20.0, 1e-7, 1e13])
 def test_focal_lengths_that_show_nothing_are_refused(verb: Callable[..., object], focal: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,11 +21,13 @@ from dyngs.data.images.video import read_frames
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import Inputs
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.output.camera_paths import static_path
-from dyngs.output.image_files import OutputOptions, file_stems, files_of, write_job_images, write_split_images
+from dyngs.output.image_files import OutputOptions, file_stems, write_job_images, write_split_images
 from dyngs.output.render_job import RenderJob, job_frames
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
+from dyngs.runs.inputs import inputs_of
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -143,12 +146,16 @@ def test_images_of_the_capture_are_not_replaced(tmp_path) -> None:
     before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     (tmp_path / "link").symlink_to(folder)
     for out in (folder, tmp_path / "link"):
-        with pytest.raises(DyngsError, match=r"image of the capture.*--out"):
+        with pytest.raises(DyngsError, match="exists and lies in"):
             write_split_images(run_dir, "test", out)
-    job = balls_job(cameras_around(1))
-    with pytest.raises(DyngsError, match="image of the capture"):
-        write_job_images(replace(job, protected=frozenset({tmp_path / "new" / "frame_0000.png"})), tmp_path / "new")
-    assert files_of(read_capture(load_resolved(run_dir).data)) >= {view.image_path.resolve() for view in views}
+    (tmp_path / "links").mkdir()
+    os.link(views[0].image_path, tmp_path / "links" / "frame_0000.png")
+    job = replace(balls_job(cameras_around(1)), inputs=inputs_of(read_capture(load_resolved(run_dir).data)))
+    with pytest.raises(DyngsError, match=r"holds frame_0000\.png, a link to"):
+        write_job_images(job, tmp_path / "links")
+    job = replace(job, inputs=Inputs([tmp_path / "links" / "frame_0000.png"]))
+    with pytest.raises(DyngsError, match="is the file that is read"):
+        write_job_images(job, tmp_path / "links")
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from splat_scenes import cameras_turned, cloud, psnr, readable, seen
@@ -214,3 +217,144 @@ def test_quaternions_need_not_be_of_unit_length(tmp_path: Path) -> None:
     for kind in [kind for kind in readable() if kind.name != "usd"]:
         back = read_splats(write_splats(file_of(kind, tmp_path), SplatFile(replace(scene, quats=scene.quats * 3))).path)
         assert psnr(seen(back.gaussians), seen(scene)) > LEAST_PSNR[kind.name]
+
+
+KNOWN = Path(__file__).with_name("known")
+"""Files of other programs; ``README.md`` there says how they were made."""
+THREE = {
+    "means": [[0.5, -1.25, 2.0], [-3.75, 0.125, 1.0], [1.0, 2.5, -0.75]],
+    "quats": [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.5, 0.5], [0.8, 0.0, -0.6, 0.0]],
+    "log_scales": [[-3.0, -2.5, -4.0], [-5.0, -1.0, -2.0], [-2.25, -2.25, -6.5]],
+    "logit_opacities": [1.5, -2.0, 0.25],
+    "sh": [
+        [[0.9, -0.3, 0.1], [0.25, 0.5, -0.5], [-0.125, 0.375, 0.125], [0.0, -0.25, 0.25]],
+        [[-1.2, 0.6, 1.4], [-0.25, 0.0, 0.375], [0.25, -0.125, -0.375], [0.5, 0.125, 0.0]],
+        [[0.0, 1.0, -1.0], [0.0, 0.25, -0.125], [0.0, 0.5, 0.0], [0.125, -0.5, 0.25]],
+    ],
+}
+"""The Gaussians in ``three.ply``, -y up."""
+OPACITY_BYTES = [208, 30, 143]  # 255 / (1 + exp(-logit)), rounded
+COLOUR_BYTES = [[162, 116, 131], [82, 150, 181], [128, 166, 89]]  # of .spz: 38.25 sh + 127.5
+TURNED = torch.tensor([1.0, -1.0, -1.0])
+"""About x by half a turn, as between viewers with -y up and y up."""
+
+
+def three() -> Gaussians:
+    return Gaussians(**{name: torch.tensor(values) for name, values in THREE.items()})
+
+
+def exactly(found: torch.Tensor, wanted: torch.Tensor, tolerance: float = 1e-6) -> None:
+    torch.testing.assert_close(found, wanted, rtol=0, atol=tolerance)
+
+
+def up_to_sign(found: torch.Tensor, wanted: torch.Tensor, tolerance: float) -> None:
+    exactly((found * wanted).sum(1).abs(), torch.ones(len(found)), tolerance)
+
+
+def test_a_ply_of_another_program() -> None:
+    splat = read_splats(KNOWN / "three.ply")
+    assert splat.up == "-y"
+    for name, values in THREE.items():
+        exactly(getattr(splat.gaussians, name), torch.tensor(values))
+
+
+@pytest.mark.parametrize("name", ["three.spz", "three_v4.spz"])
+def test_an_spz_of_another_program(name: str) -> None:
+    """Its bytes stand for just these values; those of the harmonics are multiples of an eighth, and exact."""
+    if name == "three_v4.spz":
+        pytest.importorskip("zstandard")
+    found, wanted = read_splats(KNOWN / name).gaussians, three()
+    exactly(found.means, wanted.means * TURNED)
+    exactly(found.log_scales, wanted.log_scales)
+    opacity = torch.tensor(OPACITY_BYTES) / 255
+    exactly(found.opacities, opacity)
+    exactly(found.sh[:, 0], (torch.tensor(COLOUR_BYTES) / 255 - 0.5) / 0.15, 1e-5)
+    # of degree 1: -y, z and -x of the direction from the camera
+    exactly(found.sh[:, 1:], wanted.sh[:, 1:] * torch.tensor([-1.0, -1.0, 1.0])[:, None])
+    w, x, y, z = wanted.quats.unbind(1)
+    up_to_sign(found.quats, torch.stack([w, x, -y, -z], dim=1), 2e-5)
+
+
+def test_an_spz_is_written_as_by_another_program(tmp_path: Path) -> None:
+    """The same bytes for opacities, colours, scales and harmonics; centres have four more bits."""
+    splat = SplatFile(three(), up="-y")
+    written = write_splats(tmp_path / "ours.spz", upright(splat, None, tmp_path / "ours.spz")).path
+    ours, theirs = (gzip.decompress(path.read_bytes()) for path in (written, KNOWN / "three.spz"))
+    assert ours[:12] == theirs[:12]
+    assert (ours[13], theirs[13]) == (16, 12)
+    bits = [
+        [int.from_bytes(data[i : i + 3], "little", signed=True) / 2 ** data[13] for i in range(16, 43, 3)]
+        for data in (ours, theirs)
+    ]
+    assert bits[0] == bits[1] == (three().means * TURNED).flatten().tolist()
+    assert list(ours[43:46]) == OPACITY_BYTES
+    assert ours[46:55] == bytes(value for colour in COLOUR_BYTES for value in colour)
+    assert list(ours[55:64]) == [112, 120, 96, 80, 144, 128, 124, 124, 56]  # 16 (log scale + 10)
+    assert ours[43:64] == theirs[43:64]
+    assert ours[76:] == theirs[76:]
+
+
+def test_a_splat_byte_by_byte(tmp_path: Path) -> None:
+    """By the description of antimatter15's format; ``splat-transform`` reads this very file as the values below."""
+    rows = (
+        "0000003f0000a0bf00000040 86ed4b3d2e1ca83dae0a963c c06a87d0 ff808080",
+        "000070c00000003e0000803f ffc9dc3bb25abc3e55950a3e 29abe41e c040c0c0",
+        "0000803f00002040000040bf 8cdbd73d8cdbd73d0c0fc53a 80c7388f e6803380",
+    )
+    content = bytes.fromhex("".join(rows))
+    written = write_splats(tmp_path / "ours.splat", SplatFile(three(), up="-y"), sh_degree=0).path
+    assert written.read_bytes() == content
+    found, wanted = read_splats(written).gaussians, three()
+    exactly(found.means, wanted.means)
+    exactly(found.log_scales, wanted.log_scales)
+    exactly(found.logit_opacities, torch.tensor([1.4873905, -2.0149031, 0.2443458]), 1e-5)
+    colours = [
+        [0.8966531, -0.2988844, 0.1042620],
+        [-1.2024883, 0.6047195, 1.3971107],
+        [0.0069508, 0.9939643, -0.9939643],
+    ]
+    exactly(found.sh[:, 0], torch.tensor(colours), 1e-5)
+    up_to_sign(found.quats, wanted.quats, 1e-4)
+
+
+def test_a_glb_of_another_program() -> None:
+    """It stands on its side: half a turn about z. Colours are those of the harmonics, whatever ``COLOR_0`` says."""
+    found, wanted = read_splats(KNOWN / "three.glb").gaussians, three()
+    exactly(found.means, wanted.means * torch.tensor([-1.0, -1.0, 1.0]))
+    exactly(found.log_scales, wanted.log_scales)
+    exactly(found.logit_opacities, wanted.logit_opacities)
+    exactly(found.sh, wanted.sh[:, :1])
+    w, x, y, z = wanted.quats.unbind(1)
+    up_to_sign(found.quats, torch.stack([-z, -y, x, w], dim=1), 1e-6)
+
+
+def test_a_glb_is_written_as_by_another_program(tmp_path: Path) -> None:
+    """The same attributes; but ``COLOR_0`` is linear, as glTF has it (that program writes sRGB there)."""
+    path = write_splats(tmp_path / "ours.glb", SplatFile(three()), sh_degree=0).path
+    ours, theirs = attributes(path), attributes(KNOWN / "three.glb")
+    assert ours.keys() == theirs.keys()
+    own = "KHR_gaussian_splatting"
+    for name in (f"{own}:SCALE", f"{own}:OPACITY", f"{own}:SH_DEGREE_0_COEF_0"):
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=2e-7)  # one unit of float32
+    np.testing.assert_allclose(ours[f"{own}:ROTATION"], np.array(THREE["quats"])[:, [1, 2, 3, 0]], atol=1e-7)
+    srgb = theirs["COLOR_0"] / 255
+    assert srgb[2, 2].round(3) == 0.220  # 0.5 - 0.2821: known in linear light as 0.039
+    linear = [[0.52859, 0.14390, 0.24109], [0.02235, 0.40545, 0.77742], [0.21404, 0.57392, 0.03896]]
+    np.testing.assert_allclose(ours["COLOR_0"][:, :3], linear, atol=1e-5)
+    np.testing.assert_allclose(((srgb[:, :3] + 0.055) / 1.055) ** 2.4, linear, atol=3e-3)  # theirs has 8 bits
+    np.testing.assert_allclose(ours["COLOR_0"][:, 3], [0.81757, 0.11920, 0.56218], atol=1e-5)
+
+
+def attributes(path: Path) -> dict[str, np.ndarray]:
+    """The numbers of the first primitive of a .glb, by a reader of a few lines."""
+    data = path.read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + size])
+    found = {}
+    for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = document["accessors"][index]
+        start = 28 + size + document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        count = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        kind = {5121: "u1", 5126: "<f4"}[accessor["componentType"]]
+        found[name] = np.frombuffer(data, kind, accessor["count"] * count, start).reshape(-1, count)
+    return found

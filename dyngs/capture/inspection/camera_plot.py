@@ -9,6 +9,7 @@ import numpy as np
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import inverse_rigid, pose_fault
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import Inputs
 from dyngs.files.write import write_image
 
 BACKGROUND = (24, 26, 30)
@@ -21,6 +22,7 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
     Frusta of training cameras are orange, of validation green, of test and new poses blue; points have their colours.
     Up is the mean of the cameras' up axes. Points far beyond the cameras, and views without a rigid pose, are left out.
     """
+    Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
     usable = [(split, view) for split, view in views if pose_fault(view) is None]
     if not usable:

@@ -39,6 +39,7 @@ from dyngs.data.times import Taken, taken_frames, write_seconds
 from dyngs.errors import DyngsError
 from dyngs.files.containment import MAX_MEGAPIXELS, images_up_to, staying_within
 from dyngs.files.fields import first_few
+from dyngs.files.outputs import require_new_folder
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import write_image, write_text
 
@@ -174,8 +175,7 @@ def poses_of_videos(
     Raises:
         DyngsError: a camera that moves, poses or offsets that cannot be found, with what to do; an ``out`` in use.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DyngsError(f"{out} exists already; name a new folder for the poses")
+    require_new_folder(out)
     work = temporary_folder_beside(out)
     try:
         with staying_within(source, options.follow_links), images_up_to(options.max_megapixels):

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View
-from dyngs.data.geometry import checked_pose, match_size, pinhole_matrix, repair_warning, rescale_warning
+from dyngs.data.geometry import (
+    ROTATION_TOLERANCE,
+    checked_pose,
+    match_size,
+    pinhole_matrix,
+    repair_warning,
+    rescale_warning,
+)
 from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.transforms import view_name
 from dyngs.data.times import read_seconds
@@ -78,7 +85,11 @@ def read_colmap(root: Path) -> Capture:
     for image in posed:
         where = f"{folder}, image {image.name}"
         camera = model.cameras[image.camera_id]
-        pose, repaired[where] = checked_pose(np.asarray(image.cam_from_world().matrix()), where)
+        found = image.cam_from_world()
+        length = float(np.linalg.norm(found.rotation.quat))
+        if not abs(length - 1) <= ROTATION_TOLERANCE:  # COLMAP takes zeros for no rotation
+            raise DyngsError(f"{where}: the quaternion of its rotation has length {length:.6g}, not 1; export it again")
+        pose, repaired[where] = checked_pose(np.asarray(found.matrix()), where)
         intrinsics, lens = pinhole_and_lens(camera, where)
         path = root / "images" / image.name
         header = header_if_readable(path)

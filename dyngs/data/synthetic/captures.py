@@ -13,6 +13,7 @@ from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, is_seen, render
 from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import new_capture
 from dyngs.files.write import write_image, write_text
 
 
@@ -79,7 +80,10 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
     """Write images of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
 
     Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA, straight alpha, sRGB) for
-    every split with images. Each file is written atomically, the JSON last.
+    every split with images. The folder appears when it is complete.
+
+    Raises:
+        DyngsError: ``out`` holds something already, or cannot be written.
     """
     scene = still_life()
     splits = {
@@ -87,9 +91,10 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
         "val": orbit_cameras(options.num_val, options.distance, elevation_deg=45.0, start_deg=10.0),
         "test": orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0),
     }
-    for split, poses in splits.items():
-        shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
-        _write_split(out, split, shots, lambda _: scene, options)
+    with new_capture(out) as started:
+        for split, poses in splits.items():
+            shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            _write_split(started, split, shots, lambda _: scene, options)
     return out
 
 
@@ -110,23 +115,13 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
     scene_at(name, 0.0)
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic capture needs size, num_times, num_cameras and samples of at least 1")
-    require_new_folder(out)
     splits = _room_shots(options) if name == "room" else _teleporting_shots(options)
-    for split, shots in splits.items():
-        _write_split(out, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options)
     taken = [(shot.name, shot.time or 0.0, shot.world_from_cam) for shots in splits.values() for shot in shots]
-    write_true_tracks(out, true_tracks(lambda time: scene_at(name, time), taken, options.seed))
+    with new_capture(out) as started:
+        for split, shots in splits.items():
+            _write_split(started, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options)
+        write_true_tracks(started, true_tracks(lambda time: scene_at(name, time), taken, options.seed))
     return out
-
-
-def require_new_folder(out: Path) -> None:
-    """Check that ``out`` does not exist or is an empty folder.
-
-    Raises:
-        DyngsError: it holds something or is a file.
-    """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DyngsError(f"{out} exists already; name a new folder for the capture")
 
 
 def _write_split(

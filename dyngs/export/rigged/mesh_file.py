@@ -32,6 +32,7 @@ from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import load_template
 from dyngs.runs.checkpoint import LoadedRun
+from dyngs.runs.inputs import inputs_of
 
 SUFFIX = ".glb"
 _FINER = 4
@@ -81,6 +82,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
     scene, body = person_and_template(run, "--format mesh")
     if path.suffix.lower() != SUFFIX:
         raise DyngsError(f"{path}: a mesh is written as {SUFFIX}; give --out {path.with_suffix(SUFFIX).name}")
+    inputs_of(run).require_output(path)
     with torch.no_grad():
         vertices = rest_vertices(scene, body)
         normals = anchor_normals(scene.anchors, body, vertices)

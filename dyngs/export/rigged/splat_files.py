@@ -24,6 +24,7 @@ from dyngs.human.avatar.anchors import heaviest_joints
 from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.runs.checkpoint import LoadedRun
+from dyngs.runs.inputs import inputs_of
 from dyngs.splats.gltf import EXTENSION, add_gaussians
 from dyngs.splats.ply import write_ply
 
@@ -60,6 +61,7 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
         raise DyngsError(f"{path}: joints are written as {' or '.join(SUFFIXES)}; give --out with one of these")
     if suffix == ".ply" and played is not None:
         raise DyngsError("--motion does not go with --joints in a .ply, which shows the rest pose; write a .glb")
+    inputs_of(run).require_output(path)
     vertices = rest_vertices(scene, body)
     rig = rig_of(scene, vertices)
     gaussians, notes = scene.gaussians, ()

@@ -23,9 +23,9 @@ from dyngs.data.geometry import opengl_from_cam
 from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading
+from dyngs.files.outputs import require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.data.synthetic.captures import require_new_folder
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import new_capture
 from dyngs.files.write import write_image, write_text
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
@@ -99,7 +99,6 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
         raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
     if min(options.num_new, options.num_test, options.seed) < 0:
         raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
-    require_new_folder(out)
     body, betas = _person(options.body_seed)
     outfit = random_outfit(options.seed, options.usual_clothes)
     clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
@@ -108,13 +107,14 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     clips = {"train": _clip(body, options.num_frames, options.clip_seed, 0)}
     if options.num_new and test:
         clips["pose"] = _clip(body, options.num_new, options.clip_seed, 1)
-    for name, clip in clips.items():
-        motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
-        meshes = list(_posed_meshes(clothed, motion, texture))
-        splits = {"train": train, "test": test} if name == "train" else {"pose": test}
-        for split, cameras in splits.items():
-            _write_split(out, split, meshes, cameras, options)
-        write_amass(motion, out / f"body_{name}.npz", shape_space="smpl" if options.body_seed is None else "anny")
+    with new_capture(out) as started:
+        for name, clip in clips.items():
+            motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
+            meshes = list(_posed_meshes(clothed, motion, texture))
+            splits = {"train": train, "test": test} if name == "train" else {"pose": test}
+            for split, cameras in splits.items():
+                _write_split(started, split, meshes, cameras, options)
+            write_amass(motion, started / f"body_{name}.npz", "smpl" if options.body_seed is None else "anny")
     return out
 
 

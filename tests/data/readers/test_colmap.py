@@ -219,3 +219,19 @@ def test_listed_images_are_for_testing(tmp_path: Path) -> None:
     assert [view.image_path for view in capture.splits["test"]] == [images / names[1]]
     assert len(capture.splits["train"]) == len(names) - 1
     assert any("1 listed images have no pose, first nowhere.png" in line for line in capture.warnings)
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 3.0])
+def test_a_quaternion_that_is_no_rotation(tmp_path: Path, factor: float) -> None:
+    """COLMAP itself would take zeros for the pose without any rotation."""
+    root = write_colmap(tmp_path / "text", "txt")
+    path = root / "sparse/0/images.txt"
+    rows = [line.split(" ") for line in path.read_text().splitlines()]
+    row = next(i for i, words in enumerate(rows) if words[-1] == "right/02.jpg")
+    quaternion = [1.0, 0.0, 0.0, 0.0]  # of any length a rotation for COLMAP
+    rows[row][1:5] = [str(factor * value) for value in quaternion]
+    path.write_text("\n".join(" ".join(words) for words in rows) + "\n")
+    for name in ("rigs.txt", "frames.txt"):
+        (root / "sparse/0" / name).unlink(missing_ok=True)
+    with pytest.raises(DyngsError, match=rf"right/02.jpg: the quaternion of its rotation has length {factor:g}, not 1"):
+        read_colmap(root)

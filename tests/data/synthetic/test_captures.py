@@ -32,6 +32,7 @@ from dyngs.data.synthetic.captures import (
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, render_movers
 from dyngs.data.synthetic.scenes import SceneName, scene_at
 from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
 
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
 TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_val=2, num_cameras=3, samples=1)
@@ -182,6 +183,28 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path) ->
 
 
 # ------------------------------------------------------------------------------------------------ dyngs data synth
+
+
+@pytest.mark.parametrize("scene", SYNTHETIC_SCENES)
+def test_an_interrupted_command_leaves_nothing_and_may_be_repeated(
+    scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["data", "synth", scene, str(tmp_path / "out"), "--size", "8", "--views", "2"]
+    calls: list[Path] = []
+
+    def interrupted(path: Path, pixels: np.ndarray) -> None:
+        calls.append(path)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        write_image(path, pixels)
+
+    for module in ("dyngs.data.synthetic.captures", "dyngs.human.synthetic.capture"):
+        monkeypatch.setattr(f"{module}.write_image", interrupted)
+    assert main(words) == 130
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    assert main(words) == 0
+    assert "written: " in capsys.readouterr().out
 
 
 def test_the_command_knows_all_scenes() -> None:

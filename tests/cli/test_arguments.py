@@ -1,0 +1,157 @@
+"""Arguments that name files: every command says which it reads and which it writes, and no output replaces an input.
+
+Both tests walk the parser, so that a new command, or a new argument, cannot forget it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dyngs.cli import main, make_parser
+from dyngs.cli.arguments import input_path, input_word, output_path
+from dyngs.config.io import RESOLVED_NAME, load_config, packaged_preset, save_config
+
+INPUTS, OUTPUT = (input_path, input_word), output_path
+WORDS = {
+    "data fit": {"overrides"},
+    "data inspect": {"overrides", "format"},
+    "data motion": {"clip"},
+    "data sfm": {"overrides", "start"},
+    "train": {"overrides", "host"},
+    "view": {"host"},
+    "prune": {"overrides", "prune", "masks", "steps"},
+    "render": {"times", "view"},
+    "export": {"times"},
+    "tradeoff": {"overrides", "vary", "require", "minimize", "maximize"},
+    "bench deform": {"kind"},
+    "config": {"overrides"},
+    "docs": {"topic"},
+    "completion": {"line"},
+}
+"""Arguments that are plain words, no paths; the paths among overrides are found by their keys."""
+
+
+def commands(parser: argparse.ArgumentParser, name: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """Every command with arguments of its own."""
+    inner = [action for action in parser._actions if action.nargs == argparse.PARSER]
+    if not inner:
+        yield name, parser
+    for action in inner:
+        for word, one in dict(action.choices or {}).items():  # type: ignore[call-overload]
+            yield from commands(one, f"{name} {word}".strip())
+
+
+COMMANDS = dict(commands(make_parser()))
+WRITING = [(n, a.dest) for n, parser in COMMANDS.items() for a in parser._actions if a.type is OUTPUT]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_argument_says_whether_it_names_what_is_read_or_written(name: str) -> None:
+    for action in COMMANDS[name]._actions:
+        assert action.type is not Path, f"{action.dest} of {name}: say input_path or output_path"
+        if action.type is None and action.nargs != 0 and action.choices is None:
+            assert action.dest in WORDS.get(name, ()), f"{action.dest} of {name}: a word, or input_path or output_path?"
+
+
+@pytest.fixture
+def known(tmp_path: Path) -> dict[str, Path]:
+    """A capture, a run trained on it, and a file."""
+    capture, run, file = tmp_path / "capture", tmp_path / "runs" / "a", tmp_path / "motion.npz"
+    (capture / "images").mkdir(parents=True)
+    for name in ("1.jpg", "2.jpg"):
+        (capture / "images" / name).write_text(name)
+    file.write_text("a motion")
+    config = load_config(packaged_preset("static"), [f"data.root={capture}"])
+    save_config(config, run / RESOLVED_NAME)
+    (run / "checkpoints").mkdir()
+    (run / "checkpoints" / "step_0000010.safetensors").write_text("a model")
+    return {"capture": capture, "run": run, "file": file}
+
+
+def read_of(known: dict[str, Path], kind: str) -> list[Path]:
+    """What is read of it, and may not be replaced."""
+    capture, run = known["capture"], known["run"]
+    own = [run / RESOLVED_NAME, run / "checkpoints" / "step_0000010.safetensors"]
+    below = [capture, capture / "images", capture / "images" / "1.jpg"]
+    return {"capture": below, "run": own + below, "file": [known["file"]]}[kind]
+
+
+def names_of(path: Path, folder: Path) -> list[Path]:
+    """The path, spelled in another way, and links to it."""
+    folder.mkdir(parents=True)
+    (folder / "symbolic").symlink_to(path)
+    if path.is_file():
+        os.link(path, folder / "hard")
+    return [path, path.parent / ".." / path.parent.name / path.name, *folder.iterdir()]
+
+
+def line_of(name: str, output: str, read: Path, out: Path) -> list[str] | None:
+    """A command line that reads ``read`` by all of its arguments and writes ``out``; None if it reads nothing."""
+    positional, options = list[str](), list[str]()
+    found = [action for action in COMMANDS[name]._actions if action.type in INPUTS]
+    for action in COMMANDS[name]._actions:
+        if action.dest == output or action in found:
+            value = str(out if action.dest == output else read)
+            if action.option_strings:
+                options += [action.option_strings[0], value]
+            else:
+                positional.append(value)
+        elif action.choices and not action.option_strings:
+            positional.append(str(next(iter(action.choices))))
+        elif action.required:
+            options += [action.option_strings[0], str(out.with_name("unused"))]
+    return [*name.split(), *positional, *options] if found else None
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def require_refused(line: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(line) == 2, line
+    captured = capsys.readouterr()
+    assert captured.err.startswith("dyngs: error: "), line
+    assert captured.err.count("\n") == 1, line
+    assert "is read" in captured.err, line
+    assert captured.out == "", line
+
+
+def test_the_walk_finds_the_commands_that_write() -> None:
+    names = {name for name, _ in WRITING}
+    assert names >= {"export", "render", "convert", "prune", "predict", "tradeoff", "data sfm", "bench rasterize"}
+
+
+@pytest.mark.parametrize("kind", ["capture", "run", "file"])
+@pytest.mark.parametrize(("name", "output"), WRITING)
+def test_no_output_of_any_command_replaces_what_it_reads(
+    name: str, output: str, kind: str, known: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, target in enumerate(read_of(known, kind)):
+        outs = names_of(target, tmp_path / "links" / str(number))
+        before = contents(tmp_path)
+        for out in outs:
+            line = line_of(name, output, known[kind], out)
+            if line is None:
+                assert name in ("demo", "data synth")
+                return
+            require_refused(line, capsys)
+        assert contents(tmp_path) == before
+
+
+def test_overrides_are_read_and_written_as_well(
+    known: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = known["capture"]
+    before = contents(tmp_path)
+    for out in (capture, capture / "images", capture / "images" / "1.jpg", tmp_path):
+        require_refused(["train", "static", f"data.root={capture}", f"run.dir={out}"], capsys)
+        require_refused(["tradeoff", "static", f"data.root={capture}", "--out", str(out)], capsys)
+    (tmp_path / "own.yaml").write_text("{}")
+    require_refused(["train", str(tmp_path / "own.yaml"), f"run.dir={tmp_path / 'own.yaml'}"], capsys)
+    (tmp_path / "own.yaml").unlink()
+    assert contents(tmp_path) == before

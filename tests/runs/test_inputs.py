@@ -1,0 +1,194 @@
+"""What runs, configurations and captures read, and that every function that writes to a path looks at it."""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from moving_scene import write_moving_run
+
+import dyngs
+from dyngs.api.train import train
+from dyngs.capture.inspection.camera_plot import draw_cameras
+from dyngs.config import DataConfig, RunConfig
+from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluate_run
+from dyngs.export.cameras import write_cameras
+from dyngs.export.moving_file import write_moving
+from dyngs.export.run_to_splats import export_ply, write_run_sequence, write_run_splats
+from dyngs.export.scene_file import write_scene_file
+from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
+from dyngs.output.job_of_run import job_of_run
+from dyngs.output.page_of_run import write_run_page
+from dyngs.output.render_job import RenderJobOptions
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.inputs import inputs_of
+
+PACKAGE = Path(dyngs.__file__).parent
+
+WRITERS = {"atomic_file", "write_text", "write_image", "VideoWriter", "write_tensors", "save_config"}
+CHECKS = {"require_output", "require_empty", "require_new_folder", "new_folder", "new_capture", "folder_of_export"}
+ROOMS_BELOW = ("files/", "config/", "runs/", "data/images/", "splats/", "ops/")
+"""Rooms of writers that are handed what they write, or that keep the run folder and the caches of dyngs itself."""
+VALUES = "is handed values, and reads no file that it could replace; the command checks its arguments"
+OWN = "in a run folder, or in a hidden folder, that its caller has made and checked"
+UNCHECKED = {
+    "api/still_first.py:start": OWN,
+    "api/still_first.py:still_instead": OWN,
+    "bench/deform.py:write_report": VALUES,
+    "bench/rasterize.py:write_report": VALUES,
+    "budget/size.py:write_within": OWN,
+    "capture/background_masks.py:with_background_masks": OWN,
+    "capture/multi_video/camera_poses.py:standing_model": OWN,
+    "capture/multi_video/capture.py:write_facts": OWN,
+    "capture/multi_video/capture.py:write_images": OWN,
+    "capture/photos.py:gather_photos": OWN,
+    "capture/photos.py:lay_out": OWN,
+    "capture/sfm_report.py:write_report": OWN,
+    "capture/sfm_work.py:working": OWN,
+    "data/frame_seconds.py:write_seconds": OWN,
+    "data/true_tracks.py:write_true_tracks": OWN,
+    "export/html/page.py:write_page": VALUES,
+    "export/tracks.py:write_tracks": VALUES,
+    "human/fit/inputs.py:read_person": OWN,
+    "human/fit/written.py:write_body": OWN,
+    "human/fit/written.py:write_split": OWN,
+    "human/motion/amass.py:write_amass": VALUES,
+    "output/camera_paths.py:write_path": VALUES,
+    "storage/file.py:write_scene": VALUES,
+    "tradeoff/measurements.py:write_measurement": OWN,
+    "tradeoff/report.py:write_report": OWN,
+}
+"""Functions that write without a check of their own, each with its reason."""
+
+
+def names_called(function: ast.AST) -> set[str]:
+    calls = (node.func for node in ast.walk(function) if isinstance(node, ast.Call))
+    return {f.attr if isinstance(f, ast.Attribute) else f.id for f in calls if isinstance(f, ast.Attribute | ast.Name)}
+
+
+def functions() -> dict[str, ast.FunctionDef]:
+    """Public functions outside the lowest rooms that take a path."""
+    found = {}
+    for file in sorted(PACKAGE.rglob("*.py")):
+        name = file.relative_to(PACKAGE).as_posix()
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_") and not name.startswith(ROOMS_BELOW):
+                given = [*node.args.args, *node.args.kwonlyargs]
+                if any("Path" in ast.unparse(a.annotation) for a in given if a.annotation is not None):
+                    found[f"{name}:{node.name}"] = node
+    return found
+
+
+def unchecked() -> set[str]:
+    """Functions that write, or call such a function, and check nothing."""
+    known, writing = functions(), set(WRITERS)
+    while True:
+        found = {
+            name
+            for name, node in known.items()
+            if names_called(node) & writing and not names_called(node) & CHECKS and not name.startswith("cli/")
+        }
+        more = writing | {name.split(":")[1] for name in found}
+        if more == writing:
+            return found
+        writing = more
+
+
+def test_every_function_that_writes_checks_its_output() -> None:
+    """A new one calls ``require_output``, makes a new folder, or is named in ``UNCHECKED`` with its reason."""
+    assert unchecked() == UNCHECKED.keys()
+
+
+def write_all(run: Path, out: Path) -> dict[str, Callable[[], object]]:
+    """Functions of the Python API that write of a run, each to ``out``."""
+    loaded = load_run(run)
+    capture = read_capture(loaded.config.data)
+    job = job_of_run(run, RenderJobOptions("orbit", 1, size=(8, 8)))
+    as_mp4 = OutputOptions(video=out)
+    return {
+        "train": lambda: train(loaded.config.model_copy(update={"run": RunConfig(dir=out)})),
+        "export_ply": lambda: export_ply(run, out),
+        "write_run_splats": lambda: write_run_splats(loaded, out),
+        "write_run_sequence": lambda: write_run_sequence(loaded, out, (0.0, 1.0)),
+        "write_moving": lambda: write_moving(loaded, out, (0.0, 1.0)),
+        "write_scene_file": lambda: write_scene_file(run, out),
+        "write_cameras": lambda: write_cameras(out, capture, capture.splits),
+        "write_run_page": lambda: write_run_page(run, out),
+        "write_job_images": lambda: write_job_images(job, out),
+        "write_job_images, video": lambda: write_job_images(job, None, as_mp4),
+        "write_split_images": lambda: write_split_images(run, "test", out),
+        "draw_cameras": lambda: draw_cameras(capture, out),
+    }
+
+
+def test_no_function_replaces_a_file_of_the_capture(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path)
+    root = load_resolved(run).data.root
+    image = next(root.rglob("*.png"))
+    (tmp_path / "link.png").symlink_to(image)
+    os.link(image, tmp_path / "hard.png")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for out in (image, tmp_path / "link.png", tmp_path / "hard.png", root / "transforms_train.json", root):
+        for name, write in write_all(run, out).items():
+            with pytest.raises(DyngsError, match="is read") as caught:
+                write()
+            assert "\n" not in str(caught.value), name
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_points_beside_exported_cameras_replace_nothing(tmp_path: Path, colmap_root: Path) -> None:
+    capture = read_capture(DataConfig(root=colmap_root))
+    assert capture.points is not None
+    (tmp_path / "points.ply").unlink(missing_ok=True)
+    (colmap_root / "points.ply").write_text("mine")
+    with pytest.raises(DyngsError, match="exists and lies in"):
+        write_cameras(colmap_root / "new.json", capture, capture.splits)
+    assert (colmap_root / "points.ply").read_text() == "mine"
+
+
+def test_scores_replace_no_link_to_an_input(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path)
+    image = next(load_resolved(run).data.root.rglob("*.png"))
+    os.link(image, run / "metrics.json")
+    with pytest.raises(DyngsError, match="is the file that is read, as"):
+        evaluate_run(run)
+
+
+def test_what_a_run_reads(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path)
+    own = [run / RESOLVED_NAME, *checkpoint_paths(run)]
+    for path in own:
+        for named in (run, run / "checkpoints" / ".." / ".." / "run"):
+            with pytest.raises(DyngsError, match="is the file that is read"):
+                inputs_of(named).require_output(path)
+    for name in ("splats.ply", "metrics.json", "scene.dyngs"):
+        (run / name).write_text("an export")
+        inputs_of(run).require_output(run / name)
+    checkpoint_paths(run)[0].rename(run / "kept")
+    for named in (run, run / "scene.dyngs"):
+        with pytest.raises(DyngsError, match="is the file that is read"):
+            inputs_of(named).require_output(run / "scene.dyngs")
+
+
+def test_files_that_a_capture_names_elsewhere(nerfstudio_root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """With ``data.follow_links`` the images may lie anywhere: they are read, too."""
+    moved = tmp_path_factory.mktemp("elsewhere") / "images"
+    shutil.move(nerfstudio_root / "images", moved)
+    file = nerfstudio_root / "transforms.json"
+    file.write_text(file.read_text().replace("images/", f"{moved}/"))
+    image = next(path for path in moved.iterdir() if path.is_file())
+    config = load_config(packaged_preset("static"), [f"data.root={nerfstudio_root}", "data.follow_links=true"])
+    with pytest.raises(DyngsError, match="is the file that is read"):
+        inputs_of(config).require_output(image)
+    with pytest.raises(DyngsError, match="is the file that is read"):
+        inputs_of(read_capture(config.data)).require_output(image)
+    save_config(config, nerfstudio_root.parent / "run" / RESOLVED_NAME)
+    with pytest.raises(DyngsError, match="is the file that is read"):
+        inputs_of(nerfstudio_root.parent / "run").require_output(image)
