@@ -16,7 +16,7 @@ from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
-from dyngs.human.avatar.posing import Skeleton
+from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.clip import CapturedMotion, MotionClip
@@ -86,7 +86,9 @@ def _person() -> HumanScene:
     gaussians = gaussians.replace(sh=torch.randn(gaussians.sh.shape, generator=generator))
     times, poses = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64), torch.randn(3, 55, 3, generator=generator)
     clip = MotionClip(times, 0.3 * poses, 0.1 * torch.randn(3, 3, generator=generator), torch.ones(3))
-    subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)))
+    directions = (0.02 * torch.randn(9 * 54, 9, generator=torch.Generator().manual_seed(2))).half().float()
+    shapes = PoseBlendShapes(directions, torch.arange(3).repeat(len(body.faces), 1))  # of a body of three vertices
+    subject = Subject(Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)), shapes)
     scene = HumanTraining(PERSON, (0, 1, 2), Rates(10)).first_scene(gaussians, subject)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)

@@ -30,7 +30,7 @@ def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:
         clip = motion_clip(place_on_floor(motion, body))
         clip = place_like(clip, rest_clip(clip, body.joints, body.parents), body.joints, body.parents)
         pose, weights = frame_pose(clip.at(0.3), 0), skinning_weights(anchors, len(body.joints))
-        offsets = rest_offsets(anchors, weights, pose, pose_blend_shapes(body), gaussians.means.repeat(1, 9))
+        offsets = rest_offsets(anchors, pose, pose_blend_shapes(body))
         found = pose_gaussians(gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets)
         near = nearest_neighbours(found.means)
         network = AtlasNetwork(2, 1, (8,), generator)
