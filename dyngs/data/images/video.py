@@ -50,7 +50,7 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
         DyngsError: no such file, no video in it, or damage (at the damaged place).
     """
     for _, frame in _decoded(path, "AUTO"):
-        yield _rotated_rgb(frame)
+        yield _rotated_rgb(path, frame)
 
 
 def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
@@ -67,7 +67,7 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
             continue
         if frame.is_corrupt:
             raise _broken(path, index, "its data is damaged")
-        yield index, _rotated_rgb(frame)
+        yield index, _rotated_rgb(path, frame)
         left -= 1
         if left == 0:
             return
@@ -86,7 +86,7 @@ def probe_video(path: Path) -> VideoInfo:
     first = next((frame for _, frame in _decoded(path)), None)
     if first is None:
         raise _broken(path, 0, "it holds no image")
-    height, width = _rotated_rgb(first).shape[:2]
+    height, width = _rotated_rgb(path, first).shape[:2]
     counted = hidden = 0
     with _reading(path), opened_video(path) as container:
         stream = container.streams.video[0]
@@ -202,5 +202,6 @@ def _sign(x: int) -> int:
     return -1 if x < 0 else 1
 
 
-def _rotated_rgb(frame: av.VideoFrame) -> np.ndarray:
-    return rotated_upright(frame.to_ndarray(format="rgb24"), orientation_of(frame))
+def _rotated_rgb(path: Path, frame: av.VideoFrame) -> np.ndarray:
+    with _reading(path):  # a damaged frame may not be convertible
+        return rotated_upright(frame.to_ndarray(format="rgb24"), orientation_of(frame))
