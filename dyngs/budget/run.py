@@ -25,10 +25,7 @@ class LimitedRun:
     """A run with limits.
 
     Attributes:
-        folder: of the run.
         config: as it is saved there; that of the trainer has its limits applied.
-        loop: its steps.
-        trainer: of its scene.
         given: seconds that it has.
         reserve: seconds that its limits need before the end.
     """
