@@ -36,7 +36,6 @@ class DeformLoad:
     """A configuration to measure, and the fraction of its Gaussians that move.
 
     Attributes:
-        config: configuration of a dynamic model.
         run_dir: run whose checkpoint to start from; None: untrained Gaussians.
         moving_fraction: fraction of moving Gaussians without a run.
     """
@@ -51,8 +50,6 @@ class DeformReport:
     """Median times in milliseconds.
 
     Attributes:
-        isa: instruction set of the kernels.
-        kind: kind of the field.
         steps: time of a training step by variant, interleaved.
         stages: time by stage of the field, for the moving Gaussians.
         field_fraction: fraction of the field in a step with the moving Gaussians.

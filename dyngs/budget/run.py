@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,10 +25,7 @@ class LimitedRun:
     """A run with limits.
 
     Attributes:
-        folder: of the run.
         config: as it is saved there; that of the trainer has its limits applied.
-        loop: its steps.
-        trainer: of its scene.
         given: seconds that it has.
         reserve: seconds that its limits need before the end.
     """
@@ -78,3 +76,9 @@ def stage(config: Config, step: int, fraction: float = 0.0) -> int:
     if total > steps:
         return 0
     return sum(max(step / steps, fraction) >= x for x in STAGES) + (step == steps)
+
+
+def two_digits(x: float, rounded: Callable[[float], int]) -> float:
+    """Return ``x``, positive, ``rounded`` to two digits: by ``math.floor`` or ``math.ceil``."""
+    unit = 10.0 ** (math.floor(math.log10(x)) - 1)
+    return rounded(x / unit) * unit

@@ -16,7 +16,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from dyngs.budget.run import LimitedRun, stage
+from dyngs.budget.run import LimitedRun, stage, two_digits
 from dyngs.config import Config
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
@@ -101,7 +101,7 @@ class SpeedLimit:
             found.base = found.seconds = least_seconds(trainer, scene, POSSIBLE / self.fps)
             found.measuring = time.perf_counter() - start
             if found.base > POSSIBLE / self.fps:
-                possible = _rounded_down(ACCEPTED * POSSIBLE / found.base)
+                possible = two_digits(ACCEPTED * POSSIBLE / found.base, math.floor)
                 raise DyngsError(
                     f"budget.min_fps={self.fps:g}: {FEW} Gaussians alone are drawn at {1 / found.base:.3g} per second "
                     f"here; {possible:g} would be possible, more with smaller images (data.longest_side)"
@@ -287,9 +287,3 @@ def _few(trainer: Trainer) -> Scene:
     """Return ``FEW`` of the Gaussians of ``trainer``, all of them moving if any will move."""
     kept = torch.tensor(evenly_spaced(trainer.num_gaussians, FEW), device="cpu")
     return trainer.training.all_moving(trainer.scene.select(kept), trainer.extent)
-
-
-def _rounded_down(x: float) -> float:
-    """Return ``x`` rounded down to two digits."""
-    unit = 10.0 ** (math.floor(math.log10(x)) - 1)
-    return math.floor(x / unit) * unit

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 
 from torch import Tensor
 
-from dyngs.budget.run import LimitedRun
+from dyngs.budget.run import LimitedRun, two_digits
 from dyngs.build import assemble
 from dyngs.config import Config
 from dyngs.config.kinds import harmonics_measured_after
@@ -172,7 +172,7 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
         needed = (used + forecast.seconds(with_steps(config, fewest), fewest, 0)) / AIM / 60
         raise DyngsError(
             f"train.minutes={minutes:g}: about {found} steps would fit, and fewer than {fewest} are of no use; "
-            f"{_rounded_up(needed):g} would do, or smaller images (data.longest_side)"
+            f"{two_digits(needed, math.ceil):g} would do, or smaller images (data.longest_side)"
         )
     return with_steps(config, found)
 
@@ -206,9 +206,3 @@ def _happened(config: Config, done: int) -> tuple[bool, ...]:
     """Return, for each one-time event of a run, whether it has happened after ``done`` steps."""
     once = motion_begins_after(config, config.train.steps), harmonics_measured_after(config)
     return tuple(done >= step for step in once if step is not None)
-
-
-def _rounded_up(x: float) -> float:
-    """Return ``x`` rounded up to two digits."""
-    unit = 10.0 ** (math.floor(math.log10(x)) - 1)
-    return math.ceil(x / unit) * unit

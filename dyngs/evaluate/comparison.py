@@ -32,7 +32,6 @@ class Cost:
     """Quality, size and speed of a run.
 
     Attributes:
-        num_gaussians: N.
         psnr_train, psnr_test: means over at most 20 views, dB; None without such a split.
         fps: one over the median time of drawing a view, deformation included.
         megabytes: float32 parameters, the field and masks, in 1e6 bytes.

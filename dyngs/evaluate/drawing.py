@@ -22,7 +22,6 @@ class Drawing:
     """A scene and how it is drawn.
 
     Attributes:
-        scene: Gaussians at any time.
         options: as in training, without depth.
         background: (3,) colour.
         scale: width and height drawn, relative to those of the image.

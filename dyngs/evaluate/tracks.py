@@ -100,19 +100,19 @@ class _Bound:
         times: (P,) when they were bound, NaN where they were not.
         carriers: (P, K) rows of Gaussians.
         weights: (P, K), each row sums to 1.
-        places: (P, K, 3) of the carriers when they were bound.
+        positions: (P, K, 3) of the carriers when they were bound.
     """
 
     points: np.ndarray
     times: np.ndarray
     carriers: np.ndarray
     weights: np.ndarray
-    places: np.ndarray
+    positions: np.ndarray
 
     def carried(self, scene: Scene, time: float) -> np.ndarray:
         """Return the (P, 3) points at ``time``."""
         means = scene.at(time).means.detach().cpu().double().numpy()
-        return self.points + (self.weights[..., None] * (means[self.carriers] - self.places)).sum(axis=1)
+        return self.points + (self.weights[..., None] * (means[self.carriers] - self.positions)).sum(axis=1)
 
 
 def _times_of(tracks: TrueTracks, views: Sequence[View]) -> np.ndarray:
@@ -147,7 +147,7 @@ def _bind(scene: Scene, tracks: TrueTracks, times: np.ndarray) -> _Bound:
         _, nearest = KDTree(means[opaque]).query(points, k=carriers_each)
         chosen = opaque[np.reshape(nearest, (len(points), carriers_each))]
         bound.points[members], bound.times[members] = points, time
-        bound.carriers[members], bound.places[members] = chosen, means[chosen]
+        bound.carriers[members], bound.positions[members] = chosen, means[chosen]
         bound.weights[members] = opacities[chosen] / opacities[chosen].sum(axis=1, keepdims=True)
     return bound
 

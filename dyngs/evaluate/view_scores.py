@@ -69,7 +69,6 @@ class PoseScores:
 
     Attributes:
         updates: mean number of updates that the pose of a moment took.
-        per_view: the single views.
     """
 
     psnr: float

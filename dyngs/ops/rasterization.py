@@ -18,7 +18,7 @@ from dyngs.errors import DyngsError
 from dyngs.ops.checks import REMEDY, check_memory, check_number, check_size
 from dyngs.ops.native import num_threads
 from dyngs.ops.projection import Projection
-from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register
+from dyngs.ops.registration import Gradient, Struct, empty_like, launch, register, shapes_only
 
 TILE = 16
 MAX_CHANNELS = 40
@@ -127,6 +127,8 @@ def _refusals(kernel: str) -> Generator[None]:
 def _bin_tiles(
     splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    if shapes_only():
+        return _unknown_entries(depths, size)
     settings, most = _settings(size, thresholds), min(max_entries, MAX_ENTRIES)
     try:
         entries = launch(depths, "bin_tiles", _arrays(*splats), depths, settings, most)
@@ -137,9 +139,8 @@ def _bin_tiles(
     return tile_offsets.view(torch.int64), slot_ranges, gaussians, slots
 
 
-def _fake_bin_tiles(
-    splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _unknown_entries(depths: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the shapes of entries whose number is known only once they are found."""
     entries = torch.library.get_ctx().new_dynamic_size()
     tiles = ((size[0] + TILE - 1) // TILE) * ((size[1] + TILE - 1) // TILE)
     views, n = depths.shape
@@ -151,7 +152,7 @@ def _fake_bin_tiles(
     )
 
 
-bin_tiles_op = register("bin_tiles", _bin_tiles, fake=_fake_bin_tiles)
+bin_tiles_op = register("bin_tiles", _bin_tiles)
 
 
 def _image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -54,7 +54,6 @@ def register(
     name: str,
     kernel: Callable[P, R],
     *,
-    fake: Callable[P, R] | None = None,
     devices: tuple[str, ...] = ("cpu", "cuda"),
     mutates: tuple[str, ...] = (),
     gradient: Gradient | None = None,
@@ -66,7 +65,6 @@ def register(
     Args:
         name: of the op.
         kernel: the implementation; its type hints give the schema. No result may share memory with an input.
-        fake: results of the right shape, dtype and device for inputs without data; None: ``kernel`` gives them.
         devices: for whose tensors ``kernel`` is; CUDA counts only where its core was built.
         mutates: arguments that ``kernel`` writes to.
         gradient: None: not differentiable.
@@ -74,7 +72,7 @@ def register(
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
     qualified = f"{NAMESPACE}::{name}"
     _LIBRARY.define(name + schema)
-    torch.library.register_fake(qualified, fake or _shapes_of(kernel), lib=_LIBRARY)
+    torch.library.register_fake(qualified, _shapes_of(kernel), lib=_LIBRARY)
     _LIBRARY.impl(name, _refusal(name), "CompositeExplicitAutograd")  # for every device that has none of its own
     _kernels[name] = {"meta"}
     for device in devices:

@@ -34,7 +34,7 @@ class Cut:
     """A choice of parts to take away; the defaults take nothing.
 
     Attributes:
-        share: of the Gaussians that is removed.
+        fraction: of the Gaussians that is removed.
         alpha_min: pixels skip Gaussians with a lower alpha; None: as the run has it.
         field: size of the field of control nodes; None: as it is.
         harmonics: PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay.

@@ -29,8 +29,6 @@ class ScoringViews:
         scene: N Gaussians; none is masked.
         cameras: V groups of one camera.
         times: K moments in [0, 1], ascending; one None for a static scene.
-        options: how the scene is drawn.
-        background: (3,) colour.
     """
 
     scene: Scene
@@ -45,7 +43,7 @@ class Importance:
     """Contributions of N Gaussians at K moments.
 
     Attributes:
-        shares: (K, N) C, sums over pixels and views of alpha T.
+        fractions: (K, N) C, sums over pixels and views of alpha T.
         slopes: (N,) sums over pixels, views and moments of (dI/dG)^2, or None where that was not asked for.
         opacities: (K, N).
         log_volumes: (K, N) sums of the logarithms of the scales.

@@ -32,7 +32,7 @@ from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 HELD_OUT_FRACTION, MOST_HELD_OUT = 1 / 8, 32
-"""Share and number of the training views that are held out; the number also limits those never trained on."""
+"""Fraction and number of the training views that are held out; the number also limits those never trained on."""
 LEFT_GAUSSIANS = tuple(2 ** (-step / 2) for step in range(1, 13))
 """Fractions of the Gaussians that are left, tried by bisection."""
 CUT_OFFS = (0.01, 0.02, 0.03)
@@ -55,10 +55,7 @@ class Candidate:
     """A run after a cut and fine-tuning.
 
     Attributes:
-        cut: what was taken away.
-        config: of what is left.
         checkpoint: at its end.
-        num_gaussians: left.
         psnr: mean on the views held out, dB.
         loss: that of what it is compared with, minus ``psnr``.
         trained_loss: of views that the run and fine-tuning see, against the run as it is, dB.

@@ -1,6 +1,6 @@
 """The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and training goes on with them.
 
-The share that goes is given here; ``dyngs.prune.search`` finds it, and what else can go, with the same functions.
+The fraction that goes is input here; ``dyngs.prune.search`` finds it, and what else can go, with the same functions.
 
 It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that is pruned ends
 with the same bytes as one that had the stage in its configuration.

@@ -43,10 +43,8 @@ class LoadedRun:
     """A trained model, ready to be drawn.
 
     Attributes:
-        config: the resolved configuration.
         scene: what is drawn at any time.
         step, seconds_train: how far and how long it was trained (0 s where ``timing.json`` is lost).
-        info: of the checkpoint.
     """
 
     config: Config

@@ -21,7 +21,6 @@ class LogRecord:
     """One line of ``log.jsonl``.
 
     Attributes:
-        step: steps done.
         loss: of this step, regularizers included.
         psnr: of this step's image, dB; None where its mask leaves nothing.
         num_gaussians: after the step.

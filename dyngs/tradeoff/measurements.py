@@ -42,10 +42,7 @@ class Measurement:
     """Quality, size and speed of a variant.
 
     Attributes:
-        variant: settings that differ from the run.
-        num_views: number of views of the split.
         psnr, ssim, lpips: means over the views; LPIPS is None where it cannot be computed.
-        num_gaussians: N.
         mb: 1e6 bytes on disk: the .dyngs file, or 4 bytes per value needed for rendering where nothing is quantised.
         memory_mb: largest growth of a process that loads and renders the variant, 1e6 bytes; None where unknown.
         speed: None until it is measured.

@@ -54,13 +54,11 @@ class Plan:
     """The measurements to take.
 
     Attributes:
-        variations: settings and their values.
         finetune: training steps after pruning and masking, for additional variants; 0: none.
         combine: combinations in each of three directions, see ``pareto.combinations``.
         split: "test", "val", "train" or "pose".
         rounds: renders of each timed view.
         threads: for timing; 0 = all cores.
-        device: draws.
     """
 
     variations: tuple[Variation, ...]
@@ -78,7 +76,6 @@ class ProcessGroup:
 
     Attributes:
         rank: number of this process; rank 0 also measures speed and writes the report.
-        size: number of processes.
         local_size: number of processes on this machine.
     """
 

@@ -21,7 +21,6 @@ class TableRow:
     """A measured variant. The fields but ``variant``, after its name, are the columns of the .csv.
 
     Attributes:
-        variant: settings that differ from the run.
         psnr, ssim, lpips: means over the split; LPIPS is None where it cannot be computed.
         fps: frames per second of the run itself times ``gain``, so that variants timed at another hour compare.
         gain, gain_low, gain_high: speed relative to the run: median and quartiles of interleaved pairs.

@@ -47,7 +47,6 @@ class VariantRuns:
 
     Attributes:
         run_dir: the run, with a checkpoint.
-        out: output folder.
         threads: for training, rendering and pruning; 0 = all cores.
         device: trains and prunes: "auto", "cpu" or "cuda".
     """

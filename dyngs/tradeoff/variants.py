@@ -168,7 +168,6 @@ class RunSettings:
         sh_degree: degree of its spherical harmonics, 0 if a network colours it.
         mode, alpha_min, transmittance_min: it is rendered with.
         mask_times: number of key times of its visibility masks.
-        colour: kind.
         field: kind of the deformation field; None: nothing moves.
     """
 

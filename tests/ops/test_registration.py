@@ -30,10 +30,6 @@ def _double(x: Tensor, factors: list[float]) -> Tensor:
     return x * 2 * len(factors)
 
 
-def _fake_double(x: Tensor, factors: list[float]) -> Tensor:
-    return torch.empty_like(x)
-
-
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     ctx.count = len(inputs[1])
 
@@ -42,7 +38,7 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
     return grad * 2 * ctx.count, None
 
 
-double_op = register("test_double", _double, fake=_fake_double, devices=("cpu",), gradient=Gradient(_save, _backward))
+double_op = register("test_double", _double, devices=("cpu",), gradient=Gradient(_save, _backward))
 
 
 def on(device: DispatchKey, op: Any, *arguments: object) -> Any:
