@@ -178,6 +178,10 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
             model, notes = _mapped(work, features, options, first, report)
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()
+        if "database factory" in str(error):  # all that COLMAP says where it cannot open or fill one
+            raise DyngsError(
+                f"cannot write {work}: no database can be made there; free some space, or check its disk"
+            ) from error
         raise DyngsError(f"structure from motion failed: {reason[-1] if reason else error}") from error
     finally:
         pycolmap.logging.minloglevel = level

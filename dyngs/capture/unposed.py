@@ -15,7 +15,7 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.read import FORMATS
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, as_word, reading
 from dyngs.files.cache import cache_folder
 from dyngs.files.outputs import note_sources
 
@@ -51,7 +51,7 @@ def with_poses(
     if videos and not needs_times:
         raise DyngsError(
             f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
-            f"data.root={source}`, or one video of a camera that moves"
+            f"data.root={as_word(source)}`, or one video of a camera that moves"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
@@ -96,7 +96,7 @@ def is_unposed(data: DataConfig) -> bool:
         return True
     videos = videos_in(root)
     if len(videos) == 1:
-        raise DyngsError(f"{root}: holds one video; give that: data.root={videos[0]}")
+        raise DyngsError(f"{root}: holds one video; give that: data.root={as_word(videos[0])}")
     return bool(videos)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import data_fit
 from dyngs.cli.arguments import data_section, input_path, output_path, threads
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from dyngs.config import DataConfig
@@ -190,8 +190,8 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     with ProgressBar() as report:
         result = estimate_poses(arguments.images, arguments.out, options, report)
     print(result.summary())
-    print(f"next: dyngs data inspect {result.root} --image cameras.png")
-    print(f"      dyngs train static data.root={result.root}")
+    print(f"next: dyngs data inspect {as_word(result.root)} --image cameras.png")
+    print(f"      dyngs train static data.root={as_word(result.root)}")
     return 0
 
 
@@ -220,8 +220,8 @@ def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int
     with ProgressBar() as report:
         result = poses_of_videos(arguments.images, arguments.out, options, report)
     print(result.summary())
-    print(f"next: dyngs data inspect {result.root} --image cameras.png")
-    print(f"      dyngs train dynamic data.root={result.root}")
+    print(f"next: dyngs data inspect {as_word(result.root)} --image cameras.png")
+    print(f"      dyngs train dynamic data.root={as_word(result.root)}")
     return 0
 
 
@@ -295,5 +295,5 @@ def run_synth(arguments: argparse.Namespace) -> int:
         moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed)
         synthetic.write_dynamic_capture(scene, out, moving)
     preset = {"still": "static", "human": "human"}.get(scene, "dynamic")
-    print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={out}")
+    print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import is_avatar_file, print_notes
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
@@ -52,5 +52,5 @@ def export_cameras(arguments: argparse.Namespace) -> int:
         print_notes(("training cameras as training found them; others have the capture's poses, and known lenses",))
     written = write_cameras(path, capture, splits)
     count = len(all_views(capture.splits))
-    print(f"written: {written} ({count} cameras); `data.root={path.parent} data.follow_links=true` trains with them")
+    print(f"written: {written} ({cameras}); `data.root={as_word(path.parent)} data.follow_links=true` trains with them")
     return 0
