@@ -71,7 +71,6 @@ def run(arguments: argparse.Namespace) -> int:
     trained = f"{made.seconds_steps:.2f} s steps, " if arguments.steps else ""
     parts = f"{trained}{made.seconds_maps:.2f} s images, {made.seconds_network:.2f} s network"
     print(f"time:      {seconds:.2f} s ({parts})")
-    print(
-        f"written:   {out}\nnext:      dyngs eval {as_word(out)}\n           dyngs train --resume {as_word(out)}   refines it"
-    )
+    word = as_word(out)
+    print(f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it")
     return 0
