@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import stat
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -68,6 +69,12 @@ def reason(error: BaseException) -> str:
     else:
         text = f"{type(error).__name__}: {error}" if str(error).strip() else type(error).__name__
     return printable(text[: 4 * _MAX_REASON], _MAX_REASON)
+
+
+def as_word(path: str | os.PathLike[str]) -> str:
+    """Return a path as a word of a command that can be copied to a shell, whatever characters it holds."""
+    text = os.fspath(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
 def printable(text: str, length: int | None = None) -> str:

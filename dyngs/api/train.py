@@ -25,7 +25,7 @@ from dyngs.budget.time import Deadline, first_fit, refitted
 from dyngs.build import build
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 from dyngs.evaluate.report import evaluate_run
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
@@ -153,10 +153,10 @@ def _chosen(config: Config, folder: Path, train_still: Callable[[Config, Path], 
 
 def _told_again(config: Config, folder: Path) -> str:
     """Return the line for a run that is asked for once more."""
-    longer = "" if config.prune.is_wanted else f", go on with `dyngs train --resume {folder} train.steps=N`"
+    longer = "" if config.prune.is_wanted else f", go on with `dyngs train --resume {as_word(folder)} train.steps=N`"
     return (
         f"{folder} holds just this run, finished, and training again would end with the same bytes: nothing is done; "
-        f"look at it with `dyngs eval {folder}`{longer}, or give another run.dir"
+        f"look at it with `dyngs eval {as_word(folder)}`{longer}, or give another run.dir"
     )
 
 
@@ -168,7 +168,7 @@ def _train_still(new_run: Callable[[Config, Path, Checkpoint | None], _Run], con
     try:
         new_run(config, folder, resumed).run(())
     except KeyboardInterrupt as stopped:
-        again = f"stopped before anything moves; go on with: dyngs train --resume {folder.parent}"
+        again = f"stopped before anything moves; go on with: dyngs train --resume {as_word(folder.parent)}"
         raise KeyboardInterrupt(again if stopped.args else "") from None
 
 
@@ -257,7 +257,7 @@ class _Run:
                 if loop.trainer.done > self._saved:
                     self._save()
                 raise KeyboardInterrupt(
-                    f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {self.folder}"
+                    f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {as_word(self.folder)}"
                 )
         for line in self._reached():
             print(line, flush=True)
@@ -332,7 +332,7 @@ class _Run:
             with_length(self.config, self.loop.trainer.done, steps)
         except DyngsError:  # motion began too early for so many
             return "for that train anew without train.minutes"
-        longer = f"`dyngs train --resume {self.folder} train.steps={steps}`"
+        longer = f"`dyngs train --resume {as_word(self.folder)} train.steps={steps}`"
         return f"this run goes on to that with {longer}, or train anew without train.minutes"
 
     def _reached(self) -> Iterator[str]:

@@ -9,12 +9,13 @@ from pathlib import Path
 from dyngs.capture.multi_video.estimate import VideosOptions, poses_of_videos
 from dyngs.capture.multi_video.films import VIDEOS_FILE, videos_in
 from dyngs.capture.photos import digest_of, photos_below
-from dyngs.capture.sfm import SfmOptions, estimate_poses
+from dyngs.capture.sfm import estimate_poses
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.read import FORMATS
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, as_word, reading
 from dyngs.files.outputs import note_sources
 from dyngs.files.temporary import cache_folder
 
@@ -48,7 +49,7 @@ def with_poses(
     if videos and not needs_times:
         raise DyngsError(
             f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
-            f"data.root={source}`, or one video of a camera that moves"
+            f"data.root={as_word(source)}`, or one video of a camera that moves"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
@@ -93,7 +94,7 @@ def is_unposed(data: DataConfig) -> bool:
         return True
     videos = videos_in(root)
     if len(videos) == 1:
-        raise DyngsError(f"{root}: holds one video; give that: data.root={videos[0]}")
+        raise DyngsError(f"{root}: holds one video; give that: data.root={as_word(videos[0])}")
     return bool(videos)
 
 

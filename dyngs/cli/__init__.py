@@ -88,7 +88,10 @@ def _without_debug(arguments: list[str]) -> tuple[list[str], bool]:
 
 
 def _show_any_name() -> None:
-    """Print file names that are not valid text with escapes on stdout, as stderr does."""
+    """Print file names that are not valid text with escapes on stdout, as stderr does; a closed one takes nothing."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # as after >&-
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - for the life of the process
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 

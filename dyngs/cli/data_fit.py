@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import data_section, input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
+from dyngs.errors import as_word
 
 if TYPE_CHECKING:
     from dyngs.human.fit.inputs import KnownAvatar
@@ -72,7 +73,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
     with ProgressBar() as report:
         result = write_fitted_capture(options, arguments.out, report, given)
     print(result.summary())
-    print(f"next: dyngs train human data.root={result.root}")
+    print(f"next: dyngs train human data.root={as_word(result.root)}")
     return 0
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dyngs.cli.arguments import output_path, threads
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -39,6 +39,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"orbit video           {result.video}")
     print(f"for other viewers     {result.ply}")
     print(f"run folder            {result.run_dir}")
-    print(f"to look around        dyngs view {result.run_dir}    (pip install 'dyngs[view]')")
-    print(f"one page to share     dyngs export {result.run_dir} --out scene.html")
+    print(f"to look around        dyngs view {as_word(result.run_dir)}    (pip install 'dyngs[view]')")
+    print(f"one page to share     dyngs export {as_word(result.run_dir)} --out scene.html")
     return 0

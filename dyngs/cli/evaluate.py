@@ -69,7 +69,9 @@ def report_table(report: EvalReport) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("metric", "value", title=f"{report.num_views} views of the {report.split} split")
+    table = Table(
+        "metric", "value", title=f"{report.num_views} view{'s' * (report.num_views != 1)} of the {report.split} split"
+    )
     table.add_row("PSNR", f"{report.psnr:.2f} dB")
     if report.psnr_right is not None and report.psnr_right_fitted is not None:
         right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"

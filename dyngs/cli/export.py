@@ -24,7 +24,7 @@ _EPILOG = """\
 examples:
   dyngs export runs/bench                                         runs/bench/splats.ply
   dyngs export runs/dance --time 0.5 --out middle.ply             the scene at one time
-  dyngs export runs/bench --out bench.spz                         the suffix names the format: .glb, .sog, .usdz ...
+  dyngs export runs/bench --out bench.spz                         the suffix names the format: .glb, .sog, .splat ...
   dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
   dyngs export runs/dance --out dance.4dgs                        all training times in one file
   dyngs export runs/dance --static --out stage.ply                only the Gaussians that never move

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import is_avatar_file, print_notes
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
@@ -51,6 +51,7 @@ def export_cameras(arguments: argparse.Namespace) -> int:
         splits = {name: [found.corrected_view(view) for view in views] for name, views in splits.items()}
         print_notes(("training cameras as training found them; others have the capture's poses, and known lenses",))
     written = write_cameras(path, capture, splits)
-    count = len(all_views(capture.splits))
-    print(f"written: {written} ({count} cameras); `data.root={path.parent} data.follow_links=true` trains with them")
+    count, root = len(all_views(capture.splits)), as_word(path.parent)
+    cameras = f"{count} camera{'s' * (count != 1)}"
+    print(f"written: {written} ({cameras}); `data.root={root} data.follow_links=true` trains with them")
     return 0

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dyngs.cli.arguments import input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
+from dyngs.errors import as_word
 
 _EPILOG = """\
 examples:
@@ -70,5 +71,6 @@ def run(arguments: argparse.Namespace) -> int:
     trained = f"{made.seconds_steps:.2f} s steps, " if arguments.steps else ""
     parts = f"{trained}{made.seconds_maps:.2f} s images, {made.seconds_network:.2f} s network"
     print(f"time:      {seconds:.2f} s ({parts})")
-    print(f"written:   {out}\nnext:      dyngs eval {out}\n           dyngs train --resume {out}   refines it")
+    word = as_word(out)
+    print(f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it")
     return 0

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import add_run_device, computing_device, input_path, output_path, run_device, threads
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -91,7 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")
     print(
         f"written: {folder}, and the file in {file_of(folder)}\n"
-        f"next:    dyngs eval {folder}\n         dyngs render {file_of(folder)} --out {folder}/images"
+        f"next:    dyngs eval {as_word(folder)}\n         dyngs render {as_word(file_of(folder))} "
+        f"--out {as_word(folder / 'images')}"
     )
     return 0
 

@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Render and print which files were written."""
     written = _render(_checked(arguments))
     folders = sorted({str(path.parent) for path in written})
-    print(f"written: {len(written)} files in {', '.join(folders)}")
+    print(f"written: {len(written)} file{'s' * (len(written) != 1)} in {', '.join(folders)}")
     for path in written:
         if path.suffix == ".mp4" or path.name == "sheet.png":
             print(f"         {path}")

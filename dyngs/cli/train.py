@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli.arguments import add_run_device, computing_device, input_path, run_device
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -123,7 +123,8 @@ def _with_poses(config: Config) -> Config:
         if is_unposed(config.data):
             raise DyngsError(
                 f"{config.data.root}: a person needs a capture with body parameters (docs/human.md); of photos or "
-                f"videos alone a scene can be made: `dyngs train static data.root={config.data.root}`, or dynamic"
+                "videos alone a scene can be made: "
+                f"`dyngs train static data.root={as_word(config.data.root)}`, or dynamic"
             )
         return _with_fitted_body(config)
     with ProgressBar() as report:
@@ -147,8 +148,11 @@ def _with_fitted_body(config: Config) -> Config:
 def _next(folder: Path, config: Config) -> str:
     """Return the next commands for a run."""
     if config.model.kind == "human_predictor":
-        return f"next:    dyngs predict {folder} CAPTURE --out RUN"
-    return f"next:    dyngs eval {folder}\n         dyngs render {folder} --out {folder}/images"
+        return f"next:    dyngs predict {as_word(folder)} CAPTURE --out RUN"
+    return (
+        f"next:    dyngs eval {as_word(folder)}\n"
+        f"         dyngs render {as_word(folder)} --out {as_word(folder / 'images')}"
+    )
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
@@ -182,7 +186,7 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
     preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)
     paths = [word for word in overrides if "=" not in word and Path(word).exists()]
     if paths:
-        raise DyngsError(f"{paths[0]!r}: a capture, photos or a video are given as data.root={paths[0]}")
+        raise DyngsError(f"{paths[0]!r}: a capture, photos or a video are given as data.root={as_word(paths[0])}")
     if resume is None:
         if not words:
             raise DyngsError("give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`")

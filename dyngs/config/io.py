@@ -29,7 +29,7 @@ from dyngs.config.schema import (
     section_classes,
 )
 from dyngs.config.yaml_reader import Leaf, read_file, read_override, require_usable
-from dyngs.errors import DyngsError, printable
+from dyngs.errors import DyngsError, as_word, printable
 from dyngs.files.write import write_text
 from dyngs.files.wrong_place import command_for
 
@@ -148,7 +148,7 @@ def _close_presets(name: str, packaged: Iterable[str]) -> list[str]:
 def _instead(path: Path) -> str:
     """Return what ``path`` is if it is no run, and the command for it, to be followed by more; may be empty."""
     if path.stem in packaged_presets() and not path.is_dir():
-        return f"it is a configuration, for `dyngs train {path} data.root=FOLDER`; "
+        return f"it is a configuration, for `dyngs train {as_word(path)} data.root=FOLDER`; "
     found = command_for(path)
     return f"{found}; then " if found else ""
 

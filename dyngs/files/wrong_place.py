@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import shlex
 from itertools import islice
 from pathlib import Path
+
+from dyngs.errors import as_word
 
 PHOTO_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".heic", ".heif", ".hif"}
@@ -26,7 +27,7 @@ def command_for(path: Path, *, captures: bool = True) -> str | None:
 
     Only names are looked at, those directly in a folder and in ``images`` below it.
     """
-    where = shlex.quote(str(path))
+    where = as_word(path)
     static, dynamic = (f"`dyngs train {preset} data.root={where}`" for preset in ("static", "dynamic"))
     try:
         if path.is_file():

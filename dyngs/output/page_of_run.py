@@ -60,7 +60,7 @@ def write_run_page(
         DyngsError: no such run or file, a motion for a scene that is no person, or the file cannot be written.
     """
     inputs_of(source, options.motion).require_output(path)
-    title = options.title or source.resolve().stem
+    title = options.title or (source.resolve().name if source.is_dir() else source.stem)
     if source.is_file():
         return _avatar_page(source, path, replace(options, title=title)), ()
     run = load_run(source)

@@ -22,7 +22,7 @@ from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.config.kinds import network_of
 from dyngs.conventions import RasterizeMode
-from dyngs.errors import DyngsError, reading, require_regular
+from dyngs.errors import DyngsError, as_word, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene
@@ -136,7 +136,9 @@ def load_run(run_dir: Path) -> LoadedRun:
     """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints."""
     config = load_resolved(run_dir)
     if network_of(config) is not None:
-        raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")
+        raise DyngsError(
+            f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
+        )
     checkpoint = _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
     scene = restored_scene(checkpoint, config.model)
     step = checkpoint.info.step

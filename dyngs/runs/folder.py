@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dyngs.config import Config, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, as_word
 from dyngs.files.temporary import remove_leftovers, remove_quietly, temporary_folder_beside
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
@@ -39,7 +39,7 @@ def require_no_run(folder: Path) -> None:
     found = _found(folder)
     if checkpoint_paths(folder):
         raise DyngsError(
-            f"{folder} already holds a run; go on with `dyngs train --resume {folder}` or give another folder"
+            f"{folder} already holds a run; go on with `dyngs train --resume {as_word(folder)}` or give another folder"
         )
     if SCENE_FILE in found:
         raise DyngsError(
@@ -116,7 +116,7 @@ def require_startable(folder: Path, config: Config) -> None:
     elif not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
         raise DyngsError(
             f"{folder} already holds another run, stopped before its first checkpoint; begin that again with `dyngs "
-            f"train --resume {folder}`, give another run.dir, or remove the folder"
+            f"train --resume {as_word(folder)}`, give another run.dir, or remove the folder"
         )
 
 
@@ -160,13 +160,13 @@ def _about_other(folder: Path, config: Config) -> str:
     if _is_same_run(asked, config):
         return (
             f"{folder} already holds a run, this very one, stopped after step {done:,} of {stored.total_steps:,}; go "
-            f"on with `dyngs train --resume {folder}`"
+            f"on with `dyngs train --resume {as_word(folder)}`"
         )
     different = list(_differences(asked, config))
     shown = ", ".join(f"{key} is {was} there and {now} here" for key, was, now in different[:2])
     more = f" and {len(different) - 2} more" if len(different) > 2 else ""
     longer = [key for key, _, _ in different] == ["train.steps"] and config.train.steps > done
-    go_on = f", or go on to so many with `dyngs train --resume {folder} train.steps={config.train.steps}`"
+    go_on = f", or go on to so many with `dyngs train --resume {as_word(folder)} train.steps={config.train.steps}`"
     return (
         f"{folder} already holds a run, another one ({shown}{more}); give another run.dir to keep both"
         f"{go_on if longer else ''}"

@@ -134,6 +134,7 @@ def sweep(
     Raises:
         DyngsError: no such run or split, or the folder holds measurements of another run.
     """
+    load_resolved(runs.run_dir)  # what is no run is refused before anything else
     inputs_of(runs.run_dir).require_output(runs.out)
     with MemoryMeter() as meter:
         session = _Session(runs, plan, meter, log)

@@ -10,7 +10,7 @@ from tiny_captures import write_colmap
 
 from dyngs.capture import unposed
 from dyngs.capture.multi_video.estimate import VideosOptions, VideosResult
-from dyngs.capture.sfm import SfmOptions, SfmResult
+from dyngs.capture.sfm_work import SfmOptions, SfmResult
 from dyngs.capture.unposed import with_poses
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig

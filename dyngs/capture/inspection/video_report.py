@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from dyngs.capture.multi_video.lags import motion_of
 from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
 from dyngs.data.images.video import opened_video, orientation_of, read_frames
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import reading
+from dyngs.errors import as_word, reading
 from dyngs.files.containment import inside
 
 MAX_FRAMES = 3000
@@ -158,7 +157,7 @@ def _lines(found: VideoFacts) -> list[str]:
 
 
 def _next(path: Path, found: VideoFacts) -> list[str]:
-    where = shlex.quote(str(path))
+    where = as_word(path)
     if found.stands:
         return ["next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"]
     return [
@@ -177,5 +176,5 @@ def _next_of_folder(folder: Path, reports: Sequence[VideoFacts]) -> list[str]:
     return [
         f"{len(names)} fixed cameras, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
         f"offsets between them: {known}",
-        f"next: dyngs train dynamic data.root={shlex.quote(str(folder))}",
+        f"next: dyngs train dynamic data.root={as_word(folder)}",
     ]
