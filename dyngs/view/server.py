@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.errors import DyngsError
 from dyngs.view.cameras import fitting_fov, look_point, pose_of
-from dyngs.view.gate import free_port, gate_for, guarded, is_loopback
+from dyngs.view.gate import free_port, gate_for, guarded, link_to
 from dyngs.view.pace import Pace
 from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Eye, Sent, Session
@@ -68,6 +68,7 @@ class Browsing:
         self.on_move: Callable[[], None] = lambda: None
         self.num_sent = 0
         self._told_at, self._since_told = 0.0, 0
+        self._has_refused = False
 
     def send(self, sent: Sent) -> None:
         """Pass an image to the browser."""
@@ -83,9 +84,13 @@ class Browsing:
     def camera_moved(self) -> None:
         """Take over the camera of the browser."""
         camera = self.client.camera
-        size = (max(16, int(camera.image_width)), max(16, int(camera.image_height)))
-        self.session.move(Eye(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size))
-        self.on_move()
+        size = _window(camera)
+        eye = Eye(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size)
+        if self.session.move(eye):
+            self.on_move()
+        elif not self._has_refused:
+            self._has_refused = True
+            notify(self.client, "Camera ignored", "The browser sent a camera that cannot exist; the last one stays.")
 
     def go_to(self, index: int | None) -> None:
         """Move the browser's camera to a view of the capture; None: to where it began."""
@@ -93,7 +98,8 @@ class Browsing:
         camera = viewed.start if index is None else viewed.footage.cameras[index]
         wxyz, position = pose_of(camera)
         with self.client.atomic():
-            handle.fov = fitting_fov(camera, handle.aspect)
+            width, height = _window(handle)
+            handle.fov = fitting_fov(camera, width / height)
             handle.position = position
             handle.look_at = look_point(camera, viewed.center, viewed.extent)
             handle.wxyz = wxyz
@@ -147,11 +153,7 @@ class Viewer:
     @property
     def link(self) -> str:
         """Address of the page, with the token if there is one."""
-        host, port = self.serving.host, self.server.get_port()
-        shown = "localhost" if is_loopback(host) else _name_of_machine() if host in ("0.0.0.0", "::") else host
-        return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
-            f"?token={self._token}" if self._token else ""
-        )
+        return link_to(self.serving.host, self.server.get_port(), self._token)
 
     @property
     def browsing(self) -> tuple[Browsing, ...]:
@@ -222,6 +224,11 @@ class Viewer:
                 notify(browsing.client, "Error", message)
 
 
+def _window(camera: viser.CameraHandle) -> tuple[int, int]:
+    """Return width and height of the window of a browser, px: at least 16, also of one that has none yet."""
+    return max(16, int(camera.image_width)), max(16, int(camera.image_height))
+
+
 def notify(client: viser.ClientHandle, title: str, body: str) -> None:
     """Show a message in a browser for some seconds."""
     client.add_notification(title, body, auto_close_seconds=12.0)
@@ -246,9 +253,3 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         console.quiet = before
-
-
-def _name_of_machine() -> str:
-    import socket
-
-    return socket.gethostname() or "localhost"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -32,6 +33,14 @@ class Eye:
     position: tuple[float, ...]
     fov: float
     size: tuple[int, int]
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether there is such a camera: browsers may send anything."""
+        numbers = (*self.wxyz, *self.position, self.fov)
+        return (
+            all(map(math.isfinite, numbers)) and math.hypot(*self.wxyz) > 1e-6 and self.fov > 0 and min(self.size) > 0
+        )
 
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
         """Return the camera for images of ``size``; None: that of the window."""
@@ -103,13 +112,16 @@ class Session:
 
     eye: Eye | None
 
-    def move(self, eye: Eye) -> None:
-        """The browser's camera is now ``eye``."""
+    def move(self, eye: Eye) -> bool:
+        """Look from ``eye`` from now on; return False, and go on as before, where there is no such camera."""
+        if not eye.is_possible:
+            return False
         with self._lock:
             if eye == self.eye:
-                return
+                return True
             self.eye = eye
         self._note_change()
+        return True
 
     def change(self, **changes: Any) -> None:
         """Show something else: attributes of ``Look``."""
@@ -216,11 +228,11 @@ class Session:
             area = self._pace.next_area(int(self._refined_area), None if is_moving else self._drawn_area or 1.0)
             if self._is_stale and not is_moving:
                 area = max(area, self._drawn_area or 0.0)
-            shot = self.shot(size_within(self._full_size, area))
             viewed, version = self.viewed, self._changed_at
             self._is_stale = False
             self._drawn_area, self._is_refined = self._full_area, True  # if it fails, it is not tried again
-        start = self._clock()
+            self._drawn_at = start = self._clock()
+            shot = self.shot(size_within(self._full_size, area))
         image = draw(viewed, shot)
         pixels = image.shape[0] * image.shape[1]
         if not self.closed:
@@ -228,7 +240,7 @@ class Session:
         end = self._clock()
         with self._lock:
             self._pace.observe(pixels, end - start, is_refined=not is_moving)
-            self._drawn_at, self._is_refined = start, not is_moving
+            self._is_refined = not is_moving
             self._drawn_area = area if version == self._changed_at else None
             self._end_of_play()
 

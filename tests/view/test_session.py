@@ -79,6 +79,26 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     assert looked.session.due() == 0.0
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"wxyz": (0.0, 0.0, 0.0, 0.0)},
+        {"wxyz": (float("nan"), 0.0, 0.0, 1.0)},
+        {"position": (0.0, float("inf"), 0.0)},
+        {"fov": 0.0},
+        {"size": (0, 40)},
+    ],
+)
+def test_cameras_that_cannot_be_are_ignored(change: dict) -> None:
+    looked = Looked()
+    assert not looked.session.move(replace(eye(), **change))
+    assert looked.session.due() is None
+    looked.session.move(eye())
+    looked.after(1)
+    assert not looked.session.move(replace(eye(), **change))
+    assert looked.session.eye == eye()
+
+
 def test_the_newest_camera_wins() -> None:
     looked = Looked()
     for x in (0.1, 0.2, 0.3):
