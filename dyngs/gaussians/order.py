@@ -1,4 +1,4 @@
-"""The order in which Gaussians are stored: neighbours in space are neighbours in the file and predict each other."""
+"""The order in which files hold Gaussians: neighbours in space are neighbours there, and predict each other."""
 
 from __future__ import annotations
 

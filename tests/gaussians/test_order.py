@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyngs.storage.order import morton_order, storage_order
+from dyngs.gaussians.order import morton_order, storage_order
 
 
 def test_corners_of_a_cube_follow_the_z_curve() -> None:
