@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from dyngs.errors import DyngsError
-    from dyngs.output.roundtrip import compare_splats
+    from dyngs.export.redrawn import compare_splats
     from dyngs.splats.formats import format_of, read_splats, upright, write_splats
 
     format_of(arguments.target)  # before a large file is read

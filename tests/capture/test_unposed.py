@@ -14,9 +14,9 @@ from dyngs.capture.sfm import SfmOptions, SfmResult
 from dyngs.capture.unposed import with_poses
 from dyngs.config import DataConfig
 from dyngs.errors import DyngsError
+from dyngs.export.video import VideoWriter
 from dyngs.files.cache import cache_folder
 from dyngs.files.write import write_image
-from dyngs.output.video import VideoWriter
 
 
 @pytest.fixture(autouse=True)

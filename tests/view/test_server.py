@@ -84,7 +84,7 @@ def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
     recording = Recording((Keyframe(session.eye.camera(), session.time),))
     folder.mkdir()
     path = folder / "path.json"
-    path.write_text(recording.document(session.eye.size, 30.0, session.viewed.world_offset))
+    path.write_text(recording.document(session.eye.size, 30.0, session.opened.world_offset))
     assert main(["render", str(run), "--path", str(path), "--out", str(folder / "out")]) == 0
     return np.asarray(Image.open(folder / "out" / "frame_0000.png").convert("RGB"))
 
