@@ -28,11 +28,11 @@ from torch import Tensor
 
 from dyngs.bench.rasterize import Workload, garden_workload, random_workload
 from dyngs.camera import Cameras
+from dyngs.camera_paths.orbit import frame_orbit_for_points
 from dyngs.compat import rasterization
 from dyngs.ops.device import why_no_gpu
-from dyngs.output.orbit import frame_orbit_for_points
-from dyngs.output.render_job import axis
 from dyngs.splats.formats import read_splats
+from dyngs.splats.rotation import axis_of
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 Arguments = dict[str, Any]
@@ -71,7 +71,7 @@ def of_file(path: Path, size: tuple[int, int]) -> Arguments:
     """The same of a file of Gaussians, seen from a little above."""
     file = read_splats(path, nonfinite="skip")
     splat = file.gaussians
-    cameras = frame_orbit_for_points(splat.means.double().numpy(), 1, size, axis(file.up or "z"))
+    cameras = frame_orbit_for_points(splat.means.double().numpy(), 1, size, axis_of(file.up or "z"))
     trained = {
         "means": splat.means,
         "quats": splat.quats,

@@ -28,8 +28,8 @@ from dyngs.evaluate.report import evaluate_run, scene_of_split, split_views
 from dyngs.export.scene_file import write_scene_file
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.storage.drawable import drawable
 from dyngs.storage.file import read_scene
+from dyngs.storage.tensors import drawable
 
 ONCE = "prune.steps=1"
 NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.fraction=0"

@@ -15,11 +15,11 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.export.run_to_splats import export_ply
-from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
-from dyngs.output.job_of_run import job_of_run
-from dyngs.output.render_job import RenderJobOptions
+from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.images import OutputOptions, write_path_images, write_split_images
+from dyngs.export.splat_files import write_run_splats
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
+from dyngs.runs.opened import open_run
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -91,12 +91,11 @@ def _run_demo(folder: Path, options: DemoOptions, start: float) -> DemoResult:
     print("[3/4] evaluating on held-out views", flush=True)
     report = evaluate_run(run_dir, threads=options.threads)
     print("[4/4] rendering the test views and an orbit around the moving scene", flush=True)
-    write_split_images(run_dir, "test", images)
-    job = job_of_run(run_dir, RenderJobOptions("orbit", options.num_frames))
-    video = folder / "orbit.mp4"
-    output = OutputOptions(video=video)
-    write_job_images(job, None, output)
-    ply = export_ply(run_dir, folder / "splats.ply")
+    opened, video = open_run(run_dir), folder / "orbit.mp4"
+    write_split_images(opened, "test", images)
+    path = choose_path(opened, PathOptions("orbit", options.num_frames))
+    write_path_images(opened, path, None, OutputOptions(video=video))
+    ply = write_run_splats(opened, folder / "splats.ply").path
     seconds = time.perf_counter() - start
     return DemoResult(folder, capture, run_dir, images, images / "sheet.png", video, ply, report, seconds)
 

@@ -234,8 +234,8 @@ def read_a_run(root: Path) -> object:
 
 def read_a_person(root: Path) -> object:
     """Read an avatar and render it."""
-    from dyngs.export.avatar import read_avatar
     from dyngs.gaussians.scene import render_options
+    from dyngs.runs.avatar import read_avatar
 
     run = read_avatar(only(root))
     return run.info, played(run.scene, render_options(run.config.model))
@@ -262,7 +262,7 @@ def read_override_lines(root: Path) -> object:
 
 def read_a_path(root: Path) -> object:
     """Read a camera path."""
-    from dyngs.output.camera_paths import read_path
+    from dyngs.camera_paths.path import read_path
 
     path = read_path(only(root))
     return path.cameras, path.fps, path.times
@@ -279,8 +279,8 @@ def read_a_point(root: Path) -> object:
 
 def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
+    from dyngs.camera_paths.path import parse_times
     from dyngs.data.times import parse_frames
-    from dyngs.output.camera_paths import parse_times
     from dyngs.tradeoff.table import parse_requirements
     from dyngs.tradeoff.variants import parse_variations
 

@@ -16,16 +16,16 @@ from tiny_fields import stirred_field
 
 from dyngs.build import restored_scene
 from dyngs.camera import Cameras
+from dyngs.camera_paths.path import CameraPath, write_path
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
-from dyngs.export.avatar import _KIND as AVATAR_KIND
 from dyngs.files.tensor_file import write_tensors
 from dyngs.gaussians.scene import Scene
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.output.camera_paths import CameraPath, write_path
+from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.splats import formats
 from dyngs.splats.ply import write_ply

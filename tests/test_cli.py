@@ -182,7 +182,7 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("render nowhere --out x --time 0 --times 0:1:2", "not allowed with"),
         ("render nowhere --out x --path orbit --view 3", "--view renders from a fixed camera"),
         ("render nowhere --out x --times 0:1:2 --frames 3", "--times and --frames both set"),
-        ("export nowhere", "nowhere: not a run folder"),
+        ("export nowhere", "nowhere: no such file or folder"),
         ("export nowhere --times 0:1", "'0:1' is no range of times; write START:STOP:COUNT"),
         ("export nowhere --times 0:nan:3", "times must be finite"),
         ("export nowhere --time inf", "'inf' is not a time"),

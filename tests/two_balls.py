@@ -1,4 +1,4 @@
-"""Two balls, cameras that turn about them, and the job of drawing them."""
+"""Two balls, and cameras that turn about them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,6 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.output.camera_paths import CameraPath
-from dyngs.output.render_job import DEFAULT_OPTIONS, RenderJob
-from dyngs.static.scene import StaticScene
 
 
 def two_balls(distance: float = 4.0) -> Gaussians:
@@ -33,11 +29,3 @@ def cameras_around(count: int, width: int = 24, height: int = 18, distance: floa
         poses[i, 2, 3] = distance
     intrinsics = torch.tensor([[24.0, 0, width / 2], [0, 24, height / 2], [0, 0, 1]]).repeat(count, 1, 1)
     return Cameras(poses, intrinsics, width, height)
-
-
-def balls_job(
-    cameras: Cameras, options: RenderOptions = DEFAULT_OPTIONS, background: torch.Tensor | None = None
-) -> RenderJob:
-    """The two balls seen by ``cameras``."""
-    scene = StaticScene(gaussians=two_balls())
-    return RenderJob(scene, CameraPath(cameras), options, background)

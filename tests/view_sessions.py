@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import torch
 from moving_scene import Sliding, camera, moving_scene
 
+from dyngs.gaussians.scene import Scene
+from dyngs.runs.opened import Opened, opened_scene
 from dyngs.view.cameras import pose_of
+from dyngs.view.captured_views import Viewpoint
 from dyngs.view.session import Eye, Sent, Session
-from dyngs.view.viewed import Viewed
 
 
-def balls() -> Viewed:
+def opened_at(scene: Scene, name: str = "balls") -> Opened:
+    """A scene on white, looked at from 4 away."""
+    opened = replace(opened_scene(replace(scene, background=torch.ones(3)), Path(name)), stated_up="-y")
+    opened.once("viewpoint", lambda: Viewpoint(camera(), np.zeros(3), 4.0, np.array([0.0, -1, 0])))
+    return opened
+
+
+def balls() -> Opened:
     """Five balls of which two move."""
-    scene = moving_scene(Sliding())
-    return Viewed("balls", scene, scene.options, torch.ones(3), camera(), np.zeros(3), 4.0, np.array([0.0, -1, 0]))
+    return opened_at(moving_scene(Sliding()))
 
 
 def looking_at_balls(size: tuple[int, int] = (200, 150)) -> tuple[Session, list[Sent]]:

@@ -4,15 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dyngs.errors import DyngsError
-from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
-from dyngs.export.avatar import read_avatar
-from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import Scene
-from dyngs.runs.checkpoint import SCENE_FILE, load_run
-from dyngs.splats.formats import all_suffixes, known_format, read_splats
-from dyngs.splats.splat_file import splat_options
-from dyngs.static.scene import StaticScene
+from dyngs.runs.opened import open_scene
 
 
 def load(path: Path | str) -> Scene:
@@ -28,18 +21,4 @@ def load(path: Path | str) -> Scene:
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    path = Path(path)
-    if path.is_dir():
-        return load_run(path).scene
-    if not path.exists():
-        raise DyngsError(f"{path}: no such file or folder")
-    if path.name == SCENE_FILE:
-        return load_run(path.parent).scene
-    if path.suffix.lower() == AVATAR_SUFFIX:
-        return read_avatar(path).scene
-    if known_format(path) is None:
-        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
-        other = command_for(path)
-        raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
-    splat = read_splats(path)
-    return StaticScene(gaussians=splat.gaussians, options=splat_options(splat))
+    return open_scene(Path(path)).scene

@@ -19,10 +19,10 @@ from dyngs.prune.stage import default_scores, probe_images, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
-from dyngs.storage.drawable import drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.quantize import step_below
+from dyngs.storage.tensors import drawable
 from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 

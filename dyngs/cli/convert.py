@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Convert the file, and print how much that changes what it shows."""
     from dataclasses import replace
 
-    from dyngs.output.roundtrip import compare_splats
+    from dyngs.export.redrawn import compare_splats
     from dyngs.splats.formats import format_of, read_splats, upright, write_splats
 
     format_of(arguments.target)  # before a large file is read

@@ -11,10 +11,10 @@ from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, known_suffix, prin
 from dyngs.errors import DyngsError
 
 if TYPE_CHECKING:
-    from dyngs.export.run_to_splats import Part
+    from dyngs.export.redrawn import Redrawn
+    from dyngs.export.splat_files import Part
     from dyngs.gaussians.scene import Scene
-    from dyngs.output.roundtrip import Redrawn
-    from dyngs.runs.checkpoint import LoadedRun
+    from dyngs.runs.opened import Opened
     from dyngs.splats.formats import Written
 
 _OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
@@ -97,8 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.cli.export_cameras import export_cameras
     from dyngs.cli.export_html import export_page
     from dyngs.cli.export_rigged import export_rigged
-    from dyngs.export.avatar import read_avatar
-    from dyngs.runs.checkpoint import load_run
+    from dyngs.runs.opened import open_scene
 
     arguments.run_dir = run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
@@ -124,20 +123,18 @@ def run(arguments: argparse.Namespace) -> int:
     if kind == "tracks" and arguments.static:
         raise DyngsError("--static goes with --format ply; Gaussians that never move have no tracks")
     times = _times(arguments)
-    loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
+    opened = open_scene(arguments.run_dir)
     if arguments.motion is not None:
-        from dyngs.output.animation import with_motion
-
-        loaded = with_motion(loaded, arguments.motion).run
-        times = loaded.scene.times if times is None else times
-    if loaded.scene.is_static and times is not None:
+        opened = opened.in_motion(arguments.motion)
+        times = opened.scene.times if times is None else times
+    if opened.scene.is_static and times is not None:
         print_notes(("nothing moves in this run: it is the same at all times",))
     if kind == "tracks":
-        files = _export_tracks(arguments, loaded, times)
+        files = _export_tracks(arguments, opened, times)
     elif kind == MOVING:
-        files = _export_moving(arguments, loaded, times or loaded.scene.times or (0.0,))
+        files = _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
     else:
-        files = _export_splats(arguments, loaded, times, kind)
+        files = _export_splats(arguments, opened, times, kind)
     size = sum(path.stat().st_size for path in files) / 1e6
     where = files[0] if len(files) == 1 else f"{len(files)} files, {files[0]} to {files[-1].name}"
     print(f"written: {where} ({size:.1f} MB)")
@@ -204,7 +201,7 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
 
 def _export_avatar(arguments: argparse.Namespace) -> int:
     """Write the person of a run as an avatar file."""
-    from dyngs.export.avatar import write_avatar
+    from dyngs.runs.avatar import write_avatar
     from dyngs.runs.checkpoint import load_run
 
     given = ("motion", "time", "times", "static", "dynamic")
@@ -218,8 +215,8 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the times asked for, clamped to [0, 1], or None."""
+    from dyngs.camera_paths.path import parse_times
     from dyngs.evaluate.temporal import clamped_times
-    from dyngs.output.camera_paths import parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
@@ -229,20 +226,19 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
 
 
 def _export_splats(
-    arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None, kind: str
+    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None, kind: str
 ) -> list[Path]:
     """Write a sequence if several times of a moving scene are asked for, else one file; return the paths."""
-    from dyngs.export.run_to_splats import scene_part, write_run_sequence, write_run_splats
-    from dyngs.output.upright import writing_of
+    from dyngs.export.splat_files import scene_part, write_run_sequence, write_run_splats, writing_of
     from dyngs.splats.formats import format_named
 
     own = format_named(kind)
     suffix = own.suffixes[0]
-    if loaded.scene.colour is not None:
+    if opened.scene.colour is not None:
         print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
     part = _part(arguments)
-    scene = scene_part(loaded.scene, part)
-    how, line = writing_of(loaded, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
+    scene = scene_part(opened.scene, part)
+    how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = arguments.times is not None or (arguments.motion is not None and arguments.time is None)
@@ -252,17 +248,17 @@ def _export_splats(
     print_notes((line,))
     if is_sequence and not arguments.static:
         moments = times or ()
-        written = write_run_sequence(loaded, out or arguments.run_dir / stem, moments, part, how, suffix)
+        written = write_run_sequence(opened, out or arguments.run_dir / stem, moments, part, how, suffix)
     else:
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
-        if times is None and not arguments.static and not loaded.scene.is_static:
+        if times is None and not arguments.static and not opened.scene.is_static:
             print_notes(("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",))
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
-        written = [write_run_splats(loaded, path, moments[0], part, how)]
+        written = [write_run_splats(opened, path, moments[0], part, how)]
     shown = sorted({0, len(written) // 2, len(written) - 1})
-    print_redrawn(written[0].notes, [_redrawn(loaded, scene, moments[i], written[i]) for i in shown])
+    print_redrawn(written[0].notes, [_redrawn(opened, scene, moments[i], written[i]) for i in shown])
     return [one.path for one in written]
 
 
@@ -270,41 +266,40 @@ def _part(arguments: argparse.Namespace) -> Part:
     return "still" if arguments.static else "moving" if arguments.dynamic else "all"
 
 
-def _redrawn(loaded: LoadedRun, scene: Scene, time: float, written: Written) -> Redrawn:
+def _redrawn(opened: Opened, scene: Scene, time: float, written: Written) -> Redrawn:
     """Return how a file differs from the scene."""
-    from dyngs.output.roundtrip import compare_run
+    from dyngs.export.redrawn import compare_run
     from dyngs.splats.formats import read_splats
 
-    return compare_run(loaded, scene, time, written.splat, read_splats(written.path))
+    return compare_run(opened, scene, time, written.splat, read_splats(written.path))
 
 
-def _export_moving(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...]) -> list[Path]:
+def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]) -> list[Path]:
     """Write all times as one file of moving Gaussians."""
     from dyngs.export.moving_file import SUFFIX, UP, read_moment, write_moving
-    from dyngs.export.run_to_splats import scene_part
-    from dyngs.output.roundtrip import compare_run
-    from dyngs.output.upright import writing_of
+    from dyngs.export.redrawn import compare_run
+    from dyngs.export.splat_files import scene_part, writing_of
 
     if arguments.sh_degree is not None:
         raise DyngsError(f"--sh-degree does not go with --format {MOVING}, which holds no harmonics")
-    how, line = writing_of(loaded, UP, arguments.up, arguments.from_up)
+    how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
     print_notes((line,))
-    part, scene = _part(arguments), scene_part(loaded.scene, _part(arguments))
+    part, scene = _part(arguments), scene_part(opened.scene, _part(arguments))
     out = arguments.out or arguments.run_dir
     if not out.is_dir() and out.suffix.lower() != SUFFIX:
         raise DyngsError(f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}")
-    written = write_moving(loaded, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how)
+    written = write_moving(opened, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how)
     shown = sorted({0, len(times) // 2, len(times) - 1})
-    found = [compare_run(loaded, scene, times[i], written.splats[i], read_moment(written.path, i)) for i in shown]
+    found = [compare_run(opened, scene, times[i], written.splats[i], read_moment(written.path, i)) for i in shown]
     print_redrawn(written.notes, found)
     return [written.path]
 
 
-def _export_tracks(arguments: argparse.Namespace, loaded: LoadedRun, times: tuple[float, ...] | None) -> list[Path]:
+def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None) -> list[Path]:
     from dyngs.export.tracks import tracks_of, write_tracks
 
     part = "moving" if arguments.dynamic else "all"
-    tracks = tracks_of(loaded.scene, times or loaded.scene.times or (0.0,), loaded.info.world_offset, part=part)
+    tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)
     count, moments, _ = tracks.positions.shape
     print_notes((f"{count:,} Gaussians, {int(tracks.moving.sum()):,} of them moving, at {moments} times",))
     return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]

@@ -24,7 +24,10 @@ def export_page(arguments: argparse.Namespace) -> int:
     Raises:
         DyngsError: an option that does not go with a page, no run there, or a file that cannot be written.
     """
-    from dyngs.output.page_of_run import PageOptions, write_run_page
+    from dataclasses import replace
+
+    from dyngs.export.html.page import write_page
+    from dyngs.runs.opened import open_scene
 
     for name, reason in _UNFIT.items():
         if getattr(arguments, name) not in (None, False):
@@ -35,12 +38,12 @@ def export_page(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out or source / "scene.html"
     if out.suffix.lower() not in (".html", ".htm") or out.is_dir():
         raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
-    options = PageOptions(
-        motion=arguments.motion,
-        time=0.0 if arguments.time is None else arguments.time,
-        up=arguments.from_up,
-    )
-    written, notes = write_run_page(source, out, options)
-    print_notes(notes)
+    opened = open_scene(source)
+    if arguments.motion is not None:
+        opened = opened.in_motion(arguments.motion)
+    if arguments.from_up is not None:
+        opened = replace(opened, stated_up=arguments.from_up)
+    written = write_page(opened, out, time=0.0 if arguments.time is None else arguments.time)
+    print_notes(written.notes)
     print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); it plays in any browser with WebGL 2, offline")
     return 0

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import is_avatar_file, print_notes
 from dyngs.errors import DyngsError
-
-if TYPE_CHECKING:
-    from dyngs.export.rigged.mesh_file import Played
-    from dyngs.runs.checkpoint import LoadedRun
 
 _UNFIT = ("time", "times", "static", "dynamic", "max_change", "up", "from_up", "sh_degree")
 
@@ -22,8 +17,9 @@ def export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     Raises:
         DyngsError: an option that does not go with it, no run of a person there, or a file that cannot be written.
     """
-    from dyngs.export.rigged.mesh_file import write_mesh
+    from dyngs.export.rigged.mesh_file import Played, write_mesh
     from dyngs.export.rigged.splat_files import write_rigged_splats
+    from dyngs.runs.opened import FRAME_RATE, open_scene
 
     wanted = "--joints" if arguments.joints else "--format mesh"
     for name in _UNFIT:
@@ -46,22 +42,11 @@ def export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         )
     if suffix == ".ply" and arguments.motion is not None:
         raise DyngsError("--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb")
-    loaded, played = _loaded(arguments, is_file)
-    written = (write_rigged_splats if arguments.joints else write_mesh)(loaded, out, played)
+    opened, played = open_scene(source), None
+    if arguments.motion is not None:
+        opened = opened.in_motion(arguments.motion)
+        played = Played(arguments.motion.stem, opened.fps or FRAME_RATE)
+    written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
     print_notes(written.notes)
     print(f"written: {written.path} ({written.path.stat().st_size / 1e6:.1f} MB)")
     return 0
-
-
-def _loaded(arguments: argparse.Namespace, is_file: bool) -> tuple[LoadedRun, Played | None]:
-    """Return the person in the motion that is asked for, and what is known about it."""
-    from dyngs.export.avatar import read_avatar
-    from dyngs.export.rigged.mesh_file import Played
-    from dyngs.output.animation import with_motion
-    from dyngs.runs.checkpoint import load_run
-
-    loaded = (read_avatar if is_file else load_run)(arguments.run_dir)
-    if arguments.motion is None:
-        return loaded, None
-    animated = with_motion(loaded, arguments.motion)
-    return animated.run, Played(arguments.motion.stem, animated.fps)

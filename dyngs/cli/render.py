@@ -14,7 +14,6 @@ from dyngs.cli.arguments import (
     image_size,
     input_path,
     input_word,
-    is_avatar_file,
     output_path,
     print_notes,
     run_of_scene_file,
@@ -26,7 +25,8 @@ from dyngs.errors import DyngsError
 from dyngs.files.wrong_place import command_for
 
 if TYPE_CHECKING:
-    from dyngs.output.render_job import RenderJob
+    from dyngs.export.chosen_path import PathOptions
+    from dyngs.runs.opened import Opened
 
 _EPILOG = """\
 examples:
@@ -166,7 +166,9 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     """Render and return the paths of the written files."""
     import torch
 
-    from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
+    from dyngs.export.chosen_path import choose_path
+    from dyngs.export.images import OutputOptions, write_path_images, write_split_images
+    from dyngs.runs.opened import open_run
 
     device = computing_device(arguments.device)
     if arguments.threads > 0:
@@ -174,43 +176,41 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not (arguments.source.is_file() or arguments.path or _has_fixed_camera(arguments)):
         with ProgressBar() as report:
-            return write_split_images(
-                arguments.source, arguments.split or "test", arguments.out, output, report, device
-            )
-    job = _job(arguments)
-    job = replace(job, scene=job.scene.to(device))
-    print_notes(job.notes, job.path.warnings)
+            opened = open_run(arguments.source)
+            return write_split_images(opened, arguments.split or "test", arguments.out, output, report, device)
+    opened = _opened(arguments)
+    path = choose_path(opened, _path_options(arguments))
+    print_notes((*opened.notes, *path.notes), path.warnings)
     if not arguments.fps:
-        output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, job.path.fps)
+        output = replace(output, fps=path.fps)
     with ProgressBar() as report:
-        return write_job_images(job, arguments.out, output, report)
+        return write_path_images(opened.to(device), path, arguments.out, output, report)
 
 
-def _job(arguments: argparse.Namespace) -> RenderJob:
-    """Return the render job for a run, an avatar file or a .ply."""
-    from dyngs.output.camera_paths import parse_times
-    from dyngs.output.job_of_avatar import job_of_avatar
-    from dyngs.output.job_of_ply import job_of_ply
-    from dyngs.output.job_of_run import job_of_run
-    from dyngs.output.render_job import RenderJobOptions
+def _opened(arguments: argparse.Namespace) -> Opened:
+    """Return what is rendered, in the motion and before the background that are requested."""
+    from dyngs.runs.opened import open_scene
+
+    opened = open_scene(arguments.source, nonfinite="skip")
+    if arguments.motion is not None:
+        opened = opened.in_motion(arguments.motion)
+    elif arguments.pose == "rest":
+        opened = opened.at_rest()
+    elif arguments.split is not None:
+        opened = opened.of_split(arguments.split)
+    if arguments.background is not None:
+        opened = opened.on_background(arguments.background)
+    return opened if arguments.up is None else replace(opened, stated_up=arguments.up)
+
+
+def _path_options(arguments: argparse.Namespace) -> PathOptions:
+    from dyngs.camera_paths.path import parse_times
+    from dyngs.export.chosen_path import PathOptions
 
     times = None if arguments.time is None else (arguments.time,)
     num_frames = arguments.frames
     if arguments.times is not None:
         times = parse_times(arguments.times)
         num_frames = len(times)
-    options = RenderJobOptions(
-        path=None if _has_fixed_camera(arguments) else arguments.path or "orbit",
-        num_frames=num_frames,
-        size=arguments.size,
-        background=arguments.background,
-        up=arguments.up,
-        times=times,
-        view=arguments.view,
-        split=arguments.split,
-        motion=arguments.motion,
-        at_rest=arguments.pose == "rest",
-    )
-    if not arguments.source.is_file():
-        return job_of_run(arguments.source, options)
-    return (job_of_avatar if is_avatar_file(arguments.source) else job_of_ply)(arguments.source, options)
+    path = None if _has_fixed_camera(arguments) else arguments.path or "orbit"
+    return PathOptions(path, num_frames, arguments.size, times, arguments.view, arguments.split)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli.arguments import print_notes
 
 if TYPE_CHECKING:
-    from dyngs.output.roundtrip import Redrawn
+    from dyngs.export.redrawn import Redrawn
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
 """Names of ``dyngs.splats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not import them."""

@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_viser()
     import torch
 
-    from dyngs.view.people import motion_files, person_in
+    from dyngs.view.people import motion_files
     from dyngs.view.server import Serving, Viewer
     from dyngs.view.source import first_of, open_source
 
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     motions = motion_files(arguments.motion)
     source = open_source(arguments.source, arguments.up, arguments.capture, computing_device(arguments.device))
     first = first_of(source)
-    if motions and person_in(first) is None:
+    if motions and first.person is None:
         raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")
     for note in first.notes:
         print(f"note: {note}")

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean, median
-from typing import Any, cast
+from typing import Any
 
 import torch
 
 from dyngs.config.kinds import field_of
-from dyngs.data.capture import Capture, Split, View, all_views
+from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.tracks import read_true_tracks
@@ -26,12 +26,11 @@ from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene, render_options
-from dyngs.human.avatar.scene import avatar_of
-from dyngs.human.motion.clip import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.background import evaluation_background
 from dyngs.training.views import training_cameras
 
@@ -221,32 +220,6 @@ def _reasons(report: EvalReport, regions: Regions, tracks: TrackScores) -> dict[
 def report_path(run_dir: Path, split: str) -> Path:
     """Return the path of the report of ``split`` in a run folder."""
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
-
-
-def split_views(capture: Capture, split: str) -> Sequence[View]:
-    """Return the views of a split, at least one. Raises DyngsError that lists the splits there are."""
-    views = {name: views for name, views in capture.splits.items() if views}
-    for name, found in views.items():
-        if name == split:
-            return found
-    there = ", ".join(f"{name} ({len(found)} views)" for name, found in views.items())
-    raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
-
-
-def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
-    """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that split.
-
-    The split pose, and splits with body parameters of their own, have the poses of their files. Others show the clip of
-    training with its refined poses, interpolated at times between.
-    """
-    avatar = avatar_of(run.scene)
-    if avatar is None or capture.body is None:
-        return run.scene
-    given, trained = capture.body[cast(Split, split)], capture.body["train"]
-    if split != "pose" and same_bodies(given, trained):
-        return run.scene
-    shown = captured_motion(capture.root, given, split_views(capture, split), avatar.skeleton.joints)
-    return avatar.playing(shown.clip)
 
 
 def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> dict[str, MetricValue]:

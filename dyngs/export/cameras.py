@@ -13,6 +13,7 @@ from dyngs.data.capture import Capture, PointCloud, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.files.write import atomic_file, write_text
 from dyngs.runs.inputs import inputs_of
+from dyngs.splats.ply_header import header_bytes
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -97,14 +98,12 @@ def _way(file: Path, folder: Path) -> str:
 
 def _write_points(path: Path, points: PointCloud, offset: np.ndarray) -> None:
     """Write points with their colours as a binary .ply."""
-    fields = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(points.xyz), dtype=fields)
+    colours = ("red", "green", "blue")
+    rows = np.empty(len(points.xyz), dtype=[*((name, "<f8") for name in "xyz"), *((name, "u1") for name in colours)])
     for i, name in enumerate("xyz"):
         rows[name] = points.xyz[:, i] + offset[i]
-    for i, name in enumerate(("red", "green", "blue")):
+    for i, name in enumerate(colours):
         rows[name] = points.rgb[:, i]
-    kinds = {"<f8": "double", "u1": "uchar"}
-    lines = [f"property {kinds[kind]} {name}" for name, kind in fields]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *lines, "end_header"]
+    properties = [*(("double", name) for name in "xyz"), *(("uchar", name) for name in colours)]
     with atomic_file(path) as temporary:
-        temporary.write_bytes(("\n".join(header) + "\n").encode() + rows.tobytes())
+        temporary.write_bytes(header_bytes([("vertex", len(rows), properties)]) + rows.tobytes())

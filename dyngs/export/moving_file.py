@@ -17,13 +17,11 @@ import torch
 
 from dyngs.conventions import SH_C0
 from dyngs.errors import DyngsError
-from dyngs.export.run_to_splats import AS_THEY_ARE, Part, Writing, scene_part, splats_at
+from dyngs.export.splat_files import AS_THEY_ARE, Part, Writing, scene_part, splats_at
 from dyngs.files.write import atomic_file
-from dyngs.gaussians import Gaussians
-from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
-from dyngs.splats.packing import logit
-from dyngs.splats.splat_file import SplatFile, drawable, unit_rotations
+from dyngs.runs.opened import Opened
+from dyngs.splats.splat_file import SplatFile, drawable, from_linear, unit_rotations
 
 SUFFIX = ".4dgs"
 UP = "-y"
@@ -49,12 +47,12 @@ class MovingFile:
 
 
 def write_moving(
-    run: LoadedRun, path: Path, times: Sequence[float], part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: Opened, path: Path, times: Sequence[float], part: Part = "all", how: Writing = AS_THEY_ARE
 ) -> MovingFile:
     """Write a run at T times as one .4dgs, each shown for 1/30 s.
 
     Args:
-        run: a trained model.
+        opened: a trained model.
         path: output file; an old one is replaced when the new one is complete.
         times: T >= 1 times in [0, 1].
         part: all Gaussians, or only the moving or static ones.
@@ -63,10 +61,10 @@ def write_moving(
     Raises:
         DyngsError: the package is missing, the part is empty, or the file cannot be written.
     """
-    inputs_of(run).require_output(path)
+    inputs_of(opened).require_output(path)
     model, delta = _packages(path)
-    scene = scene_part(run.scene, part)
-    splats = tuple(splats_at(run, scene, time, how) for time in times)
+    scene = scene_part(opened.scene, part)
+    splats = tuple(splats_at(opened, scene, time, how) for time in times)
     duration = len(times) / FPS
     samples = [_sample(splat, i / FPS, duration, model, delta) for i, splat in enumerate(splats)]
     options = delta.KeyframeDeltaOptions(keyframe_every=_KEYFRAME_EVERY)
@@ -89,13 +87,9 @@ def read_moment(path: Path, index: int) -> SplatFile:
     _packages(path)
     reader = import_module("fourdgs.keyframe_delta_file")
     found = reader.render_at(reader.decode_streamed(path.read_bytes()), (index + 0.5) / FPS)
-    quats = torch.from_numpy(found["rotations"][:, [3, 0, 1, 2]].astype(np.float32))
-    gaussians = Gaussians(
-        means=torch.from_numpy(found["centers"].astype(np.float32)),
-        quats=unit_rotations(quats),
-        log_scales=torch.from_numpy(np.log(found["scales"]).astype(np.float32)),
-        logit_opacities=torch.from_numpy(logit(found["opacity"])),
-        sh=torch.from_numpy(((found["rgb"] - 0.5) / SH_C0).astype(np.float32))[:, None],
+    sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
+    gaussians = from_linear(
+        found["centers"], found["rotations"][:, [3, 0, 1, 2]], found["scales"], found["opacity"], sh
     )
     return drawable(SplatFile(gaussians), path, "error")
 

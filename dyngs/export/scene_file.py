@@ -17,10 +17,10 @@ from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.inputs import inputs_of
-from dyngs.storage.drawable import FIELD, drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
+from dyngs.storage.tensors import FIELD, drawable
 from dyngs.training.state import Checkpoint
 
 MISSED = 1.05

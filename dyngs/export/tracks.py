@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dyngs.errors import DyngsError
-from dyngs.export.run_to_splats import scene_part
+from dyngs.export.splat_files import scene_part
 from dyngs.files.write import atomic_file
 from dyngs.gaussians.scene import Scene
 

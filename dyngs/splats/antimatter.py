@@ -13,9 +13,7 @@ import torch
 
 from dyngs.conventions import SH_C0
 from dyngs.errors import DyngsError
-from dyngs.gaussians import Gaussians
-from dyngs.splats.packing import logit
-from dyngs.splats.splat_file import SplatFile, require_count, unit_rotations
+from dyngs.splats.splat_file import SplatFile, from_linear, require_count
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
@@ -28,16 +26,8 @@ def read_antimatter(path: Path) -> SplatFile:
     require_count(path, size // _ROW.itemsize, size, _ROW.itemsize)
     rows = np.fromfile(path, _ROW)
     rgba = rows["rgba"].astype(np.float32) / 255
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_scales = np.log(rows["scales"])
-    gaussians = Gaussians(
-        means=torch.from_numpy(rows["means"].astype(np.float32)),
-        quats=unit_rotations(torch.from_numpy((rows["quats"].astype(np.float32) - 128) / 128)),
-        log_scales=torch.from_numpy(log_scales.astype(np.float32)),
-        logit_opacities=torch.from_numpy(logit(rgba[:, 3])),
-        sh=torch.from_numpy((rgba[:, :3] - 0.5) / SH_C0)[:, None].contiguous(),
-    )
-    return SplatFile(gaussians)
+    quats, sh = (rows["quats"].astype(np.float32) - 128) / 128, (rgba[:, None, :3] - 0.5) / SH_C0
+    return SplatFile(from_linear(rows["means"], quats, rows["scales"], rgba[:, 3], sh))
 
 
 def write_antimatter(path: Path, splat: SplatFile) -> None:

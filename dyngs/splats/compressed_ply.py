@@ -15,10 +15,10 @@ import torch
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.splats.packing import logit, morton_order, pack_fractions, smallest_three, unpack_fractions, whole_rotations
-from dyngs.splats.ply_comments import header_comments
-from dyngs.splats.ply_header import PlyHeader
-from dyngs.splats.splat_file import MOST_LOG_SCALE, SplatFile, require_count
+from dyngs.gaussians.order import morton_order
+from dyngs.splats.packing import logit, pack_fractions, smallest_three, unpack_fractions, whole_rotations
+from dyngs.splats.ply_header import PlyHeader, header_bytes
+from dyngs.splats.splat_file import MOST_LOG_SCALE, SplatFile, header_comments, require_count
 
 _PER_CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -118,16 +118,11 @@ def write_compressed(path: Path, splat: SplatFile) -> None:
 
 
 def _header(splat: SplatFile, chunks: int, count: int, rest: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {comment}" for comment in header_comments(splat)]
-    lines.append(f"element chunk {chunks}")
-    lines += [f"property float {name}" for names in _RANGES.values() for name in names]
-    lines.append(f"element vertex {count}")
-    lines += [f"property uint {name}" for name in _PACKED]
+    ranges = [("float", name) for names in _RANGES.values() for name in names]
+    elements = [("chunk", chunks, ranges), ("vertex", count, [("uint", name) for name in _PACKED])]
     if rest:
-        lines.append(f"element sh {count}")
-        lines += [f"property uchar f_rest_{i}" for i in range(rest)]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+        elements.append(("sh", count, [("uchar", f"f_rest_{i}") for i in range(rest)]))
+    return header_bytes(elements, header_comments(splat))
 
 
 def _read_rest(header: PlyHeader, file: BinaryIO, path: Path, count: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
-from dyngs.splats.rotation import AXES, axis_of, product, turn_between, turned
+from dyngs.splats.rotation import axis_of, product, turn_between, turned
 from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, unit_rotations, with_degree
 
 
@@ -191,11 +191,6 @@ def turned_file(splat: SplatFile, turn: tuple[float, float, float, float], up: s
     """Return the contents turned by a quaternion wxyz about the origin, ``up`` being what then points up."""
     gaussians = turned(splat.gaussians, turn)
     return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
-
-
-def up_choices() -> tuple[str, ...]:
-    """Return what ``--up`` of a file that is written takes."""
-    return (*AXES, "keep")
 
 
 def _unit(gaussians: Gaussians) -> Gaussians:

@@ -23,9 +23,8 @@ from dyngs.errors import DyngsError, reading
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.splats.compressed_ply import is_compressed, read_compressed, write_compressed
-from dyngs.splats.ply_comments import described, header_comments
-from dyngs.splats.ply_header import PlyHeader, read_header
-from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, unit_rotations
+from dyngs.splats.ply_header import PlyHeader, header_bytes, read_header
+from dyngs.splats.splat_file import Nonfinite, SplatFile, described, drawable, header_comments, unit_rotations
 
 __all__ = ["read_ply", "read_raw", "write_compressed", "write_ply", "write_raw"]
 
@@ -101,7 +100,7 @@ def read_raw(path: Path) -> SplatFile:
                 gaussians = read_compressed(header, file, path)
             else:
                 degree = _check_properties(header, path)
-                gaussians = _gaussians(header.read_vertices(file, path), degree)
+                gaussians = _gaussians(header.read_element(file, path), degree)
     except OSError as error:
         raise DyngsError(f"{path}: cannot read: {error.strerror or error}") from error
     return described(SplatFile(gaussians, comments=header.comments), path)
@@ -143,14 +142,8 @@ _REQUIRED = ("x", "y", "z", *_DC, "opacity", *_SCALE, *_ROT)
 
 
 def _header(comments: Iterable[str], count: int, num_terms: int, more: tuple[str, ...] = ()) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0"]
-    for comment in comments:
-        if "\n" in comment or "\r" in comment or not comment.isascii():
-            raise ValueError(f"a .ply comment must be one line of ASCII: {comment!r}")
-        lines.append(f"comment {comment}")
-    lines.append(f"element vertex {count}")
-    lines += [f"property float {name}" for name in (*_property_names(num_terms), *more)]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+    names = (*_property_names(num_terms), *more)
+    return header_bytes([("vertex", count, [("float", name) for name in names])], comments)
 
 
 def _check_properties(header: PlyHeader, path: Path) -> int:

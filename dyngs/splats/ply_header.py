@@ -1,8 +1,9 @@
-"""Strict parser of .ply headers and of the vertex data after them."""
+"""Headers of .ply files, read strictly and written, and the data after them."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -47,83 +48,87 @@ class PlyHeader:
 
     Attributes:
         byte_order: "<", ">" or None for ascii.
-        elements: all elements in file order, up to and including ``vertex``.
+        elements: all elements in file order.
         comments: comments of the header.
         data_start: offset of the first byte after the header.
-        later: the elements after ``vertex``.
     """
 
     byte_order: str | None
     elements: tuple[_Element, ...]
     comments: tuple[str, ...]
     data_start: int
-    later: tuple[_Element, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all elements, in file order."""
-        return tuple(element.name for element in (*self.elements, *self.later))
-
-    def read_element(self, file: BinaryIO, path: Path, name: str) -> np.ndarray:
-        """Read an element of a binary file as a structured array (N,).
-
-        Raises:
-            DyngsError: the file is ascii or truncated, or list properties hide where the element is.
-        """
-        index = self.names.index(name)
-        wanted, earlier = (*self.elements, *self.later)[index], (*self.elements, *self.later)[:index]
-        if self.byte_order is None or any(element.has_list for element in (*earlier, wanted)):
-            raise DyngsError(f"{path}: its element {name:.60} is ascii or has lists; export it again")
-        dtype = wanted.dtype(self.byte_order)
-        skipped = self.data_start + sum(e.count * e.dtype(self.byte_order).itemsize for e in earlier)
-        file.seek(0, os.SEEK_END)
-        if file.tell() < skipped + wanted.count * dtype.itemsize:
-            raise DyngsError(f"{path}: is truncated: the element {name:.60} ends at byte {file.tell()}")
-        file.seek(skipped)
-        return np.fromfile(file, dtype=dtype, count=wanted.count)
+        return tuple(element.name for element in self.elements)
 
     @property
     def vertex_names(self) -> tuple[str, ...]:
         """Names of the vertex properties, in file order."""
-        return tuple(name for name, _ in self.elements[-1].properties)
+        return tuple(name for name, _ in self.elements[self.names.index("vertex")].properties)
 
-    def read_vertices(self, file: BinaryIO, path: Path) -> np.ndarray:
-        """Read the vertices as a structured array (N,). Raises DyngsError if the file is truncated."""
-        vertex, earlier = self.elements[-1], self.elements[:-1]
-        if any(element.has_list for element in self.elements):
-            raise DyngsError(f"{path}: has list properties in or before its vertices, so it is not a 3DGS .ply")
+    def read_element(self, file: BinaryIO, path: Path, name: str = "vertex") -> np.ndarray:
+        """Read an element as a structured array (N,).
+
+        Raises:
+            DyngsError: the file is truncated, or list properties hide where the element is.
+        """
+        index = self.names.index(name)
+        wanted, earlier = self.elements[index], self.elements[:index]
+        if any(element.has_list for element in self.elements[: index + 1]):
+            raise DyngsError(f"{path}: has list properties in or before its {name:.60}, so it is not a 3DGS .ply")
         file.seek(0, os.SEEK_END)
         available = file.tell() - self.data_start
         file.seek(self.data_start)
         if self.byte_order is None:
-            return self._read_ascii(file, path, available)
+            return _read_ascii(file, path, wanted, sum(element.count for element in earlier), available)
         skipped = sum(e.count * e.dtype(self.byte_order).itemsize for e in earlier)
-        dtype = vertex.dtype(self.byte_order)
-        expected = skipped + vertex.count * dtype.itemsize
+        dtype = wanted.dtype(self.byte_order)
+        expected = skipped + wanted.count * dtype.itemsize
         if available < expected:
             raise DyngsError(
-                f"{path}: is truncated: {vertex.count} vertices of {dtype.itemsize} bytes need {expected} bytes after "
-                f"the header, found {available}"
+                f"{path}: is truncated: {wanted.count} rows of {name:.60}, of {dtype.itemsize} bytes, need {expected} "
+                f"bytes after the header, found {available}"
             )
         file.seek(self.data_start + skipped)
-        return np.fromfile(file, dtype=dtype, count=vertex.count)
+        return np.fromfile(file, dtype=dtype, count=wanted.count)
 
-    def _read_ascii(self, file: BinaryIO, path: Path, available: int) -> np.ndarray:
-        vertex = self.elements[-1]
-        width, skipped = len(vertex.properties), sum(element.count for element in self.elements[:-1])
-        # The shortest possible row is one character and one separator per value.
-        expected = skipped + max(2 * width * vertex.count - 1, 0)
-        if available < expected:
-            raise DyngsError(
-                f"{path}: is truncated: {vertex.count} vertices of {width} values need at least {expected} bytes after "
-                f"the header, found {available}"
-            )
-        rows = np.empty((vertex.count, width), dtype=np.float64)
-        for _ in range(skipped):
-            file.readline()
-        for i in range(vertex.count):
-            rows[i] = _ascii_row(file.readline(), width, i, path)
-        return rows.view([(name, "f8") for name in self.vertex_names])[:, 0]
+
+def _read_ascii(file: BinaryIO, path: Path, wanted: _Element, skipped: int, available: int) -> np.ndarray:
+    """Return the rows of an element after ``skipped`` lines, float64."""
+    width = len(wanted.properties)
+    # The shortest possible row is one character and one separator per value.
+    expected = skipped + max(2 * width * wanted.count - 1, 0)
+    if available < expected:
+        raise DyngsError(
+            f"{path}: is truncated: {wanted.count} rows of {width} values need at least {expected} bytes after the "
+            f"header, found {available}"
+        )
+    rows = np.empty((wanted.count, width), dtype=np.float64)
+    for _ in range(skipped):
+        file.readline()
+    for i in range(wanted.count):
+        rows[i] = _ascii_row(file.readline(), width, i, path)
+    return rows.view([(name, "f8") for name, _ in wanted.properties])[:, 0]
+
+
+def header_bytes(elements: Sequence[tuple[str, int, Sequence[tuple[str, str]]]], comments: Iterable[str] = ()) -> bytes:
+    """Return the header of a binary little-endian .ply.
+
+    Args:
+        elements: name, count, and properties as (type, name), such as ("float", "x").
+        comments: one line of ASCII each.
+    """
+    lines = ["ply", "format binary_little_endian 1.0"]
+    for comment in comments:
+        if "\n" in comment or "\r" in comment or not comment.isascii():
+            raise ValueError(f"a .ply comment must be one line of ASCII: {comment!r}")
+        lines.append(f"comment {comment}")
+    for name, count, properties in elements:
+        lines.append(f"element {name} {count}")
+        lines += [f"property {kind} {own}" for kind, own in properties]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
 def read_header(file: BinaryIO, path: Path) -> PlyHeader:
@@ -161,9 +166,8 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise DyngsError(f"{path}: has no vertices, so it is not a 3DGS .ply")
-    upto = names.index("vertex") + 1
-    whole = [replace(e, properties=tuple(own.items())) for e, own in zip(elements, properties, strict=True)]
-    return PlyHeader(byte_order, tuple(whole[:upto]), tuple(comments), file.tell(), tuple(whole[upto:]))
+    whole = tuple(replace(e, properties=tuple(own.items())) for e, own in zip(elements, properties, strict=True))
+    return PlyHeader(byte_order, whole, tuple(comments), file.tell())
 
 
 def _next_line(file: BinaryIO, path: Path) -> str:

@@ -20,8 +20,8 @@ from dyngs.conventions import RasterizeMode, num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
-from dyngs.splats.packing import largest_and_others, logit, morton_order, with_largest
-from dyngs.splats.palette import codebook, nearest_entries, palette
+from dyngs.gaussians.order import morton_order
+from dyngs.splats.packing import codebook, largest_and_others, logit, nearest_entries, palette, with_largest
 from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile
 
 _PER_ROW = 64
@@ -130,9 +130,8 @@ def write_sog(path: Path, splat: SplatFile) -> None:
         files = ["shN_centroids.webp", labelled]
         meta["shN"] = {"count": len(rows), "bands": gaussians.sh_degree, "codebook": values.tolist(), "files": files}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr("meta.json", json.dumps(meta))
-        for name, image in images.items():
-            archive.writestr(name, _encoded(image))
+        for name, data in (("meta.json", json.dumps(meta).encode()), *((n, _encoded(x)) for n, x in images.items())):
+            archive.writestr(zipfile.ZipInfo(name), data)  # without the time of day: equal scenes, equal bytes
 
 
 def _palette_image(indices: np.ndarray) -> np.ndarray:

@@ -23,10 +23,9 @@ from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats import usd_child
-from dyngs.splats.packing import logit
 from dyngs.splats.rotation import turned
 from dyngs.splats.similarity import placement_of
-from dyngs.splats.splat_file import SplatFile, unit_rotations
+from dyngs.splats.splat_file import SplatFile, from_linear
 
 _SECONDS = 600.0
 """Of wall time; the child has less of processor time."""
@@ -116,15 +115,7 @@ def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     n, terms = len(means), num_sh_terms(degree)
     if any(len(arrays[name]) != n for name in ("scales", "opacities", "quats")) or len(sh) != n * terms:
         raise DyngsError(f"{path}: the attributes of its Gaussians have different lengths; export it again")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_scales = np.log(arrays["scales"])
-    found = Gaussians(
-        means=torch.from_numpy(means),
-        quats=unit_rotations(torch.from_numpy(np.ascontiguousarray(arrays["quats"]))),
-        log_scales=torch.from_numpy(log_scales),
-        logit_opacities=torch.from_numpy(logit(arrays["opacities"])),
-        sh=torch.from_numpy(sh.reshape(n, terms, 3)),
-    )
+    found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3))
     placement = placement_of(arrays["world"])
     if placement is None:
         raise DyngsError(f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting")

@@ -28,7 +28,6 @@ from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians.scene import Scene
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
-from dyngs.storage.drawable import completed, drawable, stored_edit
 from dyngs.storage.tensors import (
     COARSENESS,
     Coding,
@@ -36,9 +35,12 @@ from dyngs.storage.tensors import (
     Whole,
     checked_coarseness,
     coding_of,
+    completed,
+    drawable,
     from_whole,
     group_of,
     restored,
+    stored_edit,
     to_whole,
 )
 

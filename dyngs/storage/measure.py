@@ -1,10 +1,10 @@
-"""Storage precision of a trained scene, measured on images of its capture."""
+"""Storage precision of a trained scene, measured on images of its capture, and the coarsest file that will do."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from statistics import fmean
 
 import torch
@@ -19,15 +19,17 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import Scene, render_options
-from dyngs.storage.drawable import drawable
+from dyngs.storage.file import SceneInfo, decoded, encoded
 from dyngs.storage.precision import (
     GREY_LEVELS,
     Precision,
     assumed_precision,
     coarseness_of,
     measured_precision,
+    rounded,
 )
-from dyngs.storage.tensors import COARSENESS
+from dyngs.storage.quantize import step_below
+from dyngs.storage.tensors import COARSENESS, completed, drawable
 from dyngs.training.background import evaluation_background
 from dyngs.training.state import Checkpoint
 from dyngs.training.views import training_cameras
@@ -40,6 +42,9 @@ SMALLEST_CHANGE = 0.01
 """Smallest change to allow, in grey levels of 255."""
 LOOKED_AT = 50
 """Number of training views in which the visibility of each Gaussian is measured."""
+
+FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))
+"""Factors on the usual steps that are tried, by bisection."""
 
 Images = Callable[[Scene], list[Tensor]]
 """Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
@@ -101,6 +106,63 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_chang
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
     exact = drawable(scene) | {COARSENESS: coarseness}
     return StoragePlan(measured_precision(exact, wanted, redrawn, max(max_change, SMALLEST_CHANGE)), coarseness, images)
+
+
+@dataclass(frozen=True)
+class CoarseFile:
+    """A file in memory.
+
+    Attributes:
+        data: its bytes.
+        factor: on the usual steps.
+        quality: of the scene that is read from it.
+        refused: quality at the next coarser steps; None where none were tried.
+    """
+
+    data: bytes
+    factor: float
+    quality: float
+    refused: float | None
+
+
+def coarsest_file(
+    config: Config, checkpoint: Checkpoint, quality: Callable[[Scene], float], least: float
+) -> CoarseFile | None:
+    """Return the file with the coarsest steps tried at which ``quality`` is at least ``least``; None: it never is.
+
+    All steps are those that ``storage_plan`` measures, times one factor. The bytes are read again before they count.
+
+    Args:
+        config: of the run.
+        checkpoint: of its scene.
+        quality: of a scene, the higher the better.
+        least: that is enough.
+    """
+    scene = restored_scene(checkpoint, config.model)
+    plan = storage_plan(config, checkpoint, scene, None)
+    exact = drawable(scene) | ({} if plan.coarseness is None else {COARSENESS: plan.coarseness})
+
+    def drawn(tensors: dict) -> Scene:
+        return restored_scene(Checkpoint(checkpoint.info, tensors), config.model)
+
+    def steps(factor: float) -> dict[str, float]:
+        return {name: step and step_below(factor * step) for name, step in plan.precision.steps.items()}
+
+    low, high, refused = 0, len(FACTORS), None
+    while low < high:
+        middle = (low + high) // 2
+        found = quality(drawn(completed(rounded(exact, steps(FACTORS[middle])))))
+        if found >= least:
+            low = middle + 1
+        else:
+            refused, high = found, middle
+    for index in range(low - 1, -1, -1):
+        data = encoded(SceneInfo(**asdict(checkpoint.info)), scene, steps(FACTORS[index]), plan.coarseness)
+        found = quality(drawn(decoded(data).tensors))
+        if found >= least:
+            return CoarseFile(data, FACTORS[index], found, refused)
+        refused = found
+    return None
 
 
 def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_Shot]:

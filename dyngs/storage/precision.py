@@ -15,9 +15,16 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
-from dyngs.storage.drawable import completed
 from dyngs.storage.quantize import LIMIT, step_below
-from dyngs.storage.tensors import COARSENESS, MAX_COARSENESS, checked_coarseness, coding_of, group_of, restored
+from dyngs.storage.tensors import (
+    COARSENESS,
+    MAX_COARSENESS,
+    checked_coarseness,
+    coding_of,
+    completed,
+    group_of,
+    restored,
+)
 
 GREY_LEVELS = 255.0
 TRIALS = 4

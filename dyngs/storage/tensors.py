@@ -1,15 +1,24 @@
-"""Conversion of tensors to integers and back: the kind and precision of each."""
+"""The tensors that a .dyngs file stores of a scene, and their conversion to integers and back.
+
+They have the names of checkpoints (``gaussians.means``, ``model.rows``), but for the harmonics, which are stored as
+``gaussians.sh_base`` (N, 3) and ``gaussians.sh_rest`` (N, K - 1, 3).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.order import storage_order
+from dyngs.gaussians.scene import Scene
+from dyngs.state import tensors_of
 from dyngs.storage.quantize import (
     FINEST_ROTATION,
     LARGEST_STEP,
@@ -26,6 +35,7 @@ from dyngs.storage.quantize import (
     opacities_to_grid,
     rotations_from_grid,
     rotations_to_grid,
+    sorted_axes,
     step_below,
     to_grid,
 )
@@ -42,6 +52,9 @@ class Kind(str, Enum):
     ROTATION = "rotation"
 
 
+FIELD = "model.field.learned."
+"""Prefix of the learned tensors of a deformation field."""
+GAUSSIANS = tuple(field.name for field in fields(Gaussians))
 MAX_COARSENESS = 6
 """Most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others."""
 COARSENESS = "gaussians.coarseness"
@@ -114,6 +127,53 @@ class Whole:
     far: np.ndarray
 
 
+def drawable(scene: Scene) -> dict[str, Tensor]:
+    """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by length.
+
+    Not those of Gaussians whose axes a field changes one by one.
+
+    Raises:
+        DyngsError: a value is not finite.
+    """
+    kept = tensors_of(scene.drawing_state())
+    for name, x in kept.items():
+        if x.is_floating_point() and not bool(torch.isfinite(x).all()):
+            raise DyngsError(f"{name.partition('.')[2]} is not finite; it cannot be stored")
+    sh = kept.pop("gaussians.sh")
+    kept |= {"gaussians.sh_base": sh[:, 0], "gaussians.sh_rest": sh[:, 1:]}
+    sorts = torch.ones(len(sh), dtype=torch.bool, device=sh.device)
+    sorts[scene.offset_rows] = False
+    quats, log_scales = sorted_axes(kept["gaussians.quats"][sorts].numpy(), kept["gaussians.log_scales"][sorts].numpy())
+    for name, values in (("gaussians.quats", quats), ("gaussians.log_scales", log_scales)):
+        kept[name] = kept[name].clone()
+        kept[name][sorts] = torch.from_numpy(values).to(kept[name])
+    return kept
+
+
+def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors of a checkpoint that can be drawn, but not trained on, from stored ones.
+
+    Raises:
+        KeyError: one is missing that every scene has.
+        ValueError: the Gaussians' tensors do not fit together.
+    """
+    full = dict(tensors)
+    base, rest = full.pop("gaussians.sh_base"), full.pop("gaussians.sh_rest")
+    full["gaussians.sh"] = torch.cat([base[:, None], rest], dim=1)
+    Gaussians(**{name: full[f"gaussians.{name}"] for name in GAUSSIANS})  # they must fit together
+    return full
+
+
+def stored_edit(scene: Scene, means: np.ndarray) -> TopologyEdit:
+    """Return the edit that puts Gaussians beside their neighbours in space, first those that a field moves.
+
+    Args:
+        scene: N Gaussians.
+        means: (N, 3) as they will be read again, which decide the order.
+    """
+    return TopologyEdit.select(torch.from_numpy(storage_order(means, scene.offset_rows.numpy())))
+
+
 def group_of(name: str, x: Tensor) -> str | None:
     """Return the name of the group that shares a step, without the number at its end; None where there is no step."""
     if x.dtype != torch.float32 or name in (RELATIVE, POSITIVE) or name in FIXED_STEPS:
@@ -127,7 +187,7 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
     """Return the coding of a tensor.
 
     Args:
-        name: as in ``dyngs.storage.drawable``.
+        name: of the tensor.
         x: its values.
         steps: group (or name, where it has none) to the largest step, 0 for none: stored as it is; a group that lacks
             is stored in half precision.

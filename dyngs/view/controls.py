@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dyngs.runs.opened import Opened
+from dyngs.view.captured_views import has_timeline, views_of
 from dyngs.view.frusta import Frusta
 from dyngs.view.layers import LAYERS, PARTS, draw
-from dyngs.view.path_controls import add_path_controls
-from dyngs.view.people import person_in
-from dyngs.view.people_controls import add_image_controls, add_person_controls
-from dyngs.view.source import Source
-from dyngs.view.viewed import Viewed
+from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion
+from dyngs.view.recording import Keyframe, Recording
+from dyngs.view.source import MOST_IMAGES, PeopleNetwork, Source
 
 if TYPE_CHECKING:
     import viser
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 NEAREST = "nearest"
+FPS = 30.0
+FILE_NAME = "camera_path.json"
+_AXES = ("x", "y", "z")
+_NONE = "-"
 HELP = """\
 **Orbit**: drag; right button or two fingers: shift; wheel: nearer, farther.
 **Fly**: W A S D, Q and E: down, up; arrow keys: turn.
@@ -50,7 +56,7 @@ class Controls:
         browsing.status = gui.add_markdown("")
         self.show(browsing.loaded)
 
-    def show(self, viewed: Viewed) -> None:
+    def show(self, opened: Opened) -> None:
         """Make the controls that a scene needs."""
         for handle in self._of_scene:
             handle.remove()
@@ -58,18 +64,18 @@ class Controls:
         gui, browsing = self._browsing.client.gui, self._browsing
         look = gui.add_folder("Show")
         with look:
-            self._add_look(gui, viewed)
+            self._add_look(gui, opened)
         folders = [look]
         browsing.time_slider = None
-        if viewed.has_timeline:
+        if has_timeline(opened):
             folders.append(gui.add_folder("Time"))
             with folders[-1]:
                 self._add_time(gui)
-        if len(viewed.footage):
+        if len(views_of(opened)):
             folders.append(gui.add_folder("Capture"))
             with folders[-1]:
-                self._add_capture(gui, viewed)
-        if person_in(viewed) is not None and not viewed.in_training:
+                self._add_capture(gui, opened)
+        if opened.person is not None and not opened.in_training:
             folders.append(gui.add_folder("Person"))
             with folders[-1]:
                 add_person_controls(browsing, self._serving.motions)
@@ -83,13 +89,13 @@ class Controls:
         folders.append(gui.add_folder("Help", expand_by_default=False))
         with folders[-1]:
             gui.add_markdown(HELP)
-            for note in viewed.notes:
+            for note in opened.notes:
                 gui.add_markdown(f"*{note}*")
         self._of_scene = folders
 
-    def _add_look(self, gui: viser.GuiApi, viewed: Viewed) -> None:
+    def _add_look(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
-        layers = [name for name in LAYERS if len(viewed.footage) or name != "error"]
+        layers = [name for name in LAYERS if len(views_of(opened)) or name != "error"]
         if session.look.layer not in layers:
             session.change(layer="colour")
         layer = gui.add_dropdown(
@@ -99,7 +105,7 @@ class Controls:
             hint="error: against the truth, at a camera of the capture",
         )
         layer.on_update(lambda _: self._change(layer=layer.value))
-        if 0 < viewed.scene.num_moving < len(viewed.scene) or (viewed.in_training and viewed.has_timeline):
+        if 0 < opened.scene.num_moving < len(opened.scene) or (opened.in_training and has_timeline(opened)):
             part = gui.add_dropdown("Parts", PARTS, initial_value=session.look.part)
             part.on_update(lambda _: session.change(part=part.value))
         else:
@@ -132,20 +138,20 @@ class Controls:
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
         self._browsing.time_slider = slider
 
-    def _add_capture(self, gui: viser.GuiApi, viewed: Viewed) -> None:
+    def _add_capture(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
         cameras = gui.add_checkbox("Cameras", False, hint="frusta with their images; click one to go there")
-        cameras.on_update(lambda _: self._frusta.show(viewed) if cameras.value else self._frusta.remove())
+        cameras.on_update(lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove())
         compare = gui.add_checkbox("Compare", session.look.comparing, hint="with the truth, on the right of the line")
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
-        view = gui.add_dropdown("Image", (NEAREST, *viewed.footage.names))
+        view = gui.add_dropdown("Image", (NEAREST, *views_of(opened).names))
         session.change(view=None)
         compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
 
         def choose(_: Any) -> None:
             name = str(view.value)
-            index = None if name == NEAREST else viewed.footage.names.index(name)
+            index = None if name == NEAREST else views_of(opened).names.index(name)
             session.change(view=index)
             if index is not None:
                 self._browsing.go_to(index)
@@ -164,35 +170,138 @@ class Controls:
 
         def load() -> None:
             try:
-                viewed = self._source.load(name)
+                opened = self._source.load(name)
             finally:
                 note.remove()
-            browsing.loaded = viewed
-            browsing.session.show(viewed)
-            self.show(viewed)
+            browsing.loaded = opened
+            browsing.session.show(opened)
+            self.show(opened)
             browsing.go_to(None)
 
         browsing.session.ask(load, "scene")
 
-    def _predicted(self, viewed: Viewed) -> None:
+    def _predicted(self, opened: Opened) -> None:
         """Show the person as predicted from other images, from the same camera."""
         browsing = self._browsing
-        browsing.session.show(viewed)
-        browsing.client.add_notification("Predicted", viewed.notes[-1], auto_close_seconds=8.0)
+        browsing.session.show(opened)
+        browsing.client.add_notification("Predicted", opened.notes[-1], auto_close_seconds=8.0)
 
     def _screenshot(self) -> None:
         """Send what is shown as a .png, in the thread that draws."""
         browsing = self._browsing
         if browsing.session.eye is None:
             return
-        image = draw(browsing.session.viewed, browsing.session.shot())
-        name = f"{browsing.session.viewed.name}_{browsing.session.time:.3f}.png"
+        image = draw(browsing.session.opened, browsing.session.shot())
+        name = f"{browsing.session.opened.name}_{browsing.session.time:.3f}.png"
         browsing.client.send_file_download(name, png_of(image), save_immediately=True)
 
 
-def add_controls(browsing: Browsing, source: Source, serving: Serving) -> Controls:
-    """Add all controls to the page of one browser."""
-    return Controls(browsing, source, serving)
+def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None:
+    """Add the motion picker and the sliders of the pose.
+
+    Args:
+        browsing: the browser, which has loaded a person.
+        motions: motion files by name.
+    """
+    gui, session = browsing.client.gui, browsing.session
+    angles: dict[str, tuple[float, float, float]] = {}
+    motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *motions))
+    joint = gui.add_dropdown("Joint", MAIN_JOINTS, initial_value="left_shoulder")
+    sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0, hint=f"degrees about {axis}") for axis in _AXES]
+
+    def play(_: Any = None) -> None:
+        choice, chosen = str(motion.value), dict(angles)
+        session.ask(lambda: session.show(in_motion(browsing.loaded, choice, motions, chosen)), "pose")
+
+    def pick(_: Any) -> None:
+        for slider, value in zip(sliders, angles.get(str(joint.value), (0.0, 0.0, 0.0)), strict=True):
+            slider.value = value
+
+    def turn(event: Any) -> None:
+        if event.client_id is None:
+            return
+        x, y, z = (float(slider.value) for slider in sliders)
+        angles[str(joint.value)] = (x, y, z)
+        if motion.value == BY_SLIDERS:
+            play()
+        else:
+            motion.value = BY_SLIDERS
+
+    def reset(_: Any) -> None:
+        angles.clear()
+        pick(None)
+        if motion.value == BY_SLIDERS:
+            play()
+
+    motion.on_update(play)
+    joint.on_update(pick)
+    for slider in sliders:
+        slider.on_update(turn)
+    gui.add_button("All joints at rest").on_click(reset)
+
+
+def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callable[[Opened], None]) -> None:
+    """Add the choice of the images that a network predicts the person from.
+
+    Args:
+        browsing: the browser, which has loaded a person of the network.
+        network: the network.
+        show: is given what was predicted.
+    """
+    gui, session, person = browsing.client.gui, browsing.session, browsing.loaded.name
+    names = (_NONE, *network.images_of(person))
+    hint = f"none: {network.num_images} that see much of the person"
+    chosen = [gui.add_dropdown(f"Image {i + 1}", names, hint=hint) for i in range(MOST_IMAGES)]
+
+    def predict(_: Any) -> None:
+        images = tuple(dict.fromkeys(str(one.value) for one in chosen if one.value != _NONE))
+        note = browsing.client.add_notification("Predicting", person, loading=True)
+
+        def work() -> None:
+            try:
+                opened = network.predict(person, images)
+            finally:
+                note.remove()
+            browsing.loaded = opened
+            show(opened)
+
+        session.ask(work)
+
+    gui.add_button("Predict").on_click(predict)
+
+
+def add_path_controls(browsing: Browsing) -> None:
+    """Add the controls of the path that this browser records."""
+    gui, session = browsing.client.gui, browsing.session
+    recorded = [Recording()]
+    status = gui.add_markdown("no keyframes yet")
+    seconds = gui.add_slider("Seconds", 0.1, 20.0, 0.1, 2.0, hint="from the keyframe that is added to the next one")
+
+    def record(recording: Recording) -> None:
+        recorded[0] = recording
+        count, duration = len(recording), recording.duration if len(recording) else 0.0
+        status.content = f"{count} keyframe{'s' * (count != 1)}, {duration:.1f} s" if count else "no keyframes yet"
+
+    def add(_: Any) -> None:
+        if session.eye is not None:
+            time = None if session.opened.scene.is_static else session.time
+            record(recorded[0].added(Keyframe(session.eye.camera(), time, float(seconds.value))))
+
+    def save(_: Any) -> None:
+        if not len(recorded[0]):
+            browsing.client.add_notification("No path", "Add a keyframe first.", auto_close_seconds=5.0)
+            return
+        width, height = (2 * (side // 2) for side in recorded[0].keyframes[0].camera_size)  # as videos need it
+        opened = session.opened
+        text = recorded[0].turned_back(opened.turned).document((width, height), FPS, opened.world_offset)
+        browsing.client.send_file_download(FILE_NAME, text.encode(), save_immediately=True)
+
+    gui.add_button("Add keyframe", hint="this camera, at this time").on_click(add)
+    gui.add_button("Remove last").on_click(lambda _: record(recorded[0].without_last()))
+    loop = gui.add_checkbox("Back to the first", False)
+    loop.on_update(lambda _: record(Recording(recorded[0].keyframes, bool(loop.value))))
+    gui.add_button("Preview").on_click(lambda _: session.preview(recorded[0]))
+    gui.add_button("Save path", hint=f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}").on_click(save)
 
 
 def png_of(image: np.ndarray) -> bytes:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dyngs.files.write import to_uint8
+from dyngs.runs.opened import Opened
 from dyngs.view.cameras import pose_of
+from dyngs.view.captured_views import viewpoint_of, views_of
 from dyngs.view.recording import fov_of
-from dyngs.view.viewed import Viewed
 
 if TYPE_CHECKING:
     from dyngs.view.server import Browsing
@@ -33,13 +34,13 @@ class Frusta:
         self._generation = 0
         browsing.on_move = self.hide_what_covers
 
-    def show(self, viewed: Viewed) -> None:
+    def show(self, opened: Opened) -> None:
         """Add the frusta, image by image, as the thread that draws finds time."""
         self.remove()
         generation = self._generation
-        places = distinct(viewed.footage.poses)
+        places = distinct(views_of(opened).poses)
         for index in (places[i] for i in spread(len(places), MOST)):
-            self._browsing.session.ask(lambda index=index: self._add(viewed, index, generation))
+            self._browsing.session.ask(lambda index=index: self._add(opened, index, generation))
 
     def remove(self) -> None:
         """Remove all frusta."""
@@ -59,10 +60,11 @@ class Frusta:
             if handle.visible == covers:
                 handle.visible = not covers
 
-    def _add(self, viewed: Viewed, index: int, generation: int) -> None:
+    def _add(self, opened: Opened, index: int, generation: int) -> None:
         if generation != self._generation:
             return
-        camera, size = viewed.footage.cameras[index], frustum_size(viewed.footage.poses, viewed.extent)
+        shown = views_of(opened)
+        camera, size = shown.cameras[index], frustum_size(shown.poses, viewpoint_of(opened).extent)
         wxyz, position = pose_of(camera)
         handle = self._browsing.client.scene.add_camera_frustum(
             f"/cameras/{index}",
@@ -71,7 +73,7 @@ class Frusta:
             scale=size,
             thickness=0.03 * size,
             color=(230, 160, 30),
-            image=thumbnail(viewed, index),
+            image=thumbnail(opened, index),
             format="jpeg",
             wxyz=wxyz,
             position=position,
@@ -83,9 +85,9 @@ class Frusta:
         self.hide_what_covers()
 
     def _go(self, index: int) -> None:
-        time = self._browsing.session.viewed.footage.times[index]
+        time = views_of(self._browsing.session.opened).times[index]
         self._browsing.go_to(index)
-        if time is not None and not self._browsing.session.viewed.is_static:
+        if time is not None and not self._browsing.session.opened.scene.is_static:
             self._browsing.session.set_time(time)
             if self._browsing.time_slider is not None:
                 self._browsing.time_slider.value = round(time, 3)
@@ -109,7 +111,7 @@ def frustum_size(poses: np.ndarray, extent: float) -> float:
     return min(_SIZE * extent, _OF_SPREAD * spread_out) if spread_out > 1e-4 * extent else _SIZE * extent
 
 
-def thumbnail(viewed: Viewed, index: int) -> np.ndarray | None:
+def thumbnail(opened: Opened, index: int) -> np.ndarray | None:
     """Return the small image (h, w, 3) uint8 of a view, None where there is none."""
-    loader = viewed.footage.thumbnails
-    return None if loader is None else to_uint8(loader[index].composite(viewed.background).clamp(0, 1).numpy())
+    loader = views_of(opened).thumbnails
+    return None if loader is None else to_uint8(loader[index].composite(opened.background).clamp(0, 1).numpy())

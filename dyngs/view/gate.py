@@ -19,7 +19,6 @@ from dyngs.errors import DyngsError
 
 DEFAULT_PORT = 8080
 COOKIE = "dyngs_view"
-_LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Gate:
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return "a page of another site asks for it"
         if self.token is None:
-            return None if _name_of(host) in _LOCAL_NAMES else "only for requests to localhost"
+            return None if is_loopback(_name_of(host)) else "only for requests to localhost"
         given = (*parse_qs(urlsplit(path).query).get("token", ()), _cookie(headers))
         if any(hmac.compare_digest(word.encode(), self.token.encode()) for word in given):
             return None
@@ -71,6 +70,15 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def link_to(host: str, port: int, token: str | None = None) -> str:
+    """Return the address at which browsers find a server that listens on ``host`` and ``port``."""
+    if host in ("0.0.0.0", "::"):
+        host = socket.gethostname() or "localhost"
+    elif host == "127.0.0.1":
+        host = "localhost"
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/{f'?token={token}' if token else ''}"
 
 
 def free_port(host: str, port: int | None) -> int:

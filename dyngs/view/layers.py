@@ -11,13 +11,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from dyngs.camera import Cameras
+from dyngs.camera_paths.path import resize_cameras
 from dyngs.conventions import SH_C0
+from dyngs.export.contact_sheet import color_map, depth_to_rgb
 from dyngs.files.write import to_uint8
 from dyngs.gaussians.rendering import Rendering
 from dyngs.gaussians.scene import Moment, Scene
-from dyngs.output.contact_sheet import color_map, depth_to_rgb
-from dyngs.output.render_job import resize_cameras
-from dyngs.view.viewed import Viewed
+from dyngs.runs.opened import Opened
+from dyngs.view.captured_views import views_of
 
 Layer = Literal["colour", "depth", "alpha", "motion", "error"]
 Part = Literal["all", "moving", "still"]
@@ -52,17 +53,17 @@ class Shot:
     divide: float = 1.0
 
 
-def draw(viewed: Viewed, shot: Shot) -> np.ndarray:
+def draw(opened: Opened, shot: Shot) -> np.ndarray:
     """Return the image (H, W, 3) uint8 of a shot."""
     camera, time = shot.camera, shot.time
     if shot.view is not None:
-        camera = resize_cameras(viewed.footage.cameras[shot.view], camera.width, camera.height)
-        time = viewed.footage.times[shot.view]
+        camera = resize_cameras(views_of(opened).cameras[shot.view], camera.width, camera.height)
+        time = views_of(opened).times[shot.view]
     with torch.no_grad():
-        rgb = _layer(viewed, shot, camera, time)
+        rgb = _layer(opened, shot, camera, time)
         if shot.view is None:
             return rgb
-        truth = truth_in_window(viewed, shot.view, (camera.width, camera.height))
+        truth = truth_in_window(opened, shot.view, (camera.width, camera.height))
     if truth is None:
         return rgb
     if shot.layer == "error":
@@ -72,18 +73,18 @@ def draw(viewed: Viewed, shot: Shot) -> np.ndarray:
     return _divided(rgb, np.where(beside, rgb, to_uint8(np.nan_to_num(truth))).astype(np.uint8), shot.divide)
 
 
-def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndarray | None:
+def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndarray | None:
     """Return the true image of a view as large as it fits into a window, (H, W, 3), NaN beside it; None without one.
 
     Args:
-        viewed: with a capture.
+        opened: with a capture.
         view: index of the view.
         size: width and height of the window, px.
     """
-    footage = viewed.footage
-    if footage.images is None:
+    images = views_of(opened).images
+    if images is None:
         return None
-    image = footage.images[view].composite(viewed.background).cpu()
+    image = images[view].composite(opened.background.cpu())
     high, wide = image.shape[:2]
     width, height = size
     scale = min(width / wide, height / high)
@@ -97,51 +98,52 @@ def truth_in_window(viewed: Viewed, view: int, size: tuple[int, int]) -> np.ndar
     return window
 
 
-def motion_colours(viewed: Viewed) -> Tensor:
+def motion_colours(opened: Opened) -> Tensor:
     """Return (N, 3) colours of how far each Gaussian moves over all times: dark blue is not at all, red is far.
 
     Red begins where 99% of those that move are left behind. On the CPU.
     """
-    return viewed.once("motion", lambda: _motion_colours(viewed.scene))
+    return opened.once("motion", lambda: _motion_colours(opened.scene))
 
 
-def _layer(viewed: Viewed, shot: Shot, camera: Cameras, time: float | None) -> np.ndarray:
+def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> np.ndarray:
     """Return one layer (H, W, 3) uint8; for the error it is the colours."""
     match shot.layer:
         case "colour" | "error":
-            return to_uint8(_rendering(viewed, shot.part, camera, time).rgb[0].clamp(0, 1).numpy())
+            return to_uint8(_rendering(opened, shot.part, camera, time).rgb[0].clamp(0, 1).numpy())
         case "alpha":
-            alpha = to_uint8(_rendering(viewed, shot.part, camera, time).alpha[0].clamp(0, 1).numpy())
+            alpha = to_uint8(_rendering(opened, shot.part, camera, time).alpha[0].clamp(0, 1).numpy())
             return np.repeat(alpha[..., None], 3, axis=2)
         case "depth":
-            made = _rendering(viewed, shot.part, camera, time, with_depth=True)
+            made = _rendering(opened, shot.part, camera, time, with_depth=True)
             depth = np.zeros(0) if made.depth is None else made.depth[0].numpy()
             return depth_to_rgb(depth, made.alpha[0].numpy())
         case "motion":
-            return _motion(viewed, shot.part, camera, time)
+            return _motion(opened, shot.part, camera, time)
 
 
-def _rendering(viewed: Viewed, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:
-    """Return a rendering, on the CPU."""
-    scene = _part(viewed, part)
-    options = replace(viewed.options, depth="expected") if with_depth else viewed.options
-    background = viewed.background.to(scene.gaussians.means.device)
-    made = scene.render(camera, viewed.moment(part, scene, time), options=options, background=background)
-    return made.to(device="cpu")
+def _rendering(opened: Opened, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:
+    """Return a rendering, on the CPU; the scene at the last time is kept."""
+    scene = _part(opened, part)
+    kept: dict[str, tuple[float | None, Moment]] = opened.once("moments", dict)
+    if part not in kept or kept[part][0] != time:
+        kept[part] = time, scene.moment(time)
+    options = replace(scene.options, depth="expected") if with_depth else None
+    return scene.render(camera, kept[part][1], options=options).to(device="cpu")
 
 
-def _part(viewed: Viewed, part: Part) -> Scene:
+def _part(opened: Opened, part: Part) -> Scene:
     """Return the scene, or only what moves of it, or only what does not."""
     match part:
         case "all":
-            return viewed.scene
+            return opened.scene
         case "moving" | "still":
-            return viewed.once(part, lambda: viewed.scene.part(part))
+            return opened.once(part, lambda: opened.scene.part(part))
 
 
-def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> np.ndarray:
+def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> np.ndarray:
     """Return the image of the motion (H, W, 3) uint8, on black."""
-    scene, colours = viewed.scene.unmasked(), motion_colours(viewed)
+    scene, colours = opened.scene.unmasked(), motion_colours(opened)
     gaussians = scene.at(time)
     coloured = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None].to(gaussians.means))
     if part != "all":
@@ -150,7 +152,7 @@ def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> 
             moves[scene.rows] = True
         coloured = coloured.select(moves if part == "moving" else ~moves)
     plain = replace(scene, colour=None, background=None)
-    made = plain.render(camera, Moment(coloured, time), options=replace(viewed.options, sh_degree=0))
+    made = plain.render(camera, Moment(coloured, time), options=replace(opened.scene.options, sh_degree=0))
     return to_uint8(made.rgb[0].clamp(0, 1).cpu().numpy())
 
 

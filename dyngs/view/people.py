@@ -10,11 +10,9 @@ from pathlib import Path
 import torch
 
 from dyngs.errors import DyngsError
-from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.placement import rest_clip
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
-from dyngs.output.animation import with_motion
-from dyngs.view.viewed import Viewed
+from dyngs.runs.opened import Opened
 
 AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"
 MAIN_JOINTS = (
@@ -47,16 +45,11 @@ def motion_files(path: Path | None) -> dict[str, Path]:
     return {str(file.relative_to(path)): file for file in found[:_MOST_MOTIONS]}
 
 
-def person_in(viewed: Viewed) -> HumanScene | None:
-    """Return the person that is viewed, None for other scenes."""
-    return avatar_of(viewed.scene)
-
-
-def in_motion(viewed: Viewed, choice: str, files: Mapping[str, Path], angles: Angles) -> Viewed:
-    """Return the person of ``viewed``, as it was loaded, in one of the motions.
+def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles) -> Opened:
+    """Return the person of ``opened``, as it was loaded, in one of the motions.
 
     Args:
-        viewed: a person in the motion of the capture.
+        opened: a person in the motion of the capture.
         choice: ``AS_CAPTURED``, ``AT_REST``, ``BY_SLIDERS`` or the name of a file.
         files: by name.
         angles: of the sliders.
@@ -65,17 +58,15 @@ def in_motion(viewed: Viewed, choice: str, files: Mapping[str, Path], angles: An
         DyngsError: the file cannot be read.
     """
     if choice == AS_CAPTURED:
-        return viewed
-    if choice in files and viewed.run is not None:
-        animated = with_motion(viewed.run, files[choice])
-        scene = animated.run.scene.to(viewed.scene.gaussians.means.device)
-        return _elsewhere(viewed).showing(scene, max(len(scene.times) - 1, 1) / animated.fps)
-    return posed(viewed, angles if choice == BY_SLIDERS else {})
+        return opened
+    if choice in files:
+        return opened.in_motion(files[choice])
+    return posed(opened, angles if choice == BY_SLIDERS else {})
 
 
-def posed(viewed: Viewed, angles: Angles) -> Viewed:
-    """Return the person of ``viewed`` in the rest pose with joints turned by ``angles``."""
-    person = person_in(viewed)
+def posed(opened: Opened, angles: Angles) -> Opened:
+    """Return the person of ``opened`` in the rest pose with joints turned by ``angles``."""
+    person = opened.person
     if person is None:
         raise ValueError("only a person can be posed")
     clip = rest_clip(person.clip, person.skeleton.joints, person.skeleton.parents)
@@ -83,17 +74,12 @@ def posed(viewed: Viewed, angles: Angles) -> Viewed:
     for name, turns in angles.items():
         row = joint_row(name, poses.shape[1])
         poses[0, row] = _composed(poses[0, row], turns)
-    return _elsewhere(viewed).showing(person.playing(replace(clip, poses=poses)))
+    return replace(opened, scene=person.playing(replace(clip, poses=poses)), as_captured=False)
 
 
 def joint_row(name: str, count: int) -> int:
     """Return the row of a joint of a body with ``count`` joints."""
     return SMPLX_ROWS[count].index(JOINT_NAMES.index(name))
-
-
-def _elsewhere(viewed: Viewed) -> Viewed:
-    """Return the same without the images, which show the person in another pose."""
-    return replace(viewed, footage=replace(viewed.footage, images=None))
 
 
 def _composed(rest: torch.Tensor, degrees: tuple[float, float, float]) -> torch.Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dyngs.camera import Cameras
-from dyngs.output.keyframes import Keyframes, interpolate_keyframes
+from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
 from dyngs.splats.rotation import with_scene
 from dyngs.view.cameras import camera_at, pose_of
 

@@ -23,6 +23,7 @@ class Drawer:
         self._sessions: list[Session] = []
         self._thread: threading.Thread | None = None
         self._is_stopped = False
+        self._failures: dict[Session, str] = {}
 
     @property
     def sessions(self) -> tuple[Session, ...]:
@@ -40,6 +41,7 @@ class Drawer:
     def remove(self, session: Session) -> None:
         """Draw no more for ``session``."""
         session.close()
+        self._failures.pop(session, None)
         with self._changed:
             if session in self._sessions:
                 self._sessions.remove(session)
@@ -98,12 +100,18 @@ class Drawer:
         except DyngsError as error:
             self._fail(session, str(error))
         except Exception as error:  # a fault of one session must not end the images of all
-            traceback.print_exc()
-            self._fail(session, f"{type(error).__name__}: {error}")
+            if self._fail(session, f"{type(error).__name__}: {error}"):
+                traceback.print_exc()
+        else:
+            self._failures.pop(session, None)
 
-    def _fail(self, session: Session, message: str) -> None:
-        if not session.closed:
-            self._on_error(session, message)
+    def _fail(self, session: Session, message: str) -> bool:
+        """Say what went wrong, once in a row: what is played fails many times a second. Return whether it is new."""
+        if session.closed or self._failures.get(session) == message:
+            return False
+        self._failures[session] = message
+        self._on_error(session, message)
+        return True
 
     def _wake(self) -> None:
         with self._changed:

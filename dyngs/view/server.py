@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.errors import DyngsError
+from dyngs.runs.opened import Opened
 from dyngs.view.cameras import fitting_fov, look_point, pose_of
-from dyngs.view.gate import free_port, gate_for, guarded, is_loopback
+from dyngs.view.captured_views import viewpoint_of, views_of
+from dyngs.view.gate import free_port, gate_for, guarded, link_to
 from dyngs.view.pace import Pace
 from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Eye, Sent, Session
 from dyngs.view.source import Source
-from dyngs.view.viewed import Viewed
 
 if TYPE_CHECKING:
     import viser
@@ -55,19 +56,20 @@ class Browsing:
 
     Args:
         client: viser's handle of it.
-        viewed: what it looks at first.
+        opened: what it looks at first.
         pace: how large its images are.
     """
 
-    def __init__(self, client: viser.ClientHandle, viewed: Viewed, pace: Pace) -> None:
+    def __init__(self, client: viser.ClientHandle, opened: Opened, pace: Pace) -> None:
         self.client = client
-        self.loaded = viewed
-        self.session = Session(viewed, self.send, pace)
+        self.loaded = opened
+        self.session = Session(opened, self.send, pace)
         self.status: viser.GuiMarkdownHandle | None = None
         self.time_slider: viser.GuiSliderHandle | None = None
         self.on_move: Callable[[], None] = lambda: None
         self.num_sent = 0
         self._told_at, self._since_told = 0.0, 0
+        self._has_refused = False
 
     def send(self, sent: Sent) -> None:
         """Pass an image to the browser."""
@@ -83,19 +85,25 @@ class Browsing:
     def camera_moved(self) -> None:
         """Take over the camera of the browser."""
         camera = self.client.camera
-        size = (max(16, int(camera.image_width)), max(16, int(camera.image_height)))
-        self.session.move(Eye(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size))
-        self.on_move()
+        size = _window(camera)
+        eye = Eye(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov), size)
+        if self.session.move(eye):
+            self.on_move()
+        elif not self._has_refused:
+            self._has_refused = True
+            notify(self.client, "Camera ignored", "The browser sent a camera that cannot exist; the last one stays.")
 
     def go_to(self, index: int | None) -> None:
         """Move the browser's camera to a view of the capture; None: to where it began."""
-        viewed, handle = self.session.viewed, self.client.camera
-        camera = viewed.start if index is None else viewed.footage.cameras[index]
+        opened, handle = self.session.opened, self.client.camera
+        begin = viewpoint_of(opened)
+        camera = begin.start if index is None else views_of(opened).cameras[index]
         wxyz, position = pose_of(camera)
         with self.client.atomic():
-            handle.fov = fitting_fov(camera, handle.aspect)
+            width, height = _window(handle)
+            handle.fov = fitting_fov(camera, width / height)
             handle.position = position
-            handle.look_at = look_point(camera, viewed.center, viewed.extent)
+            handle.look_at = look_point(camera, begin.center, begin.extent)
             handle.wxyz = wxyz
         self.camera_moved()
 
@@ -104,7 +112,7 @@ class Browsing:
         rate = self._since_told / max(now - self._told_at, 1e-6)
         shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
         view = self.session.shown_view
-        truth = "" if view is None else f", truth: {self.session.viewed.footage.names[view]}"
+        truth = "" if view is None else f", truth: {views_of(self.session.opened).names[view]}"
         if self.status is not None:
             self.status.content = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}{truth}"
         if self.time_slider is not None and self.session.timeline.playing:
@@ -126,7 +134,7 @@ class Viewer:
         DyngsError: viser is not installed, or the port cannot be had.
     """
 
-    def __init__(self, source: Source, first: Viewed, serving: Serving = Serving()) -> None:
+    def __init__(self, source: Source, first: Opened, serving: Serving = Serving()) -> None:
         require_viser()
         self.source, self.first, self.serving = source, first, serving
         self.drawer = Drawer(self._tell_error)
@@ -147,11 +155,7 @@ class Viewer:
     @property
     def link(self) -> str:
         """Address of the page, with the token if there is one."""
-        host, port = self.serving.host, self.server.get_port()
-        shown = "localhost" if is_loopback(host) else _name_of_machine() if host in ("0.0.0.0", "::") else host
-        return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
-            f"?token={self._token}" if self._token else ""
-        )
+        return link_to(self.serving.host, self.server.get_port(), self._token)
 
     @property
     def browsing(self) -> tuple[Browsing, ...]:
@@ -186,20 +190,21 @@ class Viewer:
             server._websock_server.unregister_handler(kind)  # it would pass the page through a host of others
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         server.gui.main_panel.dock_right()  # beside the image, not over it
-        _, position = pose_of(first.start)
-        server.scene.set_up_direction(tuple(first.up))
+        begin = viewpoint_of(first)
+        _, position = pose_of(begin.start)
+        server.scene.set_up_direction(tuple(begin.up))
         camera = server.initial_camera
-        camera.position, camera.look_at = position, look_point(first.start, first.center, first.extent)
-        camera.up, camera.fov = first.up, fitting_fov(first.start, first.start.width / first.start.height)
-        camera.near, camera.far = 1e-3 * first.extent, 1e3 * first.extent
+        camera.position, camera.look_at = position, look_point(begin.start, begin.center, begin.extent)
+        camera.up, camera.fov = begin.up, fitting_fov(begin.start, begin.start.width / begin.start.height)
+        camera.near, camera.far = 1e-3 * begin.extent, 1e3 * begin.extent
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        from dyngs.view.controls import add_controls
+        from dyngs.view.controls import Controls
 
         browsing = Browsing(client, self.first, Pace(self.serving.target, self.serving.longest))
         with self._lock:
             self._browsing[client.client_id] = browsing
-        add_controls(browsing, self.source, self.serving)
+        Controls(browsing, self.source, self.serving)
 
         async def moved(_: viser.CameraHandle) -> None:
             browsing.camera_moved()
@@ -220,6 +225,11 @@ class Viewer:
         for browsing in self.browsing:
             if browsing.session is session:
                 notify(browsing.client, "Error", message)
+
+
+def _window(camera: viser.CameraHandle) -> tuple[int, int]:
+    """Return width and height of the window of a browser, px: at least 16, also of one that has none yet."""
+    return max(16, int(camera.image_width)), max(16, int(camera.image_height))
 
 
 def notify(client: viser.ClientHandle, title: str, body: str) -> None:
@@ -246,9 +256,3 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         console.quiet = before
-
-
-def _name_of_machine() -> str:
-    import socket
-
-    return socket.gethostname() or "localhost"

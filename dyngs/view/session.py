@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -12,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from dyngs.camera import Cameras
+from dyngs.runs.opened import Opened
 from dyngs.view.cameras import camera_at, nearest_camera
+from dyngs.view.captured_views import viewpoint_of, views_of
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.pace import STILL_AFTER, Pace, size_within
 from dyngs.view.recording import Recording, in_window
-from dyngs.view.timeline import Timeline
-from dyngs.view.viewed import Viewed
 
 _SHORTEST = 1 / 30
 """Seconds between two images at least."""
@@ -33,9 +34,63 @@ class Eye:
     fov: float
     size: tuple[int, int]
 
+    @property
+    def is_possible(self) -> bool:
+        """Whether there is such a camera: browsers may send anything."""
+        numbers = (*self.wxyz, *self.position, self.fov)
+        return (
+            all(map(math.isfinite, numbers)) and math.hypot(*self.wxyz) > 1e-6 and self.fov > 0 and min(self.size) > 0
+        )
+
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
         """Return the camera for images of ``size``; None: that of the window."""
         return camera_at(self.wxyz, self.position, self.fov, size or self.size)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The time that is shown.
+
+    Attributes:
+        time: in [0, 1] when the clock read ``since``.
+        since: seconds of a monotonic clock.
+        playing: whether time passes.
+        loops: whether it begins again after 1; else it stops there.
+        speed: factor of the speed of the recording.
+        seconds: that the recording takes from time 0 to 1.
+    """
+
+    time: float = 0.0
+    since: float = 0.0
+    playing: bool = False
+    loops: bool = True
+    speed: float = 1.0
+    seconds: float = 4.0
+
+    def at(self, clock: float) -> float:
+        """Return the time in [0, 1] when the clock reads ``clock``."""
+        if not self.playing:
+            return self.time
+        passed = self.time + max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
+        return passed % 1.0 if self.loops and passed > 1 else min(passed, 1.0)
+
+    def is_over(self, clock: float) -> bool:
+        """Return whether it plays without a loop and has reached the end."""
+        return self.playing and not self.loops and self.at(clock) >= 1.0
+
+    def moved(self, time: float, clock: float) -> Timeline:
+        """Return the timeline set to ``time``; it plays on if it does."""
+        return replace(self, time=min(max(time, 0.0), 1.0), since=clock)
+
+    def changed(self, clock: float, **changes: bool | float) -> Timeline:
+        """Return the timeline with other ``playing``, ``loops``, ``speed`` or ``seconds``; the time does not jump.
+
+        Who plays from the end begins at 0.
+        """
+        now = replace(self, time=self.at(clock), since=clock)
+        if changes.get("playing") and now.time >= 1.0:
+            now = replace(now, time=0.0)
+        return replace(now, **changes)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -73,7 +128,7 @@ class Session:
     Several threads tell it what has changed; one thread calls ``draw_next``, and gets the newest state.
 
     Args:
-        viewed: scene to look at.
+        opened: scene to look at.
         send: passes an image to the browser.
         pace: how large images are; None: fourteen a second while something moves, whole when all is still.
         clock: monotonic seconds.
@@ -81,7 +136,7 @@ class Session:
 
     def __init__(
         self,
-        viewed: Viewed,
+        opened: Opened,
         send: Callable[[Sent], None],
         pace: Pace | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -97,19 +152,22 @@ class Session:
         self._preview: tuple[Recording, float] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
-        self.viewed, self.eye, self.look = viewed, None, Look()
-        self.timeline = Timeline(seconds=viewed.seconds)
+        self.opened, self.eye, self.look = opened, None, Look()
+        self.timeline = Timeline(seconds=opened.seconds)
         self.closed = False
 
     eye: Eye | None
 
-    def move(self, eye: Eye) -> None:
-        """The browser's camera is now ``eye``."""
+    def move(self, eye: Eye) -> bool:
+        """Look from ``eye`` from now on; return False, and go on as before, where there is no such camera."""
+        if not eye.is_possible:
+            return False
         with self._lock:
             if eye == self.eye:
-                return
+                return True
             self.eye = eye
         self._note_change()
+        return True
 
     def change(self, **changes: Any) -> None:
         """Show something else: attributes of ``Look``."""
@@ -130,12 +188,12 @@ class Session:
         self.on_play(self.timeline.playing)
         self._note_change()
 
-    def show(self, viewed: Viewed) -> None:
+    def show(self, opened: Opened) -> None:
         """Look at another scene, at the same time."""
         with self._lock:
-            self.viewed = viewed
-            self.timeline = self.timeline.changed(self._clock(), seconds=viewed.seconds)
-            if self.look.view is not None and self.look.view >= len(viewed.footage):
+            self.opened = opened
+            self.timeline = self.timeline.changed(self._clock(), seconds=opened.seconds)
+            if self.look.view is not None and self.look.view >= len(views_of(opened)):
                 self.look = replace(self.look, view=None)
         self._note_change()
 
@@ -145,15 +203,15 @@ class Session:
             self._preview = (recording, self._clock()) if recording is not None and len(recording) else None
         self._note_change()
 
-    def take(self, viewed: Viewed, *, refreshes: bool) -> None:
+    def take(self, opened: Opened, *, refreshes: bool) -> None:
         """Look at another state of the same scene; an image that is refined stays as large, and is drawn again.
 
         Args:
-            viewed: the newest state.
+            opened: the newest state.
             refreshes: draw it even if nothing else has changed.
         """
         with self._lock:
-            self.viewed = viewed
+            self.opened = opened
             self._is_stale = self._is_stale or refreshes
 
     def ask(self, job: Callable[[], None], kind: str | None = None) -> None:
@@ -179,13 +237,13 @@ class Session:
     def shown_view(self) -> int | None:
         """Index of the view whose truth is shown; None without any."""
         with self._lock:
-            look, eye, viewed = self.look, self.eye, self.viewed
-        if eye is None or not len(viewed.footage) or not (look.comparing or look.layer == "error"):
+            look, eye, opened = self.look, self.eye, self.opened
+        if eye is None or not len(views_of(opened)) or not (look.comparing or look.layer == "error"):
             return None
         if look.view is not None:
             return look.view
-        footage, time = viewed.footage, None if viewed.is_static else self.time
-        return nearest_camera(eye.camera(), time, footage.poses, footage.times, viewed.extent)
+        shown, time = views_of(opened), None if opened.scene.is_static else self.time
+        return nearest_camera(eye.camera(), time, shown.poses, shown.times, viewpoint_of(opened).extent)
 
     def due(self) -> float | None:
         """Return in how many seconds something is to be drawn; 0: now, None: not before something changes."""
@@ -216,19 +274,19 @@ class Session:
             area = self._pace.next_area(int(self._refined_area), None if is_moving else self._drawn_area or 1.0)
             if self._is_stale and not is_moving:
                 area = max(area, self._drawn_area or 0.0)
-            shot = self.shot(size_within(self._full_size, area))
-            viewed, version = self.viewed, self._changed_at
+            opened, version = self.opened, self._changed_at
             self._is_stale = False
             self._drawn_area, self._is_refined = self._full_area, True  # if it fails, it is not tried again
-        start = self._clock()
-        image = draw(viewed, shot)
+            self._drawn_at = start = self._clock()
+            shot = self.shot(size_within(self._full_size, area))
+        image = draw(opened, shot)
         pixels = image.shape[0] * image.shape[1]
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
         end = self._clock()
         with self._lock:
             self._pace.observe(pixels, end - start, is_refined=not is_moving)
-            self._drawn_at, self._is_refined = start, not is_moving
+            self._is_refined = not is_moving
             self._drawn_area = area if version == self._changed_at else None
             self._end_of_play()
 
@@ -244,15 +302,14 @@ class Session:
                 camera, recorded = recording.at(self._clock() - since)
                 camera, view = in_window(camera, size), None
                 time = time if recorded is None else recorded
-            look, viewed = self.look, self.viewed
+            look, opened = self.look, self.opened
         layer = "colour" if look.layer == "error" and view is None else look.layer
-        return Shot(
-            camera, None if viewed.is_static else time, layer, look.part, view, look.divide if look.comparing else 1.0
-        )
+        shown, divide = None if opened.scene.is_static else time, look.divide if look.comparing else 1.0
+        return Shot(camera, shown, layer, look.part, view, divide)
 
     @property
     def _is_moving(self) -> bool:
-        is_playing = self.timeline.playing and not self.viewed.is_static
+        is_playing = self.timeline.playing and not self.opened.scene.is_static
         return is_playing or self._preview is not None
 
     @property

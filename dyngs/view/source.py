@@ -1,25 +1,97 @@
-"""What can be chosen to look at: one scene, or the runs in a folder."""
+"""What can be chosen to look at: one scene, the runs in a folder, or the people that a network may predict."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 
+from dyngs.api.predict import network_config, predict_person
+from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.kinds import network_of
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.files.wrong_place import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
-from dyngs.view.network import PeopleNetwork, open_network
-from dyngs.view.viewed import Viewed, load_viewed
+from dyngs.runs.opened import Opened, open_scene
+from dyngs.training.prediction import captures_in
 
 _DEEPEST = 3
 """Folders below that which was given in which runs are looked for."""
 _MOST_RUNS = 500
+MOST_IMAGES = 5
+"""Images that can be picked."""
+
+
+@dataclass(frozen=True)
+class PeopleNetwork:
+    """A trained network and captures of people.
+
+    Attributes:
+        run: run folder of the network.
+        people: by name.
+        num_images: that it was trained to predict from.
+    """
+
+    run: Path
+    people: dict[str, DataConfig]
+    num_images: int
+    _images: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def images_of(self, person: str) -> tuple[str, ...]:
+        """Return the names of the images of a person that can be predicted from.
+
+        Raises:
+            DyngsError: the capture cannot be read.
+        """
+        if person not in self._images:
+            views = read_capture(self.people[person]).splits["train"]
+            self._images[person] = tuple(view.name for view in views)
+        return self._images[person]
+
+    def predict(self, person: str, images: tuple[str, ...] = (), up: str | None = None) -> Opened:
+        """Return a person as the network predicts it.
+
+        Args:
+            person: name.
+            images: to predict from; without any, as many as in training, chosen to see much of the person.
+            up: up axis; None: that of the capture.
+
+        Raises:
+            DyngsError: not a capture of a person, or unknown images.
+        """
+        with tempfile.TemporaryDirectory(prefix="dyngs_view_") as folder:
+            out = Path(folder) / "run"
+            made = predict_person(self.run, self.people[person].root, out, images or self.num_images)
+            opened = open_to_view(out, person, up)
+        said = f"predicted from {', '.join(made.views)} in {made.seconds_maps + made.seconds_network:.1f} s"
+        return opened.noted(said)
+
+
+def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
+    """Return a network with the people it was trained on, or those of ``capture``: one, or a folder of them.
+
+    Raises:
+        DyngsError: not the run of a network, or no captures there.
+    """
+    config, model = network_config(run)
+    data = config.data if capture is None else config.data.model_copy(update={"root": capture.absolute()})
+    if capture is not None and _is_capture(data):
+        return PeopleNetwork(run, {capture.absolute().name: data}, model.source_views)
+    return PeopleNetwork(run, {one.root.name: one for one in captures_in(data)}, model.source_views)
+
+
+def _is_capture(data: DataConfig) -> bool:
+    try:
+        read_capture(data)
+    except DyngsError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -33,7 +105,7 @@ class Source:
     """
 
     names: tuple[str, ...]
-    load: Callable[[str], Viewed]
+    load: Callable[[str], Opened]
     network: PeopleNetwork | None = None
 
 
@@ -53,21 +125,40 @@ def open_source(path: Path, up: str | None = None, capture: Path | None = None, 
         raise DyngsError(f"{path}: no such run, file or folder; give what `dyngs train` or `dyngs export` wrote")
     if is_network(path):
         network = open_network(path, capture)
-        return Source(tuple(network.people), lambda name: network.predict(name, up=up).on(device), network)
+        return Source(tuple(network.people), lambda name: network.predict(name, up=up).to(device), network)
     if capture is not None:
         raise DyngsError(f"--capture goes with the run of a network of people, {path} is none; leave it out")
     if not path.is_dir() or _is_run(path):
         name = path.name or str(path)
-        return Source((name,), lambda _: load_viewed(path, up).on(device))
+        return Source((name,), lambda _: open_to_view(path, name, up).to(device))
     runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
     if not runs:
         known = command_for(path)
         instead = f"{known}; then " if known else ""
         raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
-    return Source(tuple(runs), lambda name: replace(load_viewed(runs[name], up).on(device), name=name))
+    return Source(tuple(runs), lambda name: open_to_view(runs[name], name, up).to(device))
 
 
-def first_of(source: Source) -> Viewed:
+def open_to_view(path: Path, name: str, up: str | None = None) -> Opened:
+    """Open a run or a file; where its capture is gone, a note says what lacks.
+
+    Args:
+        path: of it.
+        name: that it is shown by.
+        up: up axis such as "z" or "-y"; None: that of the capture, or as the file or its format has it.
+
+    Raises:
+        DyngsError: nothing is there, it is damaged, or it is something else.
+    """
+    opened = replace(open_scene(path, nonfinite="skip"), name=name)
+    if up is not None:
+        opened = replace(opened, stated_up=up)
+    if opened.captured is not None and opened.missing is not None:
+        opened = opened.noted(f"without the capture, so no cameras and no truth: {opened.missing}")
+    return opened
+
+
+def first_of(source: Source) -> Opened:
     """Return the first scene that can be loaded; a note says which could not.
 
     Raises:
@@ -76,13 +167,13 @@ def first_of(source: Source) -> Viewed:
     failed: list[DyngsError] = []
     for name in source.names:
         try:
-            viewed = source.load(name)
+            opened = source.load(name)
         except DyngsError as error:
             failed.append(error)
             continue
         for error in failed:
-            viewed = viewed.noted(f"left out: {error}")
-        return viewed
+            opened = opened.noted(f"left out: {error}")
+        return opened
     raise failed[0]
 
 

@@ -8,19 +8,22 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
-from dyngs.training.background import evaluation_background
+from dyngs.runs.opened import Captured, Opened, cameras_for_paths
+from dyngs.training.background import background_colour
 from dyngs.training.events import Event, StepDone
+from dyngs.training.state import CheckpointInfo
 from dyngs.training.trainer import Trainer
+from dyngs.view.captured_views import captured_views
 from dyngs.view.gate import free_port
 from dyngs.view.render_thread import Drawer
 from dyngs.view.server import Serving, Viewer, require_viser
 from dyngs.view.source import Source
-from dyngs.view.viewed import Viewed, viewed_training
 
 FRACTION = 0.2
 """Most of the time of training that images for browsers may take."""
@@ -63,9 +66,8 @@ class DrawnBetweenSteps:
         if refreshes:
             self._refreshed_at = start
         with torch.no_grad():
-            shell = replace(scene)  # with caches of its own
             for session in sessions:
-                session.take(session.viewed.showing(shell), refreshes=refreshes)
+                session.take(session.opened.showing(_shell(scene, session.opened.background)), refreshes=refreshes)
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
@@ -127,7 +129,7 @@ class TrainingView:
         """Serve the page, now that there is a scene."""
         match event.loop.trainer:
             case Trainer() as trainer:
-                first = _first(trainer)
+                first = opened_training(trainer)
             case _:
                 raise ValueError("what is trained has no scene")
         viewer = Viewer(Source((first.name,), lambda _: first), first, self._serving)
@@ -136,10 +138,20 @@ class TrainingView:
         return DrawnBetweenSteps(self._viewer.drawer)
 
 
-def _first(trainer: Trainer) -> Viewed:
+def opened_training(trainer: Trainer) -> Opened:
     """Return the scene of a trainer with the views that it is trained on."""
-    config = trainer.config
-    choice = config.data.background if config.data.background != "auto" else trainer.background
-    _, background = evaluation_background(choice, has_alpha=False)
+    config, views = trainer.config, trainer.images.views
+    shown, cameras = captured_views(views, config.data, trainer.images), cameras_for_paths(views, config.data)
+    captured = Captured(config.data)
+    captured.once("views", lambda: shown)
+    captured.once("cameras", lambda: cameras)
+    mode = trainer.scene.options.mode.value
+    info = CheckpointInfo(trainer.done, trainer.extent, trainer.world_offset, trainer.background, mode)
     with torch.no_grad():
-        return viewed_training(config.run.name, config, replace(trainer.scene), trainer.images, background)
+        scene = _shell(trainer.scene, background_colour(trainer.background))
+    return Opened(config, scene, trainer.done, 0.0, info, name=config.run.name, captured=captured, in_training=True)
+
+
+def _shell(scene: Scene, background: Tensor) -> Scene:
+    """Return the same scene with caches of its own, to be drawn whatever its values are."""
+    return replace(scene, options=replace(scene.options, nonfinite="skip"), background=background)

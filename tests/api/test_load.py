@@ -9,10 +9,11 @@ import torch
 
 import dyngs
 from dyngs.api.load import load
-from dyngs.export.avatar import write_avatar
-from dyngs.export.run_to_splats import export_ply
 from dyngs.export.scene_file import write_scene_file
+from dyngs.export.splat_files import write_run_splats
+from dyngs.runs.avatar import write_avatar
 from dyngs.runs.checkpoint import load_run
+from dyngs.runs.opened import open_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -33,7 +34,7 @@ def test_a_run_its_ply_and_its_small_file_show_the_same(still: Path, tmp_path: P
     run = trained(still, tmp_path / "run", "init.kind=random")
     wanted = load(run).render(camera(), background=torch.zeros(3)).rgb
     assert float(wanted.detach().abs().max()) > 0.05  # something is seen
-    ply = export_ply(run, tmp_path / "a.ply")
+    ply = write_run_splats(open_run(run), tmp_path / "a.ply").path
     torch.testing.assert_close(load(ply).render(camera()).rgb, wanted, rtol=1e-4, atol=1e-5)  # quats normalised
     small = write_scene_file(run, tmp_path / "small").path
     for path in (small, small.parent, str(small)):

@@ -16,8 +16,8 @@ from dyngs.data.capture import all_views
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
 from dyngs.errors import DyngsError
+from dyngs.export.video import VideoWriter
 from dyngs.files.write import write_image
-from dyngs.output.video import VideoWriter
 
 FAST = SfmOptions(max_features=2000, num_threads=1)
 

@@ -16,10 +16,10 @@ from dyngs.cli import main
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import save_config
 from dyngs.errors import DyngsError
+from dyngs.export.video import VideoWriter
 from dyngs.files.outputs import SOURCES_NAME
 from dyngs.files.temporary import cache_folder
 from dyngs.files.write import write_image
-from dyngs.output.video import VideoWriter
 
 
 @pytest.fixture(autouse=True)

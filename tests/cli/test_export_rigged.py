@@ -12,9 +12,9 @@ from gltf_skins import SkinnedGlb
 from moving_scene import write_moving_run
 
 from dyngs.cli import main
-from dyngs.export.avatar import write_avatar
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
+from dyngs.runs.avatar import write_avatar
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.output.video import VideoWriter
+from dyngs.export.video import VideoWriter
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 260.0
 

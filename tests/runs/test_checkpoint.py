@@ -36,7 +36,7 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.static.filters import fuse_filter
-from dyngs.storage.drawable import drawable
+from dyngs.storage.tensors import drawable
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -19,8 +19,8 @@ from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel,
 from dyngs.config.io import load_resolved
 from dyngs.demo import unused_folder
 from dyngs.errors import DyngsError
-from dyngs.export.run_to_splats import write_run_sequence
 from dyngs.export.scene_file import write_scene_file
+from dyngs.export.splat_files import write_run_sequence
 from dyngs.files.outputs import require_new_folder
 from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
 from dyngs.runs.folder import default_folder, new_folder, tidy

@@ -20,15 +20,15 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.cameras import write_cameras
+from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.html.page import write_page
+from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.moving_file import write_moving
-from dyngs.export.run_to_splats import export_ply, write_run_sequence, write_run_splats
 from dyngs.export.scene_file import write_scene_file
-from dyngs.output.image_files import OutputOptions, write_job_images, write_split_images
-from dyngs.output.job_of_run import job_of_run
-from dyngs.output.page_of_run import write_run_page
-from dyngs.output.render_job import RenderJobOptions
+from dyngs.export.splat_files import write_run_sequence, write_run_splats
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import open_run
 
 PACKAGE = Path(dyngs.__file__).parent
 
@@ -110,20 +110,20 @@ def write_all(run: Path, out: Path) -> dict[str, Callable[[], object]]:
     """Functions of the Python API that write of a run, each to ``out``."""
     loaded = load_run(run)
     capture = read_capture(loaded.config.data)
-    job = job_of_run(run, RenderJobOptions("orbit", 1, size=(8, 8)))
+    opened = open_run(run)
+    path = choose_path(opened, PathOptions("orbit", 1, size=(8, 8)))
     as_mp4 = OutputOptions(video=out)
     return {
         "train": lambda: train(loaded.config.model_copy(update={"run": RunConfig(dir=out)})),
-        "export_ply": lambda: export_ply(run, out),
-        "write_run_splats": lambda: write_run_splats(loaded, out),
-        "write_run_sequence": lambda: write_run_sequence(loaded, out, (0.0, 1.0)),
-        "write_moving": lambda: write_moving(loaded, out, (0.0, 1.0)),
+        "write_run_splats": lambda: write_run_splats(opened, out),
+        "write_run_sequence": lambda: write_run_sequence(opened, out, (0.0, 1.0)),
+        "write_moving": lambda: write_moving(opened, out, (0.0, 1.0)),
         "write_scene_file": lambda: write_scene_file(run, out),
         "write_cameras": lambda: write_cameras(out, capture, capture.splits),
-        "write_run_page": lambda: write_run_page(run, out),
-        "write_job_images": lambda: write_job_images(job, out),
-        "write_job_images, video": lambda: write_job_images(job, None, as_mp4),
-        "write_split_images": lambda: write_split_images(run, "test", out),
+        "write_page": lambda: write_page(opened, out),
+        "write_path_images": lambda: write_path_images(opened, path, out),
+        "write_path_images, video": lambda: write_path_images(opened, path, None, as_mp4),
+        "write_split_images": lambda: write_split_images(opened, "test", out),
         "draw_cameras": lambda: draw_cameras(capture, out),
     }
 

@@ -9,9 +9,13 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
+from dyngs.build import restored_scene
 from dyngs.config import SceneModel
+from dyngs.config.io import load_resolved
+from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
-from dyngs.storage.measure import COMPARED, StoragePlan, storage_plan
+from dyngs.storage.file import decoded
+from dyngs.storage.measure import COMPARED, FACTORS, StoragePlan, coarsest_file, storage_plan
 from dyngs.storage.precision import assumed_precision
 
 
@@ -60,3 +64,27 @@ def test_without_a_capture_steps_are_assumed(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "capture")
     plan = plan_of(run_dir)
     assert plan == StoragePlan(assumed_precision(load_run(run_dir).scene.gaussians))
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path)
+    config, checkpoint = load_resolved(run), latest_checkpoint(run)
+    exact = restored_scene(checkpoint, config.model).at(0.5).means
+
+    def quality(scene: Scene) -> float:
+        """Minus the sum of squares of how far the Gaussians are from where they were: their order does not matter."""
+        return -float((scene.at(0.5).means.sum(0) - exact.sum(0)).square().sum())
+
+    every = coarsest_file(config, checkpoint, lambda scene: 1.0, 0.0)
+    assert every is not None
+    assert (every.factor, every.refused) == (FACTORS[-1], None)
+    some = coarsest_file(config, checkpoint, quality, -1e-3)
+    assert some is not None
+    assert some.quality >= -1e-3
+    stored = restored_scene(type(checkpoint)(checkpoint.info, decoded(some.data).tensors), config.model)
+    assert quality(stored) == some.quality
+    assert len(every.data) <= len(some.data)
+    assert coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None

@@ -14,9 +14,8 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.state import part_of
 from dyngs.static.scene import StaticScene
-from dyngs.storage.drawable import completed, drawable
 from dyngs.storage.precision import Draw, Precision, assumed_precision, coarseness_of, measured_precision
-from dyngs.storage.tensors import MAX_COARSENESS, Kind, coding_of, restored
+from dyngs.storage.tensors import MAX_COARSENESS, Kind, coding_of, completed, drawable, restored
 
 
 def tensors() -> dict[str, Tensor]:

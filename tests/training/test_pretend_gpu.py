@@ -15,9 +15,10 @@ from dyngs.build import assemble
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.evaluate.report import EvalReport, evaluate_run
-from dyngs.output.image_files import write_split_images
+from dyngs.export.images import write_split_images
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.runs.opened import open_run
 from dyngs.state import tensors_of
 from dyngs.training.prediction import assemble_network
 from dyngs.training.state import Checkpoint
@@ -184,11 +185,11 @@ def test_views_are_drawn_and_scored_there_alike(
     kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
     train(config_of(kind, request.getfixturevalue(capture), *more, *others, f"run.dir={folder}"))
     expected = evaluate_run(folder, split, refine_poses=refined)
-    images = write_split_images(folder, split, tmp_path / "cpu")
+    images = write_split_images(open_run(folder), split, tmp_path / "cpu")
     monkeypatch.setattr("dyngs.evaluate.report.device_for", lambda _: GPU)
     with pretend_gpu():
         found = evaluate_run(folder, split, refine_poses=refined)
-        there = write_split_images(folder, split, tmp_path / "GPU", device=GPU)
+        there = write_split_images(open_run(folder), split, tmp_path / "GPU", device=GPU)
     assert without_times(found) == without_times(expected)
     assert [x.read_bytes() for x in there] == [x.read_bytes() for x in images]
 

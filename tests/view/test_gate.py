@@ -5,10 +5,10 @@ import urllib.request
 import pytest
 
 from dyngs.errors import DyngsError
-from dyngs.view.gate import COOKIE, Gate, free_port, gate_for, guarded, is_loopback
+from dyngs.view.gate import COOKIE, Gate, free_port, gate_for, guarded, is_loopback, link_to
 
 
-@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:9"])
+@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1:8080", "[::1]:8080", "LOCALHOST:9", "127.0.0.2:8080"])
 def test_this_machine_may_open_the_page(host: str) -> None:
     assert Gate().refusal("/", {"Host": host}) is None
     assert Gate().refusal("/", {"Host": host, "Origin": f"http://{host}"}) is None
@@ -66,6 +66,23 @@ def test_a_free_port_is_found_and_a_taken_one_refused() -> None:
         free_port("203.0.113.7", None)
     with pytest.raises(DyngsError, match="--host"):
         free_port("no.such.host.invalid", None)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "localhost"])
+def test_the_link_leads_to_the_server(host: str) -> None:
+    viser = pytest.importorskip("viser", reason="viser is not installed")
+    with guarded(gate_for(host)):
+        server = viser.ViserServer(host=host, port=free_port(host, None), verbose=False)
+    try:
+        assert urllib.request.urlopen(link_to(host, server.get_port()), timeout=5).status == 200
+    finally:
+        server.stop()
+
+
+def test_the_link_to_other_addresses() -> None:
+    assert link_to("::1", 80) == "http://[::1]:80/"
+    assert link_to("box", 80, "secret") == "http://box:80/?token=secret"
+    assert link_to("0.0.0.0", 80, "secret").endswith(f"{socket.gethostname()}:80/?token=secret")
 
 
 def test_the_server_asks_the_gate() -> None:

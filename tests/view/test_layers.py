@@ -1,45 +1,44 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from moving_scene import MOVING_ROWS, camera, still_scene, write_moving_run
 from pretend_gpu import GPU, pretend_gpu
-from view_sessions import balls
+from view_sessions import balls, opened_at
 
-from dyngs.output.render_job import render_frame
+from dyngs.export.images import render_frame
+from dyngs.runs.opened import Opened, open_run
+from dyngs.view.captured_views import views_of
 from dyngs.view.layers import LAYERS, PARTS, Shot, draw, motion_colours, truth_in_window
-from dyngs.view.viewed import Viewed, load_viewed
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Viewed:
-    return load_viewed(write_moving_run(tmp_path_factory.mktemp("run")))
+def run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    return open_run(write_moving_run(tmp_path_factory.mktemp("run")))
 
 
 def test_colours_are_those_of_dyngs_render() -> None:
-    viewed = balls()
-    shown = draw(viewed, Shot(camera(80, 56), 0.3))
-    wanted = render_frame(viewed.scene, viewed.scene.moment(0.3), camera(80, 56), background=torch.ones(3)).rgb
+    opened = balls()
+    shown = draw(opened, Shot(camera(80, 56), 0.3))
+    wanted = render_frame(opened.scene, camera(80, 56), 0.3).rgb
     assert np.abs(shown / 255.0 - wanted).max() <= 0.5 / 255 + 1e-6
 
 
 @pytest.mark.parametrize("layer", LAYERS)
 @pytest.mark.parametrize("part", PARTS)
 def test_every_layer_of_every_part_is_a_image(layer: str, part: str) -> None:
-    for viewed in (balls(), replace(balls(), scene=still_scene())):
-        shown = draw(viewed, Shot(camera(), 0.5, layer, part))  # type: ignore[arg-type]
+    for opened in (balls(), opened_at(still_scene())):
+        shown = draw(opened, Shot(camera(), 0.5, layer, part))  # type: ignore[arg-type]
         assert shown.shape == (14, 20, 3)
         assert shown.dtype == np.uint8
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_a_gpu_draws_every_layer_alike(run: Viewed, layer: str) -> None:
+def test_a_gpu_draws_every_layer_alike(run: Opened, layer: str) -> None:
     view = 0 if layer in ("colour", "error") else None
     shots = [Shot(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
     expected = [draw(run, shot) for shot in shots]
     with pretend_gpu():
-        there = run.on(GPU)
+        there = run.to(GPU)
         found = [draw(there, shot) for shot in shots]
     for a, b in zip(found, expected, strict=True):
         assert np.array_equal(a, b)
@@ -60,29 +59,30 @@ def test_motion_is_red_where_it_is_far_and_dark_where_nothing_moves() -> None:
 
 
 def test_the_moment_of_a_time_is_computed_once() -> None:
-    viewed = balls()
-    asked = viewed.scene.field  # type: ignore[attr-defined]
+    opened = balls()
+    asked = opened.scene.field  # type: ignore[attr-defined]
     for _ in range(3):
-        draw(viewed, Shot(camera(), 0.5))
+        draw(opened, Shot(camera(), 0.5))
     assert asked.calls == 1
-    draw(viewed, Shot(camera(), 0.6))
+    draw(opened, Shot(camera(), 0.6))
     assert asked.calls == 2
 
 
 @pytest.mark.parametrize("size", [(48, 48), (96, 48), (30, 60)])
-def test_the_truth_fits_the_window(run: Viewed, size: tuple[int, int]) -> None:
+def test_the_truth_fits_the_window(run: Opened, size: tuple[int, int]) -> None:
     truth = truth_in_window(run, 0, size)
     assert truth is not None
     assert truth.shape == (size[1], size[0], 3)
     inside = ~np.isnan(truth).any(-1)
     side = min(size)
     assert inside.sum() == side * side  # the images are square
-    assert run.footage.images is not None
-    mean = run.footage.images[0].composite(run.background).mean((0, 1)).numpy()
+    images = views_of(run).images
+    assert images is not None
+    mean = images[0].composite(run.background).mean((0, 1)).numpy()
     assert truth[inside].mean(0) == pytest.approx(mean, abs=0.02)
 
 
-def test_the_line_divides_render_and_truth(run: Viewed) -> None:
+def test_the_line_divides_render_and_truth(run: Opened) -> None:
     def shown(divide: float) -> np.ndarray:
         return draw(run, Shot(camera(64, 64), 0.0, view=2, divide=divide))
 
@@ -92,7 +92,7 @@ def test_the_line_divides_render_and_truth(run: Viewed) -> None:
     assert not np.array_equal(render, truth)
 
 
-def test_the_error_is_that_of_render_and_truth(run: Viewed) -> None:
+def test_the_error_is_that_of_render_and_truth(run: Opened) -> None:
     window = truth_in_window(run, 1, (32, 32))
     assert window is not None
     render = draw(run, Shot(camera(32, 32), view=1)) / 255.0
@@ -101,7 +101,7 @@ def test_the_error_is_that_of_render_and_truth(run: Viewed) -> None:
     assert np.corrcoef(error.ravel(), np.minimum(wanted * 4, 1).ravel())[0, 1] > 0.9
 
 
-def test_beside_the_true_image_it_is_darker(run: Viewed) -> None:
+def test_beside_the_true_image_it_is_darker(run: Opened) -> None:
     wide = draw(run, Shot(camera(96, 48), view=0, divide=1.0))
     assert wide[:, :20].mean() <= 128
     assert wide[:, 40:56].mean() > 128

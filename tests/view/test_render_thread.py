@@ -1,6 +1,7 @@
 import threading
 import time
 
+import pytest
 from view_sessions import looking_at_balls
 
 from dyngs.errors import DyngsError
@@ -42,4 +43,22 @@ def test_a_fault_of_one_is_told_and_the_others_go_on() -> None:
     for _ in range(6):
         drawer.draw_one()
     assert told == [(bad, "no such file")]
+    assert sent
+
+
+def test_what_fails_again_and_again_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    told: list[str] = []
+    drawer = Drawer(lambda session, message: told.append(message))
+    session, sent = looking_at_balls()
+    drawer.add(session)
+
+    def fail() -> None:
+        raise ZeroDivisionError("by nothing")
+
+    for _ in range(50):
+        session.ask(fail)
+        drawer.draw_one()
+    assert told == ["ZeroDivisionError: by nothing"]
+    assert capsys.readouterr().err.count("Traceback") == 1
+    assert drawer.draw_one()  # it goes on
     assert sent

@@ -1,9 +1,12 @@
-"""The viewer in a real browser."""
+"""The viewer in a real browser, and what it does with messages that no browser sends."""
 
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +14,16 @@ import torch
 from browser import Browser, Page, missing
 from moving_scene import write_moving_run
 from PIL import Image
+from view_sessions import balls
 
 from dyngs.cli import main
 from dyngs.metrics import ssim
+from dyngs.view.pace import Pace
 from dyngs.view.recording import Keyframe, Recording
 from dyngs.view.server import Browsing, Serving, Viewer
 from dyngs.view.source import open_source
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
-pytestmark = pytest.mark.skipif(missing() is not None, reason=missing() or "")
 
 SIZE = (900, 480)
 SEEN = (slice(160, 470), slice(5, 560))
@@ -28,6 +32,9 @@ SEEN = (slice(160, 470), slice(5, 560))
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    reason = missing()
+    if reason is not None:
+        pytest.skip(reason)
     with Browser(timeout=30) as started:
         yield started
 
@@ -77,7 +84,7 @@ def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
     recording = Recording((Keyframe(session.eye.camera(), session.time),))
     folder.mkdir()
     path = folder / "path.json"
-    path.write_text(recording.document(session.eye.size, 30.0, session.viewed.world_offset))
+    path.write_text(recording.document(session.eye.size, 30.0, session.opened.world_offset))
     assert main(["render", str(run), "--path", str(path), "--out", str(folder / "out")]) == 0
     return np.asarray(Image.open(folder / "out" / "frame_0000.png").convert("RGB"))
 
@@ -85,6 +92,27 @@ def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
 def likeness(one: np.ndarray, other: np.ndarray) -> float:
     first, second = (torch.from_numpy(x.copy()).float() / 255 for x in (one, other))
     return ssim(first, second)
+
+
+def test_impossible_cameras_are_ignored_and_said_once() -> None:
+    told: list[str] = []
+    camera = SimpleNamespace(
+        wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=0.7, image_width=0, image_height=0, look_at=None
+    )
+    client: Any = SimpleNamespace(
+        camera=camera, atomic=nullcontext, add_notification=lambda title, body, **_: told.append(title)
+    )
+    browsing = Browsing(client, balls(), Pace(1 / 14))
+    browsing.go_to(None)  # a window without a size
+    before = browsing.session.eye
+    assert before is not None
+    assert before.size == (16, 16)
+    for wxyz in (np.zeros(4), np.full(4, np.nan)):
+        camera.wxyz = wxyz
+        for _ in range(3):
+            browsing.camera_moved()
+    assert browsing.session.eye == before
+    assert told == ["Camera ignored"]
 
 
 def test_the_page_shows_what_render_draws_at_every_time(

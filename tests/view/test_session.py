@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import Sliding, camera, moving_scene, still_scene
+from view_sessions import opened_at
 
 from dyngs.gaussians.scene import Scene
+from dyngs.runs.opened import Opened
 from dyngs.view.cameras import camera_at, pose_of
 from dyngs.view.layers import Shot, draw
 from dyngs.view.pace import STILL_AFTER
 from dyngs.view.recording import Keyframe, Recording
-from dyngs.view.session import Eye, Sent, Session
-from dyngs.view.viewed import Viewed
+from dyngs.view.session import Eye, Sent, Session, Timeline
 
 
 class Clock:
@@ -21,17 +22,8 @@ class Clock:
         return self.now
 
 
-def viewed(scene: Scene | None = None) -> Viewed:
-    return Viewed(
-        "balls",
-        scene or moving_scene(Sliding()),
-        still_scene().options,
-        torch.ones(3),
-        camera(),
-        np.zeros(3),
-        4.0,
-        np.array([0.0, -1, 0]),
-    )
+def opened(scene: Scene | None = None) -> Opened:
+    return opened_at(scene or moving_scene(Sliding()))
 
 
 def eye(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> Eye:
@@ -44,7 +36,7 @@ class Looked:
 
     def __init__(self, scene: Scene | None = None) -> None:
         self.clock, self.sent = Clock(), list[Sent]()
-        self.session = Session(viewed(scene), self.sent.append, clock=self.clock)
+        self.session = Session(opened(scene), self.sent.append, clock=self.clock)
 
     def after(self, seconds: float) -> None:
         """Let time pass, and draw whatever is due then."""
@@ -79,6 +71,26 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     assert looked.session.due() == 0.0
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"wxyz": (0.0, 0.0, 0.0, 0.0)},
+        {"wxyz": (float("nan"), 0.0, 0.0, 1.0)},
+        {"position": (0.0, float("inf"), 0.0)},
+        {"fov": 0.0},
+        {"size": (0, 40)},
+    ],
+)
+def test_cameras_that_cannot_be_are_ignored(change: dict) -> None:
+    looked = Looked()
+    assert not looked.session.move(replace(eye(), **change))
+    assert looked.session.due() is None
+    looked.session.move(eye())
+    looked.after(1)
+    assert not looked.session.move(replace(eye(), **change))
+    assert looked.session.eye == eye()
+
+
 def test_the_newest_camera_wins() -> None:
     looked = Looked()
     for x in (0.1, 0.2, 0.3):
@@ -86,7 +98,7 @@ def test_the_newest_camera_wins() -> None:
     looked.after(0)
     assert len(looked.sent) == 1
     small = looked.sent[0].image
-    wanted = draw(viewed(), Shot(eye(0.3).camera((small.shape[1], small.shape[0])), 0.0))
+    wanted = draw(opened(), Shot(eye(0.3).camera((small.shape[1], small.shape[0])), 0.0))
     assert np.array_equal(small, wanted)
 
 
@@ -168,9 +180,33 @@ def test_the_scene_in_training_is_drawn_again_as_large_as_it_was() -> None:
     looked.after(1)
     looked.after(1)
     whole = looked.sent[-1].image.shape
-    looked.session.take(viewed(), refreshes=False)
+    looked.session.take(opened(), refreshes=False)
     assert looked.session.due() is None
-    looked.session.take(replace(viewed(), name="later"), refreshes=True)
+    looked.session.take(replace(opened(), name="later"), refreshes=True)
     looked.after(1)
     assert looked.sent[-1].is_refined
     assert looked.sent[-1].image.shape == whole
+
+
+def test_time_passes_only_while_it_plays() -> None:
+    still = Timeline(seconds=4).moved(0.5, 10.0)
+    assert still.at(99.0) == 0.5
+    playing = still.changed(10.0, playing=True)
+    assert playing.at(11.0) == pytest.approx(0.75)
+    assert playing.changed(11.0, speed=2.0).at(11.25) == pytest.approx(0.875)
+    assert playing.changed(11.0, playing=False).at(50.0) == pytest.approx(0.75)
+
+
+def test_a_loop_begins_again_and_no_loop_ends() -> None:
+    loop = Timeline(seconds=2).changed(0.0, playing=True)
+    assert loop.at(2.5) == pytest.approx(0.25)
+    assert not loop.is_over(2.5)
+    once = loop.changed(0.0, loops=False)
+    assert once.at(2.5) == 1.0
+    assert once.is_over(2.5)
+    assert once.changed(3.0, playing=False).changed(5.0, playing=True).at(5.0) == 0.0
+
+
+def test_a_time_that_is_set_stays_within_the_recording() -> None:
+    assert Timeline().moved(7.0, 0.0).time == 1.0
+    assert Timeline().moved(-7.0, 0.0).time == 0.0

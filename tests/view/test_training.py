@@ -3,7 +3,6 @@ import threading
 from pathlib import Path
 
 import pytest
-import torch
 from view_sessions import looking_at_balls
 
 import dyngs
@@ -12,8 +11,7 @@ from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Session
-from dyngs.view.training import DrawnBetweenSteps
-from dyngs.view.viewed import viewed_training
+from dyngs.view.training import DrawnBetweenSteps, opened_training
 
 
 class Onlooker:
@@ -32,7 +30,7 @@ class Onlooker:
                 trainer = event.loop.trainer
                 assert isinstance(trainer, Trainer)
                 if event.step == 2:
-                    first = viewed_training("run", trainer.config, trainer.scene, trainer.images, torch.ones(3))
+                    first = opened_training(trainer)
                     session = Session(first, lambda sent: self.seen.append(sent.image.tobytes()), clock=self.clock)
                     self.drawer.add(session)
                 for session in self.drawer.sessions:
@@ -60,7 +58,7 @@ def test_images_take_no_more_than_their_share() -> None:
     threads = threading.active_count()
     now, drawer = [0.0], Drawer(lambda session, message: None)
     session, sent = looking_at_balls()
-    scene = session.viewed.scene
+    scene = session.opened.scene
 
     def clock() -> float:
         now[0] += 0.01  # whatever is done takes a while

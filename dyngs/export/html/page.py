@@ -6,17 +6,25 @@ import base64
 import hashlib
 import html
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dyngs.camera import Cameras
+from dyngs.camera_paths.aim import look_at_point
 from dyngs.conventions import RasterizeMode
-from dyngs.export.html.lists import Lists
-from dyngs.export.html.numbers import add_scene
+from dyngs.data.capture import Capture, View
+from dyngs.export.chosen_path import front_of, orbit_around, view_to_show
+from dyngs.export.html.numbers import Lists, add_scene
 from dyngs.files.write import write_text
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.human.avatar.posing import LEFT_OUT
+from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import Opened
+from dyngs.splats.rotation import AXES
+from dyngs.training.views import training_cameras
 
 HERE = Path(__file__).parent
 SCRIPTS = ("data.js", "motion.js", "sort.js", "renderer.js", "camera.js", "player.js", "main.js")
@@ -25,75 +33,120 @@ TOLERANCE = 0.25
 """Pixels of the first view that a place at its target may be off where motion is fitted."""
 
 
-@dataclass(frozen=True)
-class Staging:
-    """How a scene is shown.
-
-    Attributes:
-        title: shown in a corner and in the title bar; any text.
-        views: cameras to begin with and to go through, at least one, each a batch of one.
-        target: point to look at, world units.
-        up: direction, world.
-        background: colour in [0, 1].
-        seconds: from time 0 to time 1.
-        time: to begin with.
-    """
-
-    title: str
-    views: tuple[Cameras, ...]
-    target: tuple[float, float, float]
-    up: tuple[float, float, float]
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    seconds: float = 1.0
-    time: float = 0.0
+MOST_VIEWS = 24
+"""Cameras of the capture that a page offers, evenly chosen."""
+_RING, _FRONT_RING = 8, 24
+"""Cameras around a scene without a capture; among how many the front of a person is looked for."""
 
 
 @dataclass(frozen=True)
 class WrittenPage:
-    """A page on disk: its path, its size in bytes, and what its header says beside the layout."""
+    """A page on disk.
+
+    Attributes:
+        path: of it.
+        num_bytes: its size.
+        header: what it says except for the layout.
+        notes: lines about what was chosen or left out.
+    """
 
     path: Path
     num_bytes: int
     header: dict[str, Any]
+    notes: tuple[str, ...]
 
 
-def write_page(scene: Scene, options: RenderOptions, staging: Staging, path: Path) -> WrittenPage:
-    """Write the page of a scene, atomically.
+def write_page(
+    opened: Opened, path: Path, *, title: str | None = None, time: float = 0.0, views: Sequence[Cameras] = ()
+) -> WrittenPage:
+    """Write the page of a scene, atomically: where its viewer begins, and what moves.
 
     Args:
-        scene: of any kind; one with a colour network is coloured by it in the page, too.
-        options: how it is drawn.
-        staging: how it is shown.
+        opened: a scene of any kind; one with a colour network is coloured by it in the page, too.
         path: of the file.
+        title: shown in a corner and in the title bar, any text; None: the name of the run, or of the file.
+        time: to begin with.
+        views: cameras to begin with and to go through, each a batch of one; without any, those of the capture, or
+            around the scene.
 
     Raises:
         DyngsError: the file cannot be written.
     """
+    inputs_of(opened).require_output(path)
+    if title is None:
+        title = opened.name if opened.captured is not None else Path(opened.name).stem
     lists = Lists()
-    header = _header(scene, options, staging, lists)
-    text = _assembled(header | {"layout": lists.layout}, lists.text(), staging)
+    header = _header(opened, time, views, lists)
+    text = _assembled(header | {"layout": lists.layout}, lists.text(), title)
     write_text(path, text)
-    return WrittenPage(path, len(text.encode()), header)
+    return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
 
 
-def _header(scene: Scene, options: RenderOptions, staging: Staging, lists: Lists) -> dict[str, Any]:
-    first = staging.views[0]
-    apart = float((first.centers[0] - first.centers.new_tensor(staging.target)).norm())
+def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
+    notes: list[str] = []
+    if opened.captured is not None and opened.missing is not None:
+        up = "" if opened.person is not None else f", {opened.stated_up or 'z'} up"
+        notes.append(f"without the capture ({opened.missing}) the page begins with a view from outside{up}")
+    if opened.person is not None and opened.person.light is not None:
+        notes.append(LEFT_OUT)
+    curves = header.get("curves", {})
+    if curves.get("error"):
+        fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {curves['error']:.2g}"
+        notes.append(f"splines are fitted to the motion ({fit} world units)")
+    return tuple(notes)
+
+
+def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists) -> dict[str, Any]:
+    views, target = (views, _middle(opened)) if views else _views(opened)
+    upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
+    first, options = views[0], opened.scene.options
+    apart = float((first.centers[0] - first.centers.new_tensor(target)).norm())
     pixel = max(apart, 1e-6) / float(first.intrinsics[0, 1, 1])
-    told = add_scene(scene, lists, TOLERANCE * pixel)
+    told = add_scene(opened.scene, lists, TOLERANCE * pixel)
     shown = {
         "eps2d": options.eps2d,
         "near": options.near,
         "alphaMin": options.alpha_min,
         "antialiased": options.mode == RasterizeMode.ANTIALIASED,
-        "background": list(staging.background),
-        "target": list(staging.target),
-        "up": list(staging.up),
-        "seconds": staging.seconds,
-        "time": staging.time,
-        "views": [_view(camera) for camera in staging.views],
+        "background": opened.background.tolist(),
+        "target": target,
+        "up": upward.tolist(),
+        "seconds": opened.seconds,
+        "time": time,
+        "views": [_view(camera) for camera in views],
     }
     return told | shown
+
+
+def _views(opened: Opened) -> tuple[list[Cameras], list[float]]:
+    """Return the cameras to begin with and to go through, each a batch of one, and the point to look at."""
+    cameras = opened.cameras
+    if cameras is not None:
+        capture = opened.capture
+        chosen = (view_to_show(capture), *_some(capture))
+        return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
+    ring = orbit_around(opened, _RING)
+    views = [ring.select(i) for i in range(_RING)]
+    if opened.person is None:
+        return views, _middle(opened)
+    wide = orbit_around(opened, _FRONT_RING)
+    return [wide.select(front_of(opened, wide)), *views], look_at_point(ring).tolist()
+
+
+def _middle(opened: Opened) -> list[float]:
+    return np.median(opened.scene.at(None).means.numpy(), axis=0).tolist()
+
+
+def _some(capture: Capture) -> list[View]:
+    """Return training views at different positions, evenly chosen."""
+    views, seen = [], set()
+    for view in capture.splits["train"]:
+        pose = view.cam_from_world.tobytes()
+        if pose not in seen:
+            seen.add(pose)
+            views.append(view)
+    rows = np.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().astype(int)
+    return [views[i] for i in rows]
 
 
 def _view(camera: Cameras) -> dict[str, Any]:
@@ -106,15 +159,15 @@ def _view(camera: Cameras) -> dict[str, Any]:
     }
 
 
-def _assembled(header: dict[str, Any], numbers: str, staging: Staging) -> str:
+def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
     """Return the text of the page. All that stems from a run is escaped; scripts are allowed by their hash alone."""
-    red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in staging.background)
+    red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in header["background"])
     style = _file("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
     script = '"use strict";\n' + "\n".join(_file(name) for name in SCRIPTS)
     shaders = "\n".join(f'<script type="text/plain" id="{name}">\n{_file(name)}</script>' for name in SHADERS)
     page = _file("page.html")
     fixed = {"style": style, "script": script, "shaders": shaders}
-    fixed |= {"style_hash": _hash(style), "script_hash": _hash(script), "title": html.escape(staging.title)}
+    fixed |= {"style_hash": _hash(style), "script_hash": _hash(script), "title": html.escape(title)}
     fixed |= {"header": _script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
     fixed["about"] = f"{header['count']:,} Gaussians, {size / 1e6:.1f} MB"

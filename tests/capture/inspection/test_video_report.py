@@ -10,7 +10,7 @@ from stage_videos import camera, corner, write_videos
 
 from dyngs.capture.inspection.video_report import video_facts, video_report
 from dyngs.cli import main
-from dyngs.output.video import VideoWriter
+from dyngs.export.video import VideoWriter
 
 
 def _turning(path: Path, blurred: int = -1) -> Path:

@@ -14,7 +14,7 @@ from dyngs.data.capture import all_views
 from dyngs.data.read import read_capture
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
-from dyngs.output.video import VideoWriter
+from dyngs.export.video import VideoWriter
 
 AZIMUTHS = {"left": 32.0, "middle": 41.0, "phone": 49.0, "right": 58.0}
 STARTS = {"left": 0.03, "middle": 0.0, "phone": 0.37, "right": 0.16}

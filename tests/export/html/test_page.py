@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from browser import Browser, Page, needs_browser
-from moving_scene import camera, moving_scene, still_scene
+from moving_scene import camera, moving_scene, still_scene, write_moving_run
 from numpy.typing import NDArray
 from PIL import Image
 from scene_kinds import KINDS, onlooker, scene_of_kind
@@ -28,15 +29,14 @@ from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.deform.rigid_groups import ALONE, fitted_splines
 from dyngs.deform.scene import DynamicScene
-from dyngs.export.html.page import SCRIPTS, SHADERS, Staging, WrittenPage, write_page
+from dyngs.export.html.page import MOST_VIEWS, SCRIPTS, SHADERS, WrittenPage, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import Scene
 from dyngs.metrics import psnr, ssim
 from dyngs.ops.quaternions import rotate
+from dyngs.runs.opened import Opened, open_run, opened_scene
 from dyngs.static.scene import StaticScene
-
-WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +48,8 @@ def browser() -> Iterator[Browser]:
 def write(
     scene: Scene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
 ) -> WrittenPage:
-    staging = Staging(title, (view,), (0.0, 0.0, 0.0), (0.0, -1.0, 0.0), WHITE, seconds=2.0)
-    return write_page(scene, options or scene.options, staging, path)
+    scene = replace(scene, options=options or scene.options, background=torch.ones(3))
+    return write_page(replace(opened_scene(scene), stated_up="-y"), path, title=title, views=(view,))
 
 
 def opened(browser: Browser, path: Path, width: int = 320, height: int = 240) -> Page:
@@ -226,6 +226,42 @@ def test_all_parts_of_the_page_are_in_it(tmp_path: Path) -> None:
         lines = (folder / name).read_text(encoding="utf-8").splitlines()
         assert len(lines) <= 500, name
         assert max(len(line) for line in lines) <= 120, name
+
+
+@pytest.fixture(scope="module")
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    return open_run(write_moving_run(tmp_path_factory.mktemp("moving")))
+
+
+def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Opened, tmp_path: Path) -> None:
+    written = write_page(moving_run, tmp_path / "a.html", time=0.25)
+    header, notes = written.header, written.notes
+    assert len(notes) == 1
+    assert "splines are fitted to the motion" in notes[0]
+    assert written.num_bytes == (tmp_path / "a.html").stat().st_size
+    assert (header["moves"], header["time"], header["background"]) == (True, 0.25, [1.0, 1.0, 1.0])
+    assert header["seconds"] >= 1.0
+    assert 2 <= len(header["views"]) <= 1 + MOST_VIEWS
+    assert all((view["width"], view["height"]) == (16, 16) for view in header["views"])
+    assert header["up"] == pytest.approx([0, 0, 1], abs=0.3)
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert "<title>run</title>" in text
+    written = write_page(replace(moving_run, stated_up="-y"), tmp_path / "a.html")
+    assert written.header["up"] == [0.0, -1.0, 0.0]
+
+
+def test_without_the_capture_a_page_begins_outside(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path, moves=False)
+    shutil.rmtree(tmp_path / "capture")
+    written = write_page(open_run(run), tmp_path / "a.html", title="<i>")
+    (note,) = written.notes
+    assert "without the capture" in note
+    assert not written.header["moves"]
+    assert written.header["background"] == [1.0, 1.0, 1.0]
+    assert "<title>&lt;i&gt;</title>" in (tmp_path / "a.html").read_text(encoding="utf-8")
+    for view in written.header["views"]:  # the balls, around the origin, are in front of each
+        pose = torch.tensor(view["camFromWorld"]).reshape(4, 4)
+        assert float(pose[2, 3]) > float(camera().cam_from_world[0, 2, 2])
 
 
 def settled(page: Page) -> NDArray[np.uint8]:

@@ -27,8 +27,8 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.joints import mirrored_joints
-from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.runs.checkpoint import load_run, save_checkpoint
+from dyngs.runs.opened import open_run
 from dyngs.training.trainer import Trainer
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.895)
@@ -186,12 +186,12 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     from dyngs.config.io import RESOLVED_NAME, save_config
 
     save_config(trainer.config, tmp_path / RESOLVED_NAME)
-    run = load_run(tmp_path)
-    own = with_motion(run, capture / "body_train.npz")
-    assert len(own.run.scene.times) == 3
-    first, again = run.scene.at(0.0), own.run.scene.at(0.0)
+    run = open_run(tmp_path)
+    own = run.in_motion(capture / "body_train.npz")
+    assert len(own.scene.times) == 3
+    first, again = run.scene.at(0.0), own.scene.at(0.0)
     torch.testing.assert_close(again.log_scales, first.log_scales, rtol=0, atol=1e-4)
-    rest = in_rest_pose(run).scene
+    rest = run.at_rest().scene
     assert rest.is_static
     spread = rest.at(None).means.amax(0) - rest.at(None).means.amin(0)
     assert float(spread[0]) > 1.5, "arms to the sides"

@@ -1,0 +1,1 @@
+"""Camera paths: placed by cameras or points, smoothed, interpolated, read and written."""

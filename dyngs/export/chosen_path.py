@@ -1,0 +1,189 @@
+"""The camera path of a command: placed by cameras, a person or points, read from a file, or the camera of one view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from dyngs.camera import Cameras
+from dyngs.camera_paths.along import path_along
+from dyngs.camera_paths.orbit import frame_orbit_for_points, orbit_of, orbit_path, spiral_path
+from dyngs.camera_paths.path import CameraPath, path_file, read_path, resize_cameras, static_path, with_times
+from dyngs.data.capture import Capture, View
+from dyngs.errors import DyngsError
+from dyngs.export.images import file_stems
+from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.runs.opened import Opened, cameras_for_paths, split_views
+from dyngs.splats.rotation import AXES, with_scene
+from dyngs.training.views import training_cameras
+
+DEFAULT_FRAMES = 120
+DEFAULT_SIZE = (960, 720)
+_SAMPLED_TIMES = 8
+"""Times of a motion whose Gaussians the images of an orbit must hold."""
+_RING = 24
+
+
+@dataclass(frozen=True)
+class PathOptions:
+    """Cameras and times to render.
+
+    Attributes:
+        path: "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None:
+            one fixed camera.
+        num_frames: frames of a path that is not a file; None: as many as a motion has, else 120.
+        size: width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file.
+        times: scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view
+            for a fixed camera, from 0 to 1 along a path.
+        view: the view of the fixed camera: its name, the name of its image, or its number from 0.
+        split: split of that view; None: test, or val or train if there is none.
+    """
+
+    path: str | None = "orbit"
+    num_frames: int | None = None
+    size: tuple[int, int] | None = None
+    times: tuple[float, ...] | None = None
+    view: str | None = None
+    split: str | None = None
+
+
+def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
+    """Return the cameras and times along which a scene is rendered, with notes about defaults that were chosen.
+
+    Raises:
+        DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what a
+            file cannot have.
+    """
+    scene, times = opened.scene, options.times
+    if opened.captured is None:
+        _require_fitting(opened, options)
+    path = _fixed_camera(opened, options) if options.path is None else _moving(opened, options.path, options)
+    notes = path.notes
+    if scene.is_static and times is not None:
+        notes = (*notes, "nothing moves in this run: it looks the same at all times")
+    elif not scene.is_static and path.times is None:
+        path = with_times(path, np.linspace(0, 1, len(path)).tolist())
+        notes = (*notes, "time runs from 0 to 1 along the path; --time or --times choose other times")
+    if options.size is not None:
+        path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
+    return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
+
+
+def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
+    """Return the view called ``name``, by default the first one.
+
+    Args:
+        capture: with at least one view.
+        name: name of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0;
+            names take precedence over numbers.
+        split: "test", "val" or "train"; None looks for a name in all, for a number in the first that has views.
+
+    Raises:
+        DyngsError: no such view, or no such split.
+    """
+    order = [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
+    candidates = [split_views(capture, s) for s in order]
+    if name is None:
+        return candidates[0][0]
+    for views in candidates:
+        for view, stem in zip(views, file_stems([view.name for view in views]), strict=True):
+            if name in (view.name, stem):
+                return view
+    first = candidates[0]
+    if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(first):
+        return first[int(name)]
+    raise DyngsError(
+        f"{capture.root}: no view {name!r}; the split {order[0]} has {len(first)} views: {first[0].name} (0) to "
+        f"{first[-1].name} ({len(first) - 1})"
+    )
+
+
+def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+    """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all of their motion.
+
+    z is up where nothing says what is.
+    """
+    scene = opened.scene
+    moves = opened.person is not None and not scene.is_static
+    times = np.linspace(0, 1, _SAMPLED_TIMES).tolist() if moves else [None]
+    means = torch.cat([scene.at(time).means for time in times]).cpu().numpy()
+    x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
+    return frame_orbit_for_points(means, count, size, (x, y, z))
+
+
+def front_of(opened: Opened, ring: Cameras) -> int:
+    """Return which camera of an orbit sees a person's front; 0 for other scenes."""
+    if opened.person is None:
+        return 0
+    facing = axis_angle_to_matrix(opened.person.clip.poses[0, 0])[:, 2]
+    return int((ring.centers @ facing).argmax())
+
+
+def _require_fitting(opened: Opened, options: PathOptions) -> None:
+    """Raise DyngsError for options that a file, which has no capture, does not support."""
+    file = opened.config.data.root
+    if options.path == "along":
+        raise DyngsError(f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit")
+    if opened.person is not None:
+        if options.view is not None:
+            raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
+    elif options.path is None or options.times is not None or options.view is not None:
+        kind = file.suffix.lower()
+        raise DyngsError(f"{file}: a {kind} holds one time and no views; leave out --time, --times and --view")
+
+
+def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
+    """Return the path of one fixed camera at the times that are requested, or at the time of its view."""
+    if opened.captured is None:
+        ring = orbit_around(opened, _RING, options.size or DEFAULT_SIZE)
+        camera, times = ring.select(front_of(opened, ring)), opened.scene.times
+    else:
+        view = view_to_show(opened.capture, options.view, options.split)
+        (camera,) = training_cameras([view], opened.config.data)
+        times = (view.time or 0.0,) if opened.fps is None else opened.scene.times
+    return static_path(camera, times if options.times is None else options.times)
+
+
+def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
+    """Return the path called ``name``, with the times that are requested if there are any."""
+    file = path_file(name)
+    if file is None:
+        found = _placed(opened, name, options)
+    else:
+        found = read_path(file, opened.world_offset)
+        found = replace(found, cameras=with_scene(found.cameras, opened.turned))
+    if options.times is None:
+        return found
+    times = options.times * len(found) if len(options.times) == 1 else options.times
+    return with_times(replace(found, warnings=()), times)
+
+
+def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
+    """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by the scene."""
+    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(opened.scene.times))
+    up = None if opened.stated_up is None else np.array(AXES[opened.stated_up])
+    if opened.captured is None:
+        size = options.size or DEFAULT_SIZE
+        if name == "orbit":
+            return CameraPath(orbit_around(opened, frames, size))
+        ring = orbit_around(opened, _RING, size)
+        arc = [(front_of(opened, ring) + i) % _RING for i in (-1, 0, 1)]
+        near = replace(ring, cam_from_world=ring.cam_from_world[arc], intrinsics=ring.intrinsics[arc])
+        return CameraPath(spiral_path(near, frames))
+    views = opened.capture.splits["train"]
+    cameras = cameras_for_paths(views, opened.config.data)
+    match name:
+        case "orbit":
+            orbit = orbit_of(cameras, up)
+            if opened.person is None or orbit.width is None:
+                return CameraPath(orbit_path(cameras, frames, up), notes=orbit.notes)
+            notes = ("the person was filmed from one side: the orbit goes all around them",)
+            return CameraPath(orbit_around(opened, frames, (cameras.width, cameras.height)), notes=notes)
+        case "spiral":
+            return CameraPath(spiral_path(cameras, frames, up))
+        case _:
+            times = [view.time for view in views if view.time is not None]
+            clip = len(times) == len(views) and not opened.scene.is_static and opened.fps is None
+            return path_along(cameras, frames, times if clip else None, up)

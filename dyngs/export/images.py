@@ -1,0 +1,283 @@
+"""Images and videos of scenes: frames along a camera path, or the views of a split next to their ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.camera_paths.path import CameraPath
+from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.data.loader import ImageLoader
+from dyngs.errors import DyngsError
+from dyngs.export.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
+from dyngs.export.video import VideoWriter
+from dyngs.files.outputs import Inputs
+from dyngs.files.write import to_uint8, write_image
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import Moment, Scene
+from dyngs.metrics import psnr
+from dyngs.ops.device import CPU
+from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import Opened, split_views
+
+_SHEET_ROWS = 12
+_DEPTH_SAMPLES = 8
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One rendered image, float32.
+
+    Attributes:
+        rgb: (H, W, 3), composited on the background, clamped to [0, 1].
+        alpha: (H, W) in [0, 1].
+        depth: (H, W) expected depth, 0 where nothing is hit; None if it was not rendered.
+    """
+
+    rgb: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Files to write in addition to the colour images.
+
+    Attributes:
+        depth: ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis).
+        alpha: ``NAME_alpha.png``, white = opaque.
+        video: MP4 of the colour images in order.
+        fps: frames per second of the video.
+    """
+
+    depth: bool = False
+    alpha: bool = False
+    video: Path | None = None
+    fps: float = 30.0
+
+
+def render_frame(
+    scene: Scene, camera: Cameras, time: float | Moment | None = None, options: RenderOptions | None = None
+) -> Frame:
+    """Render one camera, without gradients.
+
+    Args:
+        scene: scene to render.
+        camera: one camera.
+        time: in [0, 1], or the scene at that time, so that it is not computed again.
+        options: None: those of the scene; ``depth`` other than "none" fills ``Frame.depth``.
+    """
+    with torch.no_grad():
+        rendering = scene.render(camera, time, options=options)
+    depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
+    return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
+
+
+def path_frames(scene: Scene, path: CameraPath, options: RenderOptions | None = None) -> Iterator[Frame]:
+    """Yield the frames along a path one by one, so that memory does not grow with their number.
+
+    The scene is deformed only where the time differs from that of the frame before. A path without times shows time 0.
+    """
+    moment, moment_time = None, None
+    for i in range(len(path)):
+        time = None if path.times is None or scene.is_static else path.times[i]
+        if moment is None or time != moment_time:
+            with torch.no_grad():
+                moment, moment_time = scene.moment(time), time
+        yield render_frame(scene, path.cameras.select(i), moment, options)
+
+
+def write_path_images(
+    opened: Opened,
+    path: CameraPath,
+    out_dir: Path | None,
+    output: OutputOptions = OutputOptions(),
+    report: ReportProgress = report_nothing,
+) -> list[Path]:
+    """Render a scene along a path to ``frame_0000.png`` and so on, and to a video if requested; return the paths.
+
+    Args:
+        opened: scene to render. Images of its capture are not overwritten.
+        path: F >= 1 cameras and times, in the order of the video.
+        out_dir: folder for the images; None writes only the video.
+        output: depth, alpha, video. Depth colours share one range over the full path.
+        report: is told of each frame.
+
+    Raises:
+        DyngsError: no cameras, nothing to write, or a file cannot be written.
+    """
+    if len(path) == 0:
+        raise DyngsError("the camera path has no cameras")
+    if out_dir is None and output.video is None:
+        raise DyngsError("nothing to write: give a folder for the images or a video file")
+    options, limits = _with_depth(opened.scene, output), None
+    if output.depth and out_dir is not None:
+        limits = _shared_depth_limits(path_frames(opened.scene, _sample(path), options))
+    digits = max(4, len(str(len(path) - 1)))
+    with _FrameWriter(out_dir, output, inputs_of(opened), limits) as writer:
+        for i, frame in enumerate(path_frames(opened.scene, path, options)):
+            writer.write(f"frame_{i:0{digits}d}", frame)
+            report("frames", i + 1, len(path))
+    return writer.written
+
+
+def write_split_images(
+    opened: Opened,
+    split: str,
+    out_dir: Path,
+    output: OutputOptions = OutputOptions(),
+    report: ReportProgress = report_nothing,
+    device: torch.device = CPU,
+) -> list[Path]:
+    """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
+
+    The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that
+    of training, black if that was random.
+
+    Args:
+        opened: a run.
+        split: "test", "val" or "train".
+        out_dir: folder for the images, which are named after the views (``file_stems``).
+        output: depth, alpha, video (views of one size only).
+        report: is told of each view.
+        device: draws.
+
+    Raises:
+        DyngsError: no such split, unreadable images, a file cannot be written.
+    """
+    inputs = inputs_of(opened)
+    inputs.require_output(out_dir)
+    views = split_views(opened.capture, split)
+    loader, background = ImageLoader(views, opened.config.data), opened.background
+    scene = opened.of_split(split).scene.to(device)
+    options = _with_depth(scene, output)
+    shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
+    rows: list[SheetRow] = []
+    with _FrameWriter(out_dir, output, inputs) as writer:
+        for i, stem in enumerate(file_stems([view.name for view in views])):
+            image = loader[i]
+            frame = render_frame(scene, image.cameras, image.time, options)
+            writer.write(stem, frame)
+            report("views", i + 1, len(views))
+            if i in shown:
+                truth = image.composite(background)
+                label = f"{psnr(torch.from_numpy(frame.rgb), truth, image.mask):.2f} dB  {image.name}"
+                rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), image.mask))
+    writer.write_image(out_dir / "sheet.png", contact_sheet(rows))
+    return writer.written
+
+
+def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
+    """Return a row of the sheet; masked pixels are black on both sides, so that they show no error."""
+    counts = 1.0 if mask is None else mask[..., None]
+    return SheetRow(label, to_uint8((truth * counts).cpu().numpy()), to_uint8((rendered * counts).cpu().numpy()))
+
+
+def file_stems(names: Sequence[str]) -> list[str]:
+    """Return safe and unique file names, without suffix, for the names of views.
+
+    Folders that all names share are dropped, other folders become a prefix (``left/0001`` is ``left_0001``). Parts
+    such as ``..`` and special characters are replaced, so that no name leaves the output folder.
+    """
+    parts = [[_safe(part) for part in name.replace("\\", "/").split("/") if part.strip(". ")] for name in names]
+    parts = [p or ["view"] for p in parts]
+    while all(len(p) > 1 for p in parts) and len({p[0] for p in parts}) == 1:
+        parts = [p[1:] for p in parts]
+    taken: set[str] = {"sheet"}
+    stems = []
+    for p in parts:
+        stem = base = "_".join(p)
+        number = 1
+        while taken & _files(stem):
+            number += 1
+            stem = f"{base}_{number}"
+        taken |= _files(stem)
+        stems.append(stem)
+    return stems
+
+
+class _FrameWriter:
+    """Context manager that writes frames to images and a video; ``written`` lists the files."""
+
+    def __init__(
+        self,
+        out_dir: Path | None,
+        output: OutputOptions,
+        inputs: Inputs,
+        limits: tuple[float, float] | None = None,
+    ) -> None:
+        self.written: list[Path] = []
+        self._inputs = inputs
+        self._out_dir, self._output, self._limits = out_dir, output, limits
+        self._stack = ExitStack()
+        self._video: VideoWriter | None = None
+        self._size: tuple[int, ...] | None = None
+
+    def __enter__(self) -> _FrameWriter:
+        for out in (self._out_dir, self._output.video):
+            if out is not None:
+                self._inputs.require_output(out)
+        if self._output.video is not None:
+            self._video = self._stack.enter_context(VideoWriter(self._output.video, fps=self._output.fps))
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self._stack.__exit__(*problem)  # type: ignore[arg-type]
+        if problem[0] is None and self._output.video is not None:
+            self.written.append(self._output.video)
+
+    def write(self, stem: str, frame: Frame) -> None:
+        rgb = to_uint8(frame.rgb)
+        if self._video is not None:
+            self._size = self._size or rgb.shape
+            if rgb.shape != self._size:
+                raise DyngsError(f"{self._output.video}: a video needs views of one size, {stem} differs")
+            self._video.add(rgb)
+        if self._out_dir is None:
+            return
+        self.write_image(self._out_dir / f"{stem}.png", rgb)
+        if self._output.alpha:
+            self.write_image(self._out_dir / f"{stem}_alpha.png", frame.alpha)
+        if self._output.depth and frame.depth is not None:
+            self.write_image(self._out_dir / f"{stem}_depth.png", depth_to_rgb(frame.depth, frame.alpha, self._limits))
+            self.write_image(self._out_dir / f"{stem}_depth.exr", frame.depth)
+
+    def write_image(self, path: Path, pixels: np.ndarray) -> None:
+        self._inputs.require_output(path)
+        write_image(path, pixels)
+        self.written.append(path)
+
+
+def _with_depth(scene: Scene, output: OutputOptions) -> RenderOptions:
+    return replace(scene.options, depth="expected" if output.depth else "none")
+
+
+def _sample(path: CameraPath) -> CameraPath:
+    """Return at most 8 of the frames, evenly spread."""
+    count, device = min(len(path), _DEPTH_SAMPLES), path.cameras.cam_from_world.device
+    index = torch.linspace(0, len(path) - 1, count, device=device).round().long()
+    poses, intrinsics = path.cameras.cam_from_world[index], path.cameras.intrinsics[index]
+    cameras = replace(path.cameras, cam_from_world=poses, intrinsics=intrinsics)
+    return replace(path, cameras=cameras, times=path.times and tuple(path.times[i] for i in index.tolist()))
+
+
+def _shared_depth_limits(frames: Iterator[Frame]) -> tuple[float, float]:
+    """Return near and far over all of the frames."""
+    seen = [(frame.depth.ravel(), frame.alpha.ravel()) for frame in frames if frame.depth is not None]
+    return depth_limits(np.concatenate([d for d, _ in seen]), np.concatenate([a for _, a in seen]))
+
+
+def _files(stem: str) -> set[str]:
+    """Return the file names of a view, in lower case because some file systems ignore case."""
+    return {f"{stem}{suffix}".lower() for suffix in ("", "_depth", "_alpha")}
+
+
+def _safe(part: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in part).lstrip(".") or "_"

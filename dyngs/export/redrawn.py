@@ -1,0 +1,124 @@
+"""Exported files drawn again and compared with the scene that they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.camera_paths.orbit import frame_orbit_for_points
+from dyngs.camera_paths.path import resize_cameras
+from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import render
+from dyngs.gaussians.scene import Scene
+from dyngs.metrics import psnr
+from dyngs.runs.opened import Opened
+from dyngs.splats.formats import Written, read_splats
+from dyngs.splats.rotation import AXES, inverse, product, with_scene
+from dyngs.splats.splat_file import SplatFile, splat_options
+
+VIEWS = 4
+_LONGEST_SIDE = 240
+_LEAST_FRACTION = 0.002
+"""Cameras that see the scene in fewer pixels than this are replaced by an orbit."""
+FAINT = 30.0
+"""dB, below which a line about the difference is a warning."""
+
+
+@dataclass(frozen=True)
+class Redrawn:
+    """A file drawn again.
+
+    Attributes:
+        psnr: dB, mean over the images; 100 where they are equal.
+        views: number of images.
+    """
+
+    psnr: float
+    views: int
+
+    @property
+    def line(self) -> str:
+        """Return the figure for people."""
+        figure = "the same images" if self.psnr >= 99.9 else f"{self.psnr:.1f} dB (PSNR)"
+        return f"drawn again from {self.views} cameras: {figure} compared with the scene"
+
+    @property
+    def is_faint(self) -> bool:
+        """Return whether the file shows something visibly different."""
+        return self.psnr < FAINT
+
+
+def compare_run(opened: Opened, scene: Scene, time: float, meant: SplatFile, read: SplatFile) -> Redrawn:
+    """Return how a file differs from a scene at one time, seen by cameras of its capture, else from an orbit.
+
+    Args:
+        opened: what was exported.
+        scene: the part of it.
+        time: in [0, 1].
+        meant: what the file is meant to hold, turned from the axes of the scene.
+        read: what it holds.
+
+    Raises:
+        DyngsError: no camera sees anything.
+    """
+    with torch.no_grad():
+        moment = scene.moment(time)
+        for cameras in (capture_cameras(opened), with_scene(around(meant), inverse(meant.turned))):
+            if cameras is None:
+                continue
+            drawn = scene.render(cameras, moment, background=_black(moment.gaussians.means))
+            if float((drawn.alpha > 0.1).float().mean()) >= _LEAST_FRACTION:
+                return compare(drawn.rgb, with_scene(cameras, meant.turned), read)
+    raise DyngsError("nothing of the scene is seen by the cameras of the capture, or from an orbit around it")
+
+
+def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
+    """Return how a file differs from what it was converted from, seen from an orbit.
+
+    Args:
+        splat: before it was turned.
+        written: the file.
+
+    Raises:
+        DyngsError: the file cannot be read.
+    """
+    cameras = around(splat)
+    with torch.no_grad():
+        background = _black(splat.gaussians.means)
+        wanted = render(splat.gaussians, cameras, splat_options(splat), background=background).rgb
+    return compare(
+        wanted, with_scene(cameras, product(written.splat.turned, inverse(splat.turned))), read_splats(written.path)
+    )
+
+
+def compare(wanted: Tensor, cameras: Cameras, splat: SplatFile) -> Redrawn:
+    """Return how what a file holds, seen by cameras in its axes, differs from images (V, H, W, 3)."""
+    with torch.no_grad():
+        drawn = render(splat.gaussians, cameras, splat_options(splat), background=_black(wanted)).rgb
+    values = [psnr(a, b) for a, b in zip(drawn, wanted, strict=True)]
+    return Redrawn(float(np.mean(values)), len(values))
+
+
+def capture_cameras(opened: Opened) -> Cameras | None:
+    """Return a few training cameras, in images of modest size; None where no capture can be read."""
+    cameras = opened.cameras
+    if cameras is None:
+        return None
+    rows = np.unique(np.linspace(0, len(cameras) - 1, VIEWS).round().astype(int))
+    few = replace(cameras, cam_from_world=cameras.cam_from_world[rows], intrinsics=cameras.intrinsics[rows])
+    fraction = min(1.0, _LONGEST_SIDE / max(few.width, few.height))
+    return resize_cameras(few, max(1, round(fraction * few.width)), max(1, round(fraction * few.height)))
+
+
+def around(splat: SplatFile) -> Cameras:
+    """Return an orbit around Gaussians, in their own axes."""
+    means = splat.gaussians.means.numpy()
+    return frame_orbit_for_points(means, VIEWS, (_LONGEST_SIDE, _LONGEST_SIDE * 3 // 4), AXES[splat.up or "z"])
+
+
+def _black(like: Tensor) -> Tensor:
+    return torch.zeros(3, dtype=torch.float32, device=like.device)

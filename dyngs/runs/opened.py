@@ -1,0 +1,311 @@
+"""Scenes with what is known about them: of a run, an avatar file, a file of Gaussians, or a training in progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.camera_paths.aim import up_direction
+from dyngs.config import Config, DataConfig, HumanModel, StaticModel
+from dyngs.config.kinds import person_of
+from dyngs.data.capture import Capture, Split, View
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+from dyngs.files.wrong_place import command_for
+from dyngs.gaussians.scene import Scene
+from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.motion import placement
+from dyngs.human.motion.clip import captured_motion, motion_clip, same_bodies
+from dyngs.human.template.body_reader import load_template
+from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
+from dyngs.runs.avatar import read_avatar
+from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
+from dyngs.splats.formats import all_suffixes, known_format, read_splats
+from dyngs.splats.rotation import AXES
+from dyngs.splats.splat_file import Nonfinite, SplatFile, splat_options
+from dyngs.static.scene import StaticScene
+from dyngs.training.background import background_colour
+from dyngs.training.state import CheckpointInfo
+from dyngs.training.views import training_cameras
+
+FRAME_RATE = 30.0
+"""Assumed where a capture does not say."""
+SHORTEST = 1.0
+"""Seconds that a motion is played for at least."""
+_NO_TURN = (1.0, 0.0, 0.0, 0.0)
+
+T = TypeVar("T")
+
+
+class Captured:
+    """The capture that a scene was trained on; read when it is first needed, and only once.
+
+    Args:
+        data: where it is.
+        capture: what was read from there already.
+    """
+
+    def __init__(self, data: DataConfig, capture: Capture | None = None) -> None:
+        self.data = data
+        self._found: Capture | DyngsError | None = capture
+        self._kept: dict[str, Any] = {}
+
+    @property
+    def capture(self) -> Capture:
+        """The capture. Raises DyngsError where it cannot be read."""
+        if self._found is None:
+            try:
+                self._found = read_capture(self.data)
+            except DyngsError as error:
+                self._found = error
+        if isinstance(self._found, DyngsError):
+            raise self._found
+        return self._found
+
+    @property
+    def cameras(self) -> Cameras | None:
+        """The V training cameras, all with size and intrinsics of the first; None where the capture cannot be read."""
+        return self.once("cameras", self._cameras)
+
+    def _cameras(self) -> Cameras | None:
+        try:
+            return cameras_for_paths(self.capture.splits["train"], self.data)
+        except DyngsError:
+            return None
+
+    def once(self, name: str, compute: Callable[[], T]) -> T:
+        """Return what ``compute`` returned when first asked for ``name``."""
+        if name not in self._kept:
+            self._kept[name] = compute()
+        return self._kept[name]
+
+
+@dataclass(frozen=True)
+class Opened(LoadedRun):
+    """A scene, and what is known about it.
+
+    Attributes:
+        name: of the run or file.
+        captured: what it was trained on; None: a file, which does not say.
+        turned: (4,) wxyz, the rotation from the axes of the capture's files to those of the scene.
+        stated_up: axis that the file or the user says is up, such as "-y"; None: neither does.
+        fps: frame rate of the motion that a person plays instead of that of training; None: it is that of training.
+        as_captured: a person is in the poses of the capture.
+        notes: lines about what was changed or left out in reading.
+        in_training: it still changes; what does not move yet may do so later.
+    """
+
+    name: str = ""
+    captured: Captured | None = None
+    turned: tuple[float, float, float, float] = _NO_TURN
+    stated_up: str | None = None
+    fps: float | None = None
+    as_captured: bool = True
+    notes: tuple[str, ...] = ()
+    in_training: bool = False
+    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def capture(self) -> Capture:
+        """The capture. Raises DyngsError where there is none, or it cannot be read."""
+        if self.captured is None:
+            raise DyngsError(f"{self.config.data.root}: a file, without the capture that it was trained on")
+        return self.captured.capture
+
+    @property
+    def missing(self) -> DyngsError | None:
+        """Why there is no capture; None: there is one."""
+        try:
+            _ = self.capture
+        except DyngsError as error:
+            return error
+        return None
+
+    @property
+    def cameras(self) -> Cameras | None:
+        """The V training cameras, all with size and intrinsics of the first; None where no capture can be read."""
+        return None if self.captured is None else self.captured.cameras
+
+    @property
+    def background(self) -> Tensor:
+        """(3,) colour behind the scene: that of training, black where that was random."""
+        own = self.scene.background
+        return torch.zeros(3, device="cpu") if own is None else own
+
+    @property
+    def world_offset(self) -> np.ndarray:
+        """(3,) float64; added to coordinates, once they are turned back, it gives those of the capture's files."""
+        return np.asarray(self.info.world_offset, np.float64)
+
+    @property
+    def person(self) -> HumanScene | None:
+        """The scene if it is of a person."""
+        return avatar_of(self.scene)
+
+    @property
+    def up(self) -> tuple[np.ndarray, str] | None:
+        """Direction (3,) that is up, and what says so: the file, a body at rest, or the cameras; None: nothing does."""
+        if self.stated_up is not None:
+            return np.array(AXES[self.stated_up]), "the file"
+        if self.person is not None:
+            return placement.up_direction(self.person.clip).double().cpu().numpy(), "the body at rest"
+        cameras = self.cameras
+        return None if cameras is None else (up_direction(cameras), "the mean camera")
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that pass from time 0 to 1: as the capture or the motion says, else 30 frames a second."""
+        frames = max(len(self.scene.times), 1)
+        if self.fps is not None:
+            return max(frames / self.fps, SHORTEST)
+        known = None if self.in_training or self.missing else self.capture.seconds
+        return max(known or frames / FRAME_RATE, SHORTEST)
+
+    def once(self, name: str, compute: Callable[[], T]) -> T:
+        """Return what ``compute`` returned when first asked for ``name`` of this scene."""
+        if name not in self._kept:
+            self._kept[name] = compute()
+        return self._kept[name]
+
+    def showing(self, scene: Scene) -> Opened:
+        """Return the same with another scene."""
+        return replace(self, scene=scene)
+
+    def to(self, device: torch.device | str) -> Opened:
+        """Return the same with its scene on ``device``, which then draws it."""
+        return self.showing(self.scene.to(device))
+
+    def on_background(self, name: str) -> Opened:
+        """Return the same before a "white" or "black" background."""
+        return self.showing(replace(self.scene, background=background_colour(name)))
+
+    def noted(self, *notes: str) -> Opened:
+        """Return the same with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
+    def of_split(self, split: str) -> Opened:
+        """Return the same as the views of ``split`` show it, see ``scene_of_split``."""
+        return self.showing(scene_of_split(self, self.capture, split))
+
+    def in_motion(self, path: Path) -> Opened:
+        """Return the same with its person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM animation).
+
+        A file with ``scale`` is a fit to this person in the world of the capture; any other motion is adapted to the
+        size, position and up direction of the person.
+
+        Raises:
+            DyngsError: it is no person, or the file cannot be read.
+        """
+        from dyngs.human.motion.read import read_motion  # late: scipy's rotations, which no other drawing needs
+
+        person, model = self._person_for(f"--motion {path}")
+        scene = person.to("cpu")
+        motion = read_motion(path, load_template(model))
+        if motion.poses.shape[1] != len(scene.skeleton.joints):
+            motion = motion.for_joints(len(scene.skeleton.joints))
+        clip = motion_clip(motion)
+        if bool((motion.scale != 1).any()):
+            clip = replace(clip, trans=clip.trans - clip.trans.new_tensor(self.info.world_offset))
+        else:
+            clip = placement.place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
+        playing = scene.playing(clip).to(person.gaussians.means.device)
+        return replace(self, scene=playing, fps=motion.fps, as_captured=False)
+
+    def at_rest(self) -> Opened:
+        """Return the same with its person in the rest pose of the template, upright on the floor.
+
+        Raises:
+            DyngsError: it is no person.
+        """
+        scene, _ = self._person_for("--pose rest")
+        rest = placement.rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
+        return replace(self, scene=scene.playing(rest), as_captured=False)
+
+    def _person_for(self, wanted: str) -> tuple[HumanScene, HumanModel]:
+        model = person_of(self.config)
+        if self.person is None or model is None:
+            kind = self.config.model.kind
+            raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {kind}")
+        return self.person, model
+
+
+def open_scene(path: Path, *, nonfinite: Nonfinite = "error") -> Opened:
+    """Open a run folder, a ``scene.dyngs`` with the ``config.yaml`` of its run, an avatar, or a file of Gaussians.
+
+    Args:
+        path: of it. A capture is read later, when something of it is needed.
+        nonfinite: of a file of Gaussians, as ``dyngs.splats.formats.read_splats``.
+
+    Raises:
+        DyngsError: nothing is there, it is damaged, or it is something else.
+    """
+    if path.is_dir() or (path.name == SCENE_FILE and path.exists()):
+        return open_run(path if path.is_dir() else path.parent)
+    if not path.exists():
+        raise DyngsError(f"{path}: no such file or folder; give what `dyngs train` or `dyngs export` wrote")
+    if path.suffix.lower() == AVATAR_SUFFIX:
+        return Opened(**vars(read_avatar(path)), name=path.name)
+    if known_format(path) is None:
+        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
+        other = command_for(path)
+        raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
+    return _of_splats(path, read_splats(path, nonfinite=nonfinite))
+
+
+def open_run(folder: Path, capture: Capture | None = None) -> Opened:
+    """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it is read already."""
+    run = load_run(folder)
+    return Opened(**vars(run), name=folder.absolute().name, captured=Captured(run.config.data, capture))
+
+
+def opened_scene(scene: Scene, file: Path = Path("scene")) -> Opened:
+    """Return a scene of which nothing else is known, as if it had been read from ``file``."""
+    config = Config(data=DataConfig(root=file), model=StaticModel())
+    info = CheckpointInfo(0, 0.0, (0.0, 0.0, 0.0), "black", scene.options.mode.value)
+    return Opened(config, scene, 0, 0.0, info, name=file.name)
+
+
+def _of_splats(path: Path, splat: SplatFile) -> Opened:
+    opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), path)
+    info = replace(opened.info, world_offset=splat.world_offset)
+    return replace(opened, info=info, turned=splat.turned, stated_up=splat.up, notes=splat.notes)
+
+
+def cameras_for_paths(views: Sequence[View], data: DataConfig) -> Cameras:
+    """Return the cameras of V views, all with size and intrinsics of the first (downscaled, undistorted)."""
+    (first,) = training_cameras(views[:1], data)
+    poses = torch.from_numpy(np.stack([view.cam_from_world for view in views])).to(first.cam_from_world)
+    return Cameras(poses, first.intrinsics.expand(len(views), 3, 3).clone(), first.width, first.height)
+
+
+def split_views(capture: Capture, split: str) -> Sequence[View]:
+    """Return the views of a split, at least one. Raises DyngsError that lists the splits there are."""
+    views = {name: views for name, views in capture.splits.items() if views}
+    for name, found in views.items():
+        if name == split:
+            return found
+    there = ", ".join(f"{name} ({len(found)} views)" for name, found in views.items())
+    raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
+
+
+def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
+    """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that split.
+
+    The split pose, and splits with body parameters of their own, have the poses of their files. Others show the clip of
+    training with its refined poses, interpolated at times between.
+    """
+    avatar = avatar_of(run.scene)
+    if avatar is None or capture.body is None:
+        return run.scene
+    own, trained = capture.body[cast(Split, split)], capture.body["train"]
+    if split != "pose" and same_bodies(own, trained):
+        return run.scene
+    shown = captured_motion(capture.root, own, split_views(capture, split), avatar.skeleton.joints)
+    return avatar.playing(shown.clip)

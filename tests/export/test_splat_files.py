@@ -1,0 +1,172 @@
+"""Files of a run: where things are at each moment, its parts, sequences that are whole or not there."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import MOVING_ROWS, Sliding, moved_x, moving_scene, row_of_balls, still_scene, write_moving_run
+
+from dyngs.errors import DyngsError
+from dyngs.export import splat_files
+from dyngs.export.splat_files import (
+    Part,
+    frame_names,
+    scene_part,
+    up_of,
+    write_run_sequence,
+    write_run_splats,
+    writing_of,
+)
+from dyngs.runs.opened import Captured, Opened, open_run
+from dyngs.splats.ply import read_ply
+from dyngs.splats.rotation import AXES, turn_between
+
+ALL = (0, 1, 2, 3, 4)
+STILL_ROWS = (0, 2, 4)
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    return open_run(write_moving_run(tmp_path_factory.mktemp("moving"), offset=(100.0, 0.0, -5.0)))
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    return open_run(write_moving_run(tmp_path_factory.mktemp("still"), moves=False))
+
+
+def written(run: Opened, path: Path, time: float = 0.0, part: Part = "all") -> Path:
+    return write_run_splats(run, path, time, part).path
+
+
+def x_of(path: Path) -> torch.Tensor:
+    return read_ply(path).gaussians.means[:, 0]
+
+
+@pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
+def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
+    splat = read_ply(written(moving, tmp_path / "a.ply", time))
+    torch.testing.assert_close(splat.gaussians.means[:, 0], moved_x(ALL, time))
+    assert torch.equal(splat.gaussians.means[:, 1:], row_of_balls().means[:, 1:])
+    assert f"dyngs time {time!r}" in splat.comments
+    assert splat.world_offset == (100.0, 0.0, -5.0)
+    assert splat.eps2d == moving.config.model.eps2d
+
+
+def test_a_still_run_has_no_time(still: Opened, tmp_path: Path) -> None:
+    early, late = (written(still, tmp_path / f"{time}.ply", time) for time in (0.0, 1.0))
+    assert early.read_bytes() == late.read_bytes()
+    assert not any("time" in comment for comment in read_ply(early).comments)
+    everything = written(still, tmp_path / "still.ply", part="still")
+    assert everything.read_bytes() == early.read_bytes()
+
+
+def test_the_default_is_the_beginning(tmp_path: Path) -> None:
+    run_dir = write_moving_run(tmp_path)
+    torch.testing.assert_close(x_of(written(open_run(run_dir), tmp_path / "a.ply")), moved_x(ALL, 0.0))
+
+
+def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
+    for time in (0.0, 0.7):
+        moves = x_of(written(moving, tmp_path / "moving.ply", time, "moving"))
+        stays = x_of(written(moving, tmp_path / "still.ply", time, "still"))
+        torch.testing.assert_close(moves, moved_x(MOVING_ROWS, time))
+        torch.testing.assert_close(stays, moved_x(STILL_ROWS, time))
+    assert not any("time" in comment for comment in read_ply(tmp_path / "still.ply").comments)
+
+
+def test_empty_parts_are_refused() -> None:
+    with pytest.raises(DyngsError, match="nothing moves in this run"):
+        scene_part(still_scene(), "moving")
+    with pytest.raises(DyngsError, match="every Gaussian of this run moves"):
+        scene_part(moving_scene(Sliding(), ALL), "still")
+
+
+@pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])
+def test_a_sequence(moving: Opened, part, rows: tuple[int, ...], tmp_path: Path) -> None:
+    times = (0.0, 0.25, 1.0)
+    files = write_run_sequence(moving, tmp_path / "new" / "seq", times, part)
+    paths = [one.path for one in files]
+    assert [p.name for p in paths] == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
+    assert sorted((tmp_path / "new" / "seq").iterdir()) == paths
+    assert all(re.fullmatch(r"(.*?)(\d+)\.ply", p.name) for p in paths)  # what players look for
+    for path, time in zip(paths, times, strict=True):
+        torch.testing.assert_close(x_of(path), moved_x(rows, time))
+        assert f"dyngs time {time!r}" in read_ply(path).comments
+
+
+@pytest.mark.parametrize(
+    ("count", "last"), [(1, "frame_0000.ply"), (10_000, "frame_9999.ply"), (10_001, "frame_10000.ply")]
+)
+def test_names_are_in_order_of_frames(count: int, last: str) -> None:
+    names = frame_names(count)
+    assert (len(set(names)), names[-1]) == (count, last)
+    assert sorted(names) == names
+
+
+def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(moving: Opened, tmp_path: Path) -> None:
+    folder = tmp_path / "seq"
+    write_run_sequence(moving, folder, (0.0, 0.5))
+    (folder / "notes.txt").write_text("mine")
+    longer = [one.path for one in write_run_sequence(moving, folder, (1.0, 1.0, 1.0))]
+    assert all(torch.equal(x_of(path), x_of(longer[0])) for path in longer)
+    before = {p: p.read_bytes() for p in folder.iterdir()}
+    with pytest.raises(DyngsError, match=r"holds other \.ply files \(frame_0002\.ply\)"):
+        write_run_sequence(moving, folder, (0.0, 0.5))
+    assert {p: p.read_bytes() for p in folder.iterdir()} == before
+    with pytest.raises(DyngsError, match="is a file, but a sequence needs a folder"):
+        write_run_sequence(moving, folder / "notes.txt", (0.0, 0.5))
+
+
+@pytest.mark.parametrize("problem", [DyngsError("NaN"), OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_sequence_that_fails_leaves_nothing(
+    moving: Opened, problem: BaseException, exists: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, real, count = tmp_path / "seq", splat_files.write_splats, []
+    if exists:
+        folder.mkdir()
+        (folder / "notes.txt").write_text("mine")
+
+    def failing(*arguments, **options):
+        count.append(1)
+        if len(count) == 3:
+            raise problem
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(splat_files, "write_splats", failing)
+    with pytest.raises(DyngsError if isinstance(problem, OSError) else type(problem)):
+        write_run_sequence(moving, folder, (0.0, 0.25, 0.5, 0.75))
+    assert len(count) == 3
+    assert [p.name for p in tmp_path.rglob("*")] == (["seq", "notes.txt"] if exists else [])
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Opened:
+    return open_run(write_moving_run(tmp_path))
+
+
+def test_the_cameras_know(run: Opened) -> None:
+    found = up_of(run)
+    assert found is not None
+    assert found[0] in AXES.values()
+    name = next(name for name, axis in AXES.items() if axis == found[0])
+    how, line = writing_of(run, "y")
+    assert how.turn == turn_between(found[0], AXES["y"])
+    assert f"it was {name} in the capture" in line or name == "y"
+    assert "the axes of the capture are kept" in writing_of(run, name)[1]
+
+
+def test_without_a_capture_nothing_is_turned(run: Opened) -> None:
+    lost = replace(run, captured=Captured(run.config.data.model_copy(update={"root": Path("no")})))
+    assert up_of(lost) is None
+    how, line = writing_of(lost, "y", sh_degree=2)
+    assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
+    assert "--from-up=AXIS tells it" in line
+    told, _ = writing_of(lost, "y", from_up="z")
+    assert told.turn == turn_between(AXES["z"], AXES["y"])
+    assert writing_of(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
