@@ -155,7 +155,7 @@ def test_images_given_out_on_a_gpu_are_the_same(
 ) -> None:
     """Whether they are kept there, on the CPU, or nowhere; within both limits."""
     views = views_of(tmp_path, 6)
-    monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: None if free is None else (free, 0))
+    monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: None if free is None else (free, 0))
     options = DataConfig(root=Path(), cache_mb=cache_mb)
     there, plain = ImageLoader(views, options, decoding_threads=threads), loader(views, cache_mb=0)
     with pretend_gpu():

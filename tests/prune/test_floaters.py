@@ -50,7 +50,7 @@ def test_what_is_not_near_is_none(trainer: Trainer, monkeypatch: pytest.MonkeyPa
 
 
 def test_what_several_views_share_is_none(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAIN_SHARE", 1.0)
+    monkeypatch.setattr(module, "MAIN_FRACTION", 1.0)
     assert not bool(floaters(trainer).any())
 
 

@@ -73,13 +73,13 @@ def _config(capture: Path, **changes: object) -> Config:
 
 def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
-    monkeypatch.setattr(memory, "card_memory", lambda _: (3 * GB, 8 * GB))
-    monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: (2000, 8 * GB))
+    monkeypatch.setattr(memory, "gpu_memory", lambda _: (3 * GB, 8 * GB))
+    monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: (2000, 8 * GB))
     config = _config(capture, strategy=DefaultStrategy(max_gaussians=10**7), train=TrainConfig(steps=30_000))
     with pretend_gpu():
         trainer = assemble(config)
         gpu, machine = memory_forecasts(trainer)
-        monkeypatch.setattr(memory, "card_memory", lambda _: (GB // 100, 8 * GB))
+        monkeypatch.setattr(memory, "gpu_memory", lambda _: (GB // 100, 8 * GB))
         small = memory_forecasts(trainer, 2)[0]
     assert (gpu.free, gpu.whole, gpu.program, gpu.images) == (3 * GB, 8 * GB, 0, 500)
     assert gpu.count > 60

@@ -103,7 +103,7 @@ def test_a_network_too_large_for_the_kernel_is_computed_by_torch(still: Path, mo
     config = config_of("static", still, *STATIC, "colour.kind=network")
     expected = trained(config, monkeypatch, torch.device("cpu")).colours.network
     assert expected is not None
-    monkeypatch.setattr("dyngs.ops.perceptron.CARD_WIDTH", 31)
+    monkeypatch.setattr("dyngs.ops.perceptron.GPU_WIDTH", 31)
     monkeypatch.setattr("dyngs.ops.perceptron.perceptron_op", None)  # the CPU has had it
     with pretend_gpu():
         network = trained(config, monkeypatch, GPU).colours.network
@@ -156,7 +156,7 @@ def test_images_that_do_not_fit_there_are_streamed(still: Path, monkeypatch: pyt
     config = config_of("static", still, *STATIC)
     with pretend_gpu():
         kept = trained(config, monkeypatch, GPU).checkpoint().tensors
-        monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: (0, 0))
+        monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: (0, 0))
         streamed = trained(config, monkeypatch, GPU).checkpoint().tensors
     assert [key for key, x in kept.items() if not torch.equal(streamed[key], x)] == []
 
@@ -175,7 +175,11 @@ def test_views_are_drawn_and_scored_there_alike(
     name: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, (split, refined, others) = tmp_path / "run", SCORED[name]
-    for few in ("human.avatar.pose_fit.WINDOW", "human.avatar.pose_fit.MOST_WINDOWS", "training.camera_fit.UPDATES"):
+    for few in (
+        "human.avatar.pose_fit.WINDOW",
+        "human.avatar.pose_fit.MOST_WINDOWS",
+        "training.corrections.camera_fit.UPDATES",
+    ):
         monkeypatch.setattr(f"dyngs.{few}", 2)
     kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
     train(config_of(kind, request.getfixturevalue(capture), *more, *others, f"run.dir={folder}"))
