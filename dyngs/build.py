@@ -40,7 +40,6 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
 from dyngs.deform.given_masks import moving_fraction_of
 from dyngs.deform.scene import DynamicScene
@@ -89,14 +88,12 @@ from dyngs.training.schedule import (
     filter_steps,
     grad_threshold,
     growth_per_change,
-    hold_out_until,
     image_divisor,
     rates_of,
 )
 from dyngs.training.state import OTHER_CONFIG, Checkpoint
 from dyngs.training.trainer import Trainer
 from dyngs.training.views import (
-    held_out_views,
     resolved_background,
     surroundings,
     training_cameras,
@@ -138,12 +135,13 @@ def build(config: Config, *, restored: bool = False) -> Built:
             assert_never(config.model)
 
 
-def assemble(config: Config, *, restored: bool = False) -> Trainer:
+def assemble(config: Config, *, restored: bool = False, held_out: frozenset[int] = frozenset()) -> Trainer:
     """Return the trainer of a scene: capture read, Gaussians initialised, nothing trained.
 
     Args:
         config: of a run.
         restored: a checkpoint will be, so that it does not matter where Gaussians begin: no points are triangulated.
+        held_out: indices of training views that are never trained on.
 
     Raises:
         DyngsError: a capture that cannot be read, a budget that is too small.
@@ -187,8 +185,7 @@ def assemble(config: Config, *, restored: bool = False) -> Trainer:
         has_test_views=bool(capture.splits.get("test")),
         alpha=_alpha_weight(config, capture, images),
         generator=generator,
-        held_out=held_out_views(capture.splits["train"], config.train.hold_out_every),
-        held_out_until=hold_out_until(config.train),
+        held_out=held_out,
         priors=priors,
         robust=_robust(config, capture, images),
         exposures=exposures_of(config.train, images),
@@ -404,9 +401,6 @@ def _training_views(
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
         return [footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used]
 
-    left_out = held_out_views(views, config.train.hold_out_every)
-    trained_on = [i for i in range(len(images)) if i not in left_out]
-    held_out = ComparedViews(images, sorted(left_out), options, background, shader)
     return TrainingViews(
         training_times(capture),
         cameras,
@@ -414,8 +408,6 @@ def _training_views(
         errors_of,
         cameras_stay=bool(in_place),
         standing=standing,
-        held_out=held_out.psnr if left_out else None,
-        matched=replace(held_out, indices=trained_on),
     )
 
 

@@ -107,7 +107,7 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
         f"init.num_random={options.num_points}",
         f"model.num_random_moving={options.num_points // 3}",
         f"train.steps={options.steps}",
-        "model.compare_with_still=false",  # the scene is made to move
+        "model.choose=false",  # the scene is made to move
         "train.initial_downscale=2",  # the images are small
         "run.name=demo",
         f"run.threads={options.threads}",

@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from torch import Tensor
 
-from dyngs.api import still_choices, still_first
+from dyngs.api.choose import choose, write_choices
 from dyngs.api.following import Leader
-from dyngs.api.still_first import StillComparison
 from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
@@ -133,22 +131,15 @@ def train(
             print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
             return folder
         asked = asked_for(folder) if resume_from is not None else config
-        new_run = partial(_Run, processes=processes, threads=threads)
+        choices = []
         if resumed is None:
-            config = _chosen(config, folder, partial(_train_still, new_run))
-        if not new_run(config, folder, resumed, asked).run(listeners):
-            still = still_choices.decided(still_first.still_instead(folder, config))
-            new_run(still, folder, None, asked).run(listeners)
+            config, choices = choose(config)
+        run = _Run(config, folder, resumed, asked, processes=processes, threads=threads)
+        if choices:
+            write_choices(folder, choices)
+        run.run(listeners)
         note_asked(folder, asked)
     return folder
-
-
-def _chosen(config: Config, folder: Path, train_still: Callable[[Config, Path], None]) -> Config:
-    """Return the configuration with everything decided that is to be found out before the run.
-
-    What holds for still and moving scenes comes first, as the comparison of the two builds on it.
-    """
-    return still_choices.decided(still_first.start(still_choices.decided(config), folder, train_still))
 
 
 def _told_again(config: Config, folder: Path) -> str:
@@ -160,18 +151,6 @@ def _told_again(config: Config, folder: Path) -> str:
     )
 
 
-def _train_still(new_run: Callable[[Config, Path, Checkpoint | None], _Run], config: Config, folder: Path) -> None:
-    """Train the static model that a moving one is compared with, or go on with it, to its end."""
-    resumed = latest_checkpoint(folder) if checkpoint_paths(folder) else None
-    if resumed is not None and resumed.info.step >= config.total_steps:
-        return
-    try:
-        new_run(config, folder, resumed).run(())
-    except KeyboardInterrupt as stopped:
-        again = f"stopped before anything moves; go on with: dyngs train --resume {as_word(folder.parent)}"
-        raise KeyboardInterrupt(again if stopped.args else "") from None
-
-
 class _Run:
     """A run from the reading of its capture to its last line.
 
@@ -179,7 +158,7 @@ class _Run:
         config: of the run.
         folder: of the run.
         resumed: what it goes on from; None: it begins.
-        asked: the configuration that was asked for, from which this one was chosen; None: this one.
+        asked: the configuration that was asked for, from which this one was chosen.
         processes: that this one leads.
         threads: of the kernels in each of them.
     """
@@ -189,7 +168,7 @@ class _Run:
         config: Config,
         folder: Path,
         resumed: Checkpoint | None,
-        asked: Config | None = None,
+        asked: Config,
         *,
         processes: Processes,
         threads: int,
@@ -209,27 +188,22 @@ class _Run:
             None if built.scene_trainer is None else LimitedRun(folder, config, self.loop, built.scene_trainer)
         )
         self._config, self._saved = config, self.loop.trainer.done
-        if self.limited is not None and asked is not None:
+        if self.limited is not None:
             _tell_memory(self.limited.trainer, processes.local_size)
         self._meter: CostMeter | None = None
         if self.limited is not None:
             self._set_limits(self.limited, resumed)
         if resumed is None:
             begin(folder, self.config)
-            if asked is not None:
-                note_asked(folder, asked)
+            note_asked(folder, asked)
 
     @property
     def config(self) -> Config:
         """The configuration as saved; limits may change the number of steps."""
         return self._config if self.limited is None else self.limited.config
 
-    def run(self, listeners: Sequence[Listener]) -> bool:
-        """Step until the end, or until interrupted, and keep the limits.
-
-        Returns:
-            false where the static model has turned out to be better, so that the run ends before its time.
-        """
+    def run(self, listeners: Sequence[Listener]) -> None:
+        """Step until the end, or until interrupted, and keep the limits."""
         options, loop, done = self.config.train, self.loop, self.loop.trainer.done
         with (
             RunLog(self.folder, done, every=options.log_every, tensorboard=options.tensorboard) as log,
@@ -237,22 +211,19 @@ class _Run:
             Interrupts() as interrupts,
         ):
             measures = [] if self._meter is None else [self._meter]
-            limited, comparison = self.limited, None
+            limited = self.limited
             if limited is not None:
                 loop.subscribe(FloaterRemoval(loop, lambda: limited.trainer))
             loop.subscribe(
                 self._leader, *measures, *self.limits.values(), log, progress, *listeners, self._save_and_evaluate
             )
             if limited is not None:
-                comparison = StillComparison(self.folder, lambda: limited.trainer, loop)
-                loop.subscribe(PruneStage(loop, lambda: limited.trainer), comparison)
+                loop.subscribe(PruneStage(loop, lambda: limited.trainer))
             try:
-                loop.run(lambda: interrupts.requested or _is_lost(comparison))
+                loop.run(lambda: interrupts.requested)
             finally:
                 if limited is not None:
                     limited.trainer.images.rest()
-            if _is_lost(comparison):
-                return False
             if loop.trainer.done < loop.total:
                 if loop.trainer.done > self._saved:
                     self._save()
@@ -261,7 +232,6 @@ class _Run:
                 )
         for line in self._reached():
             print(line, flush=True)
-        return True
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
         """Set up the limits of the configuration, with the measurements that they need before training."""
@@ -361,10 +331,6 @@ def _tell_memory(trainer: Trainer, processes: int) -> None:
         warning = forecast.warning()
         if warning is not None:
             print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)
-
-
-def _is_lost(comparison: StillComparison | None) -> bool:
-    return comparison is not None and comparison.is_lost
 
 
 def _is_done_and_read_only(config: Config, folder: Path) -> bool:

@@ -55,16 +55,21 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
 
     Returns:
         the checked configuration; ``data.root`` and ``data.body`` are made absolute, so that later commands work from
-        any folder.
+        any folder. ``model_fields_set`` of its sections has what overrides, or a file of the user's own, say.
 
     Raises:
         DyngsError: naming the file and line or the override, the key, and what is allowed.
     """
     layers = _Layers()
+    own: set[tuple[str, ...]] = set()
     if preset is not None:
-        layers.add(read_file(find_preset(Path(preset))))
-    layers.add_overrides(overrides)
+        file = find_preset(Path(preset))
+        layers.add(read_file(file))
+        if file.resolve() not in [packaged.resolve() for packaged in packaged_presets().values()]:
+            own |= layers.origins.keys()
+    own |= layers.add_overrides(overrides)
     config = _validate(layers)
+    _note_requested(config, (), own)
     body = config.data.body
     paths = {"root": config.data.root.absolute(), "body": None if body is None else body.absolute()}
     data = config.data.model_copy(update=paths)
@@ -186,13 +191,15 @@ class _Layers:
         for leaf in leaves:
             self._set(leaf)
 
-    def add_overrides(self, overrides: Iterable[str]) -> None:
+    def add_overrides(self, overrides: Iterable[str]) -> set[tuple[str, ...]]:
+        """Lay overrides over what is there, and return the keys that they set."""
         leaves = [leaf for text in overrides for leaf in read_override(text)]
         # what empties a section goes first, outer sections before inner ones
         for leaf in sorted(leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))):
             if leaf.keys[-1] == "kind":
                 self._drop_other_kind(leaf.keys[:-1], leaf.value)
             self._set(leaf)
+        return {leaf.keys for leaf in leaves}
 
     def _drop_other_kind(self, keys: tuple[str, ...], kind: Any) -> None:
         """Empty the section at ``keys`` if it is of another kind than ``kind``."""
@@ -258,6 +265,16 @@ def _validate(layers: _Layers) -> Config:
         return _validate(layers)
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     raise DyngsError(_explain(layers, problems[0]) + more)
+
+
+def _note_requested(section: BaseModel, above: tuple[str, ...], requested: set[tuple[str, ...]]) -> None:
+    """Leave only what was ``requested`` in ``model_fields_set`` of a section and those in it."""
+    for name in type(section).model_fields:
+        inner = getattr(section, name)
+        if isinstance(inner, BaseModel):
+            _note_requested(inner, (*above, name), requested)
+        elif (*above, name) not in requested:
+            section.model_fields_set.discard(name)
 
 
 def _require_countable(section: dict[str, Any], above: tuple[str, ...], layers: _Layers) -> None:

@@ -8,7 +8,7 @@ Local letters: M moving Gaussians, S drivers, P control points, B drivers that o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,7 +16,6 @@ from torch import Tensor
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, Offsets
 from dyngs.deform.nodes import FOLLOWED
-from dyngs.deform.rigid_groups import is_alone
 from dyngs.deform.spline_fit import SPAN, spline_basis
 
 SAMPLES_PER_PIECE = 3
@@ -33,7 +32,7 @@ class Curves:
     Attributes:
         heads: control points (S, P, size) by attribute of ``Offsets``; always "means".
         pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own, about itself.
-        followed: (M, B) drivers of each Gaussian, B = 4, or 8 where some follow two rigid groups; None as above.
+        followed: (M, B) drivers of each Gaussian, B = 4; None as above.
         shares: (M, B) of theirs, rows sum to 1; None as above.
         error: of a driver's place: the quantile ``CHECKED``, in world units.
     """
@@ -57,7 +56,7 @@ def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance:
     """
     match field:
         case ControlNodes():
-            return _curves_of_nodes(field, means, tolerance)
+            return _curves_of_nodes(field, means)
         case _:
             heads, error = fitted_curves(lambda time: field.offsets(means, time), num_times, tolerance)
             return Curves(heads, error=error)
@@ -106,22 +105,11 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
     return float(found.sort().values[int(CHECKED * (len(found) - 1))]) if len(found) else 0.0
 
 
-def _curves_of_nodes(field: ControlNodes, means: Tensor, tolerance: float) -> Curves:
-    """Return the splines of control nodes: exact, but where rigid groups carry them along, whose turns are fitted."""
+def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
+    """Return the splines of control nodes, which are exact."""
     nodes = field.nodes_for(means)
-    if field.has_groups:
-        heads, error = fitted_curves(field.at, 2 * MOST_PIECES, tolerance)
-    else:
-        heads, error = _fit(field.at, field.num_pieces), 0.0
     followed, fractions = _padded(nodes.followed, nodes.weights(means))
-    others, binding = field.buffers.get("others"), field.parameters.get("binding")
-    if others is not None and binding is not None:
-        torn = ~is_alone(binding)
-        second = torch.where(torn, torch.sigmoid(binding[:, 0]), 0.0)[:, None]
-        other, weights = _padded(others, replace(nodes, followed=others).weights(means))
-        followed = torch.cat([followed, other], dim=1)
-        fractions = torch.cat([(1 - second) * fractions, second * weights], dim=1)
-    return Curves(heads, nodes.positions, followed, fractions, error)
+    return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
 
 
 def _padded(followed: Tensor, fractions: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,9 +6,9 @@ Local letters: M moving Gaussians, a subset of the N of a scene.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,9 +19,6 @@ from dyngs.ops.quaternions import identity_quat, quat_product
 from dyngs.ops.registration import has_kernel
 from dyngs.ops.skinning import add_offsets_
 from dyngs.state import State, moved_to, part_of, prefixed
-
-if TYPE_CHECKING:
-    from dyngs.deform.node_shifts import SeenShift
 
 F = TypeVar("F", bound="NetworkField")
 
@@ -109,14 +106,6 @@ class DeformationField(Protocol):
         """Return the field after an edit of the moving Gaussians."""
         ...
 
-    def with_groups(self, means: Tensor) -> DeformationField | None:
-        """Return the field with rigid groups that move ``means`` (M, 3) nearly as now; None: there are none."""
-        ...
-
-    def shifted(self, means: Tensor, seen: Sequence[SeenShift]) -> DeformationField | None:
-        """Return the field with the motion of ``means`` (M, 3) corrected by what was ``seen``; None: it cannot be."""
-        ...
-
     def regroup(self) -> None:
         """Drop what was derived from the set of Gaussians; it is computed again when next needed."""
         ...
@@ -157,12 +146,6 @@ class NetworkField:
 
     def edited(self: F, edit: TopologyEdit) -> F:
         return self
-
-    def with_groups(self, means: Tensor) -> DeformationField | None:
-        """Return None: only nodes form groups."""
-
-    def shifted(self, means: Tensor, seen: Sequence[SeenShift]) -> DeformationField | None:
-        """Return None: only splines of nodes are fitted to shifts."""
 
     def regroup(self) -> None:
         """Do nothing: nothing is derived from the set of Gaussians."""

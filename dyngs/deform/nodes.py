@@ -57,24 +57,6 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
 
-def nodes_of_label(positions: Tensor, labels: Tensor, means: Tensor, wanted: Tensor) -> Tensor:
-    """Return indices (M, ``FOLLOWED``) of the nearest nodes that have the label that each point wants, nearest first.
-
-    Where there are fewer, the nearest ones are repeated; where there is none, those of all labels are taken.
-
-    Args:
-        positions, labels: (S, 3) and (S,) of the nodes, at least one.
-        means, wanted: (M, 3) and (M,) of the points.
-    """
-    followed = torch.zeros(len(means), FOLLOWED, dtype=torch.long, device=means.device)
-    for label in wanted.unique().tolist():
-        rows, own = torch.nonzero(wanted == label)[:, 0], torch.nonzero(labels == label)[:, 0]
-        own = own if len(own) else torch.arange(len(positions), device=means.device)
-        near = nodes_at(positions[own], means[rows]).followed
-        followed[rows] = own[near[:, torch.arange(FOLLOWED, device=means.device) % near.shape[1]]]
-    return followed
-
-
 def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
     """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it and from ``taken``.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
@@ -15,6 +16,8 @@ from dyngs.deform.fixed_cameras.changes import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
+DIFFERS = 0.06
+"""Difference from the median image, mean over channels, from which a pixel shows something else."""
 MIN_SAME = 3
 """Fewest images of one camera whose median shows what is still."""
 USUAL = 0.7
@@ -143,3 +146,25 @@ def two_group_threshold(scores: Tensor) -> float:
     if not len(scores) or float(scores.min()) == float(scores.max()):
         return float("inf")
     return float(threshold_otsu(scores.cpu().numpy()))
+
+
+@torch.no_grad()
+def differing_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
+    """Return the fraction of pixels that differ from the median image of their camera.
+
+    Each image is first brought to the brightness of the median (changing exposure is no motion) and averaged over
+    2x2 pixels, against noise.
+
+    Args:
+        cameras: images (H, W, 3) in [0, 1] of each camera that stays in place.
+    """
+    differing = total = 0
+    for images in cameras:
+        smooth = [avg_pool2d(image.movedim(2, 0), 2, ceil_mode=True) for image in images]
+        usual = torch.stack(smooth).median(0).values
+        for image in smooth:
+            gap = image - usual
+            gap = gap - gap.flatten(1).median(1).values[:, None, None]
+            differing += int((gap.abs().mean(0) > DIFFERS).sum())
+            total += gap[0].numel()
+    return differing / max(total, 1)

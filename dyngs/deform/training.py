@@ -16,13 +16,11 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import DynamicModel
 from dyngs.data.loader import Image
-from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.motion import bake_, measure_motion
-from dyngs.deform.pieces import MovingPart, Scores, paid_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
@@ -54,8 +52,6 @@ class DeformSchedule:
         decays: step from which the field's rates fall.
         splits: steps after which Gaussians that do not move are frozen.
         rates: how the field's rates fall.
-        groups: step after which what moves may form rigid groups.
-        matches: steps after which motion is corrected by block matching.
     """
 
     fine: int
@@ -64,8 +60,6 @@ class DeformSchedule:
     decays: int
     splits: tuple[int, ...]
     rates: Rates
-    groups: int = 0
-    matches: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -79,8 +73,6 @@ class TrainingViews:
         still_errors: how far its images disagree with what is still, where N Gaussians are seen.
         cameras_stay: in place, so that images show what is still exactly alike.
         standing: returns what those cameras show.
-        held_out: returns the PSNR, dB, of the images held out, of Gaussians at a time; None: none are.
-        matched: images for block matching.
     """
 
     times: tuple[float, ...]
@@ -89,8 +81,6 @@ class TrainingViews:
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False
     standing: Callable[[], Sequence[Footage]] = tuple
-    held_out: Scores | None = None
-    matched: ComparedViews | None = None
 
 
 class DynamicTraining:
@@ -160,26 +150,13 @@ class DynamicTraining:
             return scene
         if edited:
             scene.field.regroup()
-        if step in self.schedule.matches:
-            scene = self._registered(scene, step)
-            scene.changed()
-        if scene.field is not None:
-            scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
+        scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene where motion begins, nodes form rigid groups, or only motion that pays is to stay."""
-        if step == self.schedule.fine:
-            return self._with_motion(scene)
-        if scene.field is None:
+        """Return the scene with Gaussians to begin motion with; None where a static model explains all."""
+        if step != self.schedule.fine:
             return None
-        if step == self.schedule.groups:
-            grouped = scene.field.with_groups(scene.gaussians.means.detach()[scene.moving])
-            return None if grouped is None else (replace(scene, field=grouped), EditResult(None))
-        return self._with_paid_motion(scene) if step in self.schedule.splits[-1:] else None
-
-    def _with_motion(self, scene: DynamicScene) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene with random Gaussians to begin motion with; None where a static model explains all."""
         now = scene.gaussians
         found = self.capture.still_errors(lambda _: now)
         floor = self.options.motion_threshold
@@ -254,32 +231,6 @@ class DynamicTraining:
             seen = self.capture.still_errors(lambda time: deformed(now, field.offsets(means, time), scene.moving))
             moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
         return _with_frozen(scene, motion.mean, ~moves)
-
-    @torch.no_grad()
-    def _registered(self, scene: DynamicScene, step: int) -> DynamicScene:
-        """Return the scene with its motion corrected by block matching, if that lowers the error of the images."""
-        views, times = self.capture.matched, self._window.bounds(step)
-        if views is None or scene.field is None or not len(scene.moving):
-            return scene
-        seen = views.shifts(lambda time: scene.deformed_at(time)[0], scene.moving, times)
-        field = scene.field.shifted(scene.gaussians.means.detach()[scene.moving], seen)
-        if field is None:
-            return scene
-        tried = replace(scene, field=field)
-        before, after = (views.error(lambda time, x=x: x.deformed_at(time)[0], times) for x in (scene, tried))
-        return tried if after < before else scene
-
-    def _with_paid_motion(self, scene: DynamicScene) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene in which only pieces move whose motion pays; None where no view is held out to tell."""
-        field, scores = scene.field, self.capture.held_out
-        if field is None or scores is None or not len(scene.moving):
-            return None
-        now = scene.gaussians.detach()
-        means = now.means[scene.moving]
-        motion = measure_motion(field, now.select(scene.moving), self.times, torch.ones_like(means[:, 0]))
-        part = MovingPart(now, scene.moving, lambda time: field.offsets(means, time), motion.mean, scene.filter_std)
-        found = paid_motion(part, scores)
-        return _with_frozen(scene, motion.mean, found.stays), EditResult(None, finding=f"motion {found}")
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
         """Return the mean motion as a penalty: what need not move should not. What was found to travel must."""

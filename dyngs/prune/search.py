@@ -14,7 +14,6 @@ the loss below a fraction of what is allowed, with what was found for those befo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -143,7 +142,7 @@ class Search:
         self.held_out = () if unseen else evenly_held_out(len(trainer.images))
         self.trials = 0
         self._begin = trainer.config, trainer.options, trainer.colours
-        trainer.held_out, trainer.held_out_until = frozenset(self.held_out), math.inf
+        trainer.held_out = frozenset(self.held_out)
         self._scores = chosen_scores(trainer)
         self._truths = list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         self.views = f"{len(self._truths)} training views held out" if self.held_out else "its only training view"

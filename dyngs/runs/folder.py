@@ -18,11 +18,11 @@ from dyngs.runs.log import LOG_NAME
 
 EXPORT_FOLDER = "export"
 """In a run folder: the run as one .dyngs file of at most ``budget.max_mb``."""
-STILL_FOLDER = "still"
-"""In the folder of a run of a moving scene: the run of the static model that it is compared with."""
+CHOICES_NAME = "choices.json"
+"""In a run folder: what small runs before it said."""
 ASKED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else (config.yaml)."""
-_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, STILL_FOLDER, BODY_FOLDER)
+_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, CHOICES_NAME, BODY_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
 
 

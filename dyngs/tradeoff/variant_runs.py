@@ -100,7 +100,7 @@ class VariantRuns:
         run = load_resolved(self.run_dir)
         changes = [*field_changes(run, wanted)]
         if field_of(run) is not None:  # a variant is what it says: nothing is chosen, and it stays a moving scene
-            changes += ["model.pilot_steps=0", "model.compare_with_still=false"]
+            changes += ["model.choose=false"]
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
         changes += [*self._where, f"run.dir={out}"]

@@ -17,7 +17,6 @@ from dyngs.training.corrections.exposure import WARM_UP
 from dyngs.training.schedule import (
     PUBLISHED_STEPS,
     deform_schedule,
-    hold_out_until,
     means_rate,
     motion_begins_after,
     rates_of,
@@ -108,7 +107,7 @@ def told(before: Config, after: Config, done: int) -> str:
 
 
 def _train(options: TrainConfig, length: Length) -> TrainConfig:
-    """Return the section ``train``: images, harmonics and views held out go on where they are."""
+    """Return the section ``train``: images and harmonics go on where they are."""
     changed: dict[str, object] = {"steps": length.steps, "minutes": None}
     full_at = max(options.resolution_grows_from, options.resolution_full_at)
     if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
@@ -117,8 +116,6 @@ def _train(options: TrainConfig, length: Length) -> TrainConfig:
     if length.steps > length.was:
         pace = scaled(options.sh_every, length.was)
         changed["sh_every"] = max(1, pace * PUBLISHED_STEPS // length.steps)
-    if length.done >= hold_out_until(options):
-        changed["hold_out_every"] = 0
     return options.model_copy(update=changed)
 
 

@@ -8,7 +8,6 @@ from typing_extensions import assert_never
 
 from dyngs.config import (
     Config,
-    ControlNodesField,
     DefaultStrategy,
     DynamicModel,
     HumanModel,
@@ -37,10 +36,6 @@ MIN_COARSE_STEPS = 1000
 """Steps that a static model needs to show where it fails; short runs spend at most a third on it."""
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all times."""
-MATCH_FRACTION, MATCHES_UNTIL = 0.04, 0.85
-"""Fraction of the run between two rounds of block matching, and after which there are no more."""
-GROUPS = 0.12
-"""The step at which nodes may form rigid groups, likewise: after the first split."""
 
 
 def scaled(step: int, steps: int) -> int:
@@ -54,11 +49,6 @@ def image_divisor(options: TrainConfig, step: int) -> int:
     first, last = options.resolution_grows_from, max(options.resolution_grows_from, options.resolution_full_at)
     fractions = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
     return options.initial_downscale >> sum(step / options.steps >= fraction for fraction in fractions)
-
-
-def hold_out_until(options: TrainConfig) -> int:
-    """Return the last step that does without the views held out."""
-    return round(options.hold_out_until * options.steps)
 
 
 def rates_of(config: Config) -> Rates:
@@ -142,18 +132,7 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
         sorted({full + round(fraction * (steps - full)) for fraction in SPLITS}) if model.freeze_below_px > 0 else []
     )
     splits = tuple(step for step in splits if step > full)
-    groups = full + round(GROUPS * (steps - full))
-    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, _matches(model, fine, steps))
-
-
-def _matches(model: DynamicModel, fine: int, steps: int) -> tuple[int, ...]:
-    """Return the steps after which block matching corrects motion that begins after ``fine``."""
-    match model.deform:
-        case ControlNodesField(block_matching=True):
-            every = max(1, round(MATCH_FRACTION * steps))
-            return tuple(range(fine + every, round(MATCHES_UNTIL * steps) + 1, every))
-        case _:
-            return ()
+    return DeformSchedule(fine, opens, full, decays, splits, rates)
 
 
 def motion_begins_after(config: Config, steps: int) -> int | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -62,8 +61,7 @@ class Trainer:
         refinement: of the cameras; None: they stay as the capture has them.
         done: steps done.
         bad_gradients: how often a Gaussian was left out of a step because its gradient was not finite.
-        held_out: indices of the training views that are not trained on up to ``held_out_until``.
-        held_out_until: the last step without them.
+        held_out: indices of the training views that are not trained on.
         processes: that take a fraction of the views of each step; one: this.
         device: where the scene is trained; see ``place``.
     """
@@ -90,7 +88,6 @@ class Trainer:
     done: int = 0
     bad_gradients: Count = 0
     held_out: frozenset[int] = frozenset()
-    held_out_until: float = math.inf
     processes: Processes = field(default_factory=Processes)
     device: torch.device = CPU
 
@@ -182,10 +179,6 @@ class Trainer:
         if self.refinement is not None:
             self.bad_gradients = self.bad_gradients + self.refinement.optimize(step, index, image.cameras)
         return StepReport(step, loss, image, rendered.detach(), truth)
-
-    def holds_out(self, index: int, step: int) -> bool:
-        """Return whether the view ``index`` is held out in ``step``."""
-        return index in self.held_out and step <= self.held_out_until
 
     def keep(self, kept: Tensor) -> None:
         """Leave only the Gaussians where ``kept`` (N,) is true."""
@@ -359,7 +352,7 @@ class Trainer:
             return self.training.trains_on(times[index], step)
 
         def is_wanted(index: int) -> bool:
-            return may_train(index) and not self.colours.holds_out(index, step) and not self.holds_out(index, step)
+            return may_train(index) and not self.colours.holds_out(index, step) and index not in self.held_out
 
         return is_wanted if any(is_wanted(i) for i in range(len(self.images))) else may_train
 

@@ -47,11 +47,3 @@ def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras
 def training_times(capture: Capture) -> tuple[float, ...]:
     """Return the times of the training views in [0, 1], ascending; empty without times."""
     return tuple(sorted(view.time for view in capture.splits["train"] if view.time is not None))
-
-
-def held_out_views(views: Sequence[View], every: int) -> frozenset[int]:
-    """Return the indices of one of ``every`` views in order of time; none for 0."""
-    if every == 0:
-        return frozenset()
-    order = sorted(range(len(views)), key=lambda i: (views[i].time or 0.0, views[i].name))
-    return frozenset(order[every // 2 :: every])

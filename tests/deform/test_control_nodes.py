@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +18,6 @@ from torch import Tensor
 from dyngs.config import ControlNodesField
 from dyngs.deform.control_nodes import SMOOTHNESS, ControlNodes
 from dyngs.deform.field import Offsets
-from dyngs.deform.rigid_groups import ALONE, continuous, fitted_splines
 from dyngs.gaussians import TopologyEdit
 from dyngs.state import tensors_of
 
@@ -292,122 +290,3 @@ def test_the_place_of_a_gaussian_matters() -> None:
 
 
 # --- rigid groups -----------------------------------------------------------------------------------------------------
-
-
-def two_bodies() -> tuple[ControlNodes, Tensor]:
-    """A field with nodes on two touching bodies, and (80, 3) Gaussians there: one spins, one shifts; noise on both."""
-    means = torch.cat([cloud(50).means * 0.3, cloud(30, seed=1).means * 0.2 + torch.tensor([1.2, 0.0, 0.0])])
-    field = placed(means, nodes=40, pieces=8, num_times=20, rigid_groups=True)
-    positions = field.buffers["positions"].double()
-    times = torch.linspace(0, 1, 30)
-    spin = Rotation.from_rotvec(np.array([0, 0, 2 * np.pi]) * (times.numpy()[:, None] - 0.5))
-    matrices = torch.from_numpy(spin.as_matrix())
-    is_first = (positions[:, 0] < 0.6)[None, :, None]
-    moved = torch.einsum("tde,se->tsd", matrices, positions)
-    shifted = positions + (times - 0.5)[:, None, None] * torch.tensor([0.0, 1.0, 0.0])
-    paths = torch.where(is_first, moved, shifted) - positions
-    quats = continuous(torch.from_numpy(spin.as_quat()).roll(1, dims=1))[:, None].repeat(1, len(positions), 1)
-    quats = torch.where(is_first, quats, torch.tensor([1.0, 0, 0, 0]).double())
-    quats = quats - torch.tensor([1.0, 0, 0, 0])
-    generator = torch.Generator().manual_seed(0)
-    for name, values in (("means", paths), ("quats", quats)):
-        points = fitted_splines(times, values, field.num_points).float()
-        field.parameters[name].data[:] = points + 0.01 * torch.randn(points.shape, generator=generator)
-    return field, means
-
-
-def test_in_groups_everything_moves_as_before() -> None:
-    """To 3 % of the spacing of the nodes, while the groups carry nearly all of it; a spin of a whole turn included."""
-    field, means = two_bodies()
-    grouped = field.with_groups(means)
-    assert grouped is not None
-    labels = grouped.buffers["labels"]
-    assert len(grouped.buffers["centers"]) == 2
-    assert sorted(torch.bincount(labels).tolist()) == sorted(
-        [int((field.buffers["positions"][:, 0] < 0.6).sum()), int((field.buffers["positions"][:, 0] >= 0.6).sum())]
-    )
-    spacing = float(field.buffers["radii"].mean())
-    alone = grouped.parameters["binding"][:, 0] == ALONE
-    assert 0.5 < float(alone.float().mean()) <= 1.0
-    for time in (0.0, 0.23, 0.5, 0.81, 1.0):
-        before, after = field.offsets(means, time), grouped.offsets(means, time)
-        assert float((before.means - after.means).detach().norm(dim=1).max()) < 0.03 * spacing
-        assert before.quats is not None
-        assert after.quats is not None
-        one = torch.tensor([1.0, 0, 0, 0])
-        a, b = ((x.detach() + one) / (x.detach() + one).norm(dim=1, keepdim=True) for x in (before.quats, after.quats))
-        assert float((a * b).sum(1)[alone].abs().min()) > 0.999
-        residual = grouped._local(time).means.detach().norm(dim=1)
-        assert float(residual.max()) < 0.1
-    assert "node residuals" in grouped.penalties(0.3)
-    assert field.with_groups(means) is not None, "the field itself stays as it was"
-    assert not field.has_groups
-
-
-def test_groups_are_looked_for_only_where_they_are_wanted_and_possible() -> None:
-    means = cloud().means
-    assert placed(means).with_groups(means) is None
-    assert placed(means, rigid_groups=True, move_rotations=False).with_groups(means) is None
-    grouped = placed(cloud(30).means, nodes=12, rigid_groups=True).with_groups(cloud(30).means)
-    assert grouped is not None, "what stands is rigid, too"
-    assert grouped.with_groups(cloud(30).means) is None
-
-
-def test_groups_follow_edits_and_come_back_from_a_state() -> None:
-    """New Gaussians are of their parents' groups, new nodes of those of the Gaussians that they start at."""
-    field, means = two_bodies()
-    grouped = field.with_groups(means)
-    assert grouped is not None
-    rows = torch.cat([torch.arange(10, 80), torch.tensor([79, 12, 12])])
-    is_new = torch.arange(73) >= 70
-    edited = grouped.edited(TopologyEdit(rows, is_new))
-    assert torch.equal(outputs(edited.offsets(means[rows], 0.3)), outputs(grouped.offsets(means, 0.3))[rows]), (
-        "nodes stay until they are placed again"
-    )
-    edited.regroup()
-    between = {name: x.clone() for name, x in tensors_of(edited.state()).items()}
-    assert between["buffers.bodies"].shape == (73, 2)
-    moved = means[rows] + 0.3 * torch.randn(73, 3, generator=torch.Generator().manual_seed(1)) * is_new[:, None]
-    found = edited.offsets(moved, 0.3)
-    labels, followed = edited.buffers["labels"], edited.buffers["followed"]
-    assert torch.equal(labels[followed], between["buffers.bodies"][:, :1].expand(-1, followed.shape[1]))
-    assert len(labels) == len(edited.buffers["positions"]) == len(edited.parameters["means"])
-    again = ControlNodes(edited.options, replace(edited.setup, num_moving=73), torch.Generator()).restored(between)
-    assert torch.equal(outputs(again.offsets(moved, 0.3)), outputs(found))
-    third = ControlNodes(edited.options, replace(edited.setup, num_moving=73), torch.Generator())
-    assert torch.equal(outputs(third.restored(tensors_of(edited.state())).offsets(moved, 0.3)), outputs(found)), (
-        "also when nothing is to be placed"
-    )
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("labels", 99), ("others", 40), ("bodies", 3), ("followed", -1)],
-)
-def test_groups_that_do_not_fit_are_refused(name: str, value: int) -> None:
-    field, means = two_bodies()
-    grouped = field.with_groups(means)
-    assert grouped is not None
-    if name == "bodies":
-        grouped.regroup()
-    tensors = {key: x.clone() for key, x in tensors_of(grouped.state()).items()}
-    tensors[f"buffers.{name}"].view(-1)[0] = value
-    with pytest.raises(ValueError, match=name):
-        ControlNodes(grouped.options, replace(grouped.setup, num_moving=80), torch.Generator()).restored(tensors)
-
-
-@pytest.mark.parametrize("pieces", [6, 8])
-def test_groups_stay_when_nodes_and_pieces_are_reduced(pieces: int) -> None:
-    """And the tensors are its own: to train the smaller one changes nothing of the larger one."""
-    field, means = two_bodies()
-    grouped = field.with_groups(means)
-    assert grouped is not None
-    before = outputs(grouped.offsets(means, 0.3))
-    small = grouped.reduced(15, pieces, means)
-    assert 15 <= small.num_nodes <= 17
-    moved = grouped.offsets(means, 0.3).means.detach()
-    apart = (small.offsets(means, 0.3).means.detach() - moved).norm(dim=1)
-    assert float(apart.median()) < 0.02, "what is rigid needs few nodes"
-    for x in small.parameters.values().values():
-        x += 1.0
-    assert torch.equal(outputs(grouped.offsets(means, 0.3)), before)

@@ -158,7 +158,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path:
 
 
 def test_what_has_begun_keeps_its_step() -> None:
-    options = TrainConfig(steps=1000, initial_downscale=4, hold_out_every=8)
+    options = TrainConfig(steps=1000, initial_downscale=4)
     model = DynamicModel(time_window=0.1, time_window_grows_from=0.4, time_window_full_at=0.6, motion_from=0.35)
     config = Config(data=DataConfig(root=Path("x")), model=model, train=options)
     old = deform_schedule(model, Rates(1000))
@@ -177,7 +177,6 @@ def test_what_has_begun_keeps_its_step() -> None:
             assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
             if done >= old.opens and steps < 9000:
                 assert (now.opens, now.full) == (old.opens, min(old.full, steps))
-            assert new.train.hold_out_every == (0 if done >= 900 else 8)
             assert told(config, new, done).count("\n") == 0
 
 

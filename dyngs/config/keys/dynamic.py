@@ -70,14 +70,6 @@ class ControlNodesField(FieldSection):
         description="weight of the as-rigid-as-possible term: squared strain between neighbouring nodes, in node "
         "spacings; lower where things bend",
     )
-    block_matching: bool = Field(
-        default=False,
-        description="now and then look up to three small pixels around for where moving blocks of the drawn image "
-        "belong in the true one, and correct the splines by that where it lowers the error",
-    )
-    rigid_groups: bool = Field(
-        default=False, description="nodes that move rigidly get one motion per body once all times are seen"
-    )
 
 
 class TrajectoryField(FieldSection):
@@ -105,16 +97,10 @@ class DynamicModel(SceneModel):
     deform: Annotated[
         DeformField, Field(discriminator="kind", description="how the canonical Gaussians are moved over time")
     ] = HexplaneField()
-    compare_with_still: bool = Field(
+    choose: bool = Field(
         default=False,
-        description="find out first whether anything moves; train a static model, too, compare the two on held-out "
-        "training views, and keep the better one",
-    )
-    pilot_steps: int = Field(
-        default=0,
-        ge=0,
-        description="with compare_with_still: steps of each small run that decides between settings which were not "
-        "asked for, at most a quarter of the run's; 0: none",
+        description="find out first, by small runs compared on training views held out, whether motion pays, and what "
+        "colours are made of and whether opacities change where that was not requested (docs/dynamic.md)",
     )
     motion_from: Fraction = Field(
         default=0.13,

@@ -51,7 +51,7 @@ class TrainConfig(Section):
     robust: Literal["never", "auto", "always"] = Field(
         default="never",
         description="leave out pixels that disagree with the other views (people who walk by); static scenes only; "
-        "auto: where two small runs beforehand say that it pays",
+        "auto: where small runs beforehand say that it pays",
     )
     exposure: Literal["never", "auto", "always"] = Field(
         default="never",
@@ -67,15 +67,6 @@ class TrainConfig(Section):
         default=1000,
         ge=1,
         description="steps, of a 30,000-step run, after which one more degree of harmonics is trained each time",
-    )
-    hold_out_every: int = Field(
-        default=0,
-        ge=0,
-        description="one of so many training views, in order of time, is held out, so that choices can be compared on "
-        "them; 0: none",
-    )
-    hold_out_until: Fraction = Field(
-        default=0.9, description="fraction of the run after which views that were held out are trained on, too"
     )
     log_every: int = Field(default=10, ge=1, description="steps between lines of log.jsonl")
     save_every: int = Field(default=0, ge=0, description="steps between checkpoints; 0: only the last")

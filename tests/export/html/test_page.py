@@ -22,19 +22,14 @@ from scene_kinds import KINDS, onlooker, scene_of_kind
 from tiny_fields import tiny_options
 
 from dyngs.camera import Cameras
-from dyngs.config import ControlNodesField
 from dyngs.conventions import RasterizeMode
-from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
-from dyngs.deform.rigid_groups import ALONE, fitted_splines
-from dyngs.deform.scene import DynamicScene
 from dyngs.export.html.page import MOST_VIEWS, SCRIPTS, SHADERS, WrittenPage, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import Scene
 from dyngs.metrics import psnr, ssim
-from dyngs.ops.quaternions import rotate
 from dyngs.runs.opened import Opened, open_run, opened_scene
 from dyngs.static.scene import StaticScene
 
@@ -116,15 +111,6 @@ def test_harmonics_and_modes(mode: RasterizeMode, browser: Browser, tmp_path: Pa
 
 
 @needs_browser
-def test_two_rigid_groups(browser: Browser, tmp_path: Path) -> None:
-    """Gaussians of two bodies that turn differently; some are between them."""
-    scene, view = two_bodies(), large(camera(), 6)
-    write(scene, tmp_path / "page.html", view)
-    page = opened(browser, tmp_path / "page.html")
-    assert_alike(page, scene, view, scene.options)
-    page.close()
-
-
 @needs_browser
 def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
     scene, path = sliding_scene(), tmp_path / "page.html"
@@ -274,37 +260,6 @@ def settled(page: Page) -> NDArray[np.uint8]:
 
 def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
     return a.shape != b.shape or bool(np.abs(a.astype(int) - b).max() > 40)
-
-
-def two_bodies() -> Scene:
-    """Two bodies of 40 Gaussians: one turns, one goes; some follow both."""
-    generator = torch.Generator().manual_seed(3)
-    means = torch.rand(80, 3, generator=generator) * 1.2 - torch.tensor([1.2, 0.6, 0.6])
-    means[40:, 0] += 1.2
-    setup = FieldSetup(torch.zeros(3), torch.ones(3), 12, len(means), 1.0)
-    options = ControlNodesField(nodes=30, pieces=4, rigid_groups=True)
-    field = ControlNodes(options, setup, generator)
-    field.offsets(means, 0.0)
-    positions, times = field.buffers["positions"], torch.linspace(0, 1, 20)
-    angles = (1.5 * times)[:, None]
-    turned = torch.stack([angles.cos(), 0 * angles, 0 * angles, angles.sin()], dim=-1)
-    first = (positions[:, 0] < 0)[None, :, None]
-    quats = torch.where(first, turned, torch.tensor([1.0, 0, 0, 0]))
-    goes = (times[:, None, None] - 0.5) * torch.tensor([0.0, 1, 0])
-    shifts = torch.where(first, rotate(quats, positions.expand(20, -1, 3)) - positions, goes)
-    for name, values in (("means", shifts), ("quats", quats - torch.tensor([1.0, 0, 0, 0]))):
-        field.parameters[name].data[:] = fitted_splines(times, values, field.num_points).float()
-    grouped = field.with_groups(means)
-    assert grouped is not None
-    assert int((grouped.parameters["binding"] > 0.5 * ALONE).sum()) > 3
-    gaussians = Gaussians(
-        means,
-        torch.randn(80, 4, generator=generator),
-        torch.rand(80, 3, generator=generator) - 3.5,
-        torch.full((80,), 2.0),
-        torch.randn(80, 4, 3, generator=generator),
-    )
-    return DynamicScene(gaussians=gaussians, seen_at=tuple(times.tolist()), field=grouped, moving=torch.arange(80))
 
 
 def sliding_scene() -> Scene:

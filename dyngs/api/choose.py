@@ -1,0 +1,363 @@
+"""What is decided before a run, by one procedure: small runs that differ in one setting, compared view by view.
+
+All small runs of a capture have the same images, steps and cap on Gaussians, and hold out the same training views. A
+setting is taken if the mean gain over these views, pair by pair, is above twice its standard error; a tie goes to the
+simpler one, which is what comes first. The winner is trained in full. What was requested is never asked.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean, stdev
+
+from dyngs.api.view_scores import PairScore, after_colour_fit, after_pose_fit, explained, plain
+from dyngs.build import assemble
+from dyngs.config import (
+    BudgetConfig,
+    Config,
+    DefaultStrategy,
+    DynamicModel,
+    NetworkColour,
+    OptimConfig,
+    PointsInit,
+    PruneConfig,
+    ShColour,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.config.keys.section import Section
+from dyngs.data.capture import Capture, View
+from dyngs.data.images.images import target_size
+from dyngs.data.loader import ImageLoader
+from dyngs.data.read import read_capture
+from dyngs.data.times import evenly_spaced
+from dyngs.deform.still_error import cameras_in_place, differing_fraction
+from dyngs.errors import DyngsError
+from dyngs.files.write import write_text
+from dyngs.runs.folder import CHOICES_NAME
+from dyngs.training.background import evaluation_background
+from dyngs.training.interrupt import Interrupts
+from dyngs.training.schedule import image_divisor
+from dyngs.training.trainer import Trainer
+
+SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
+"""Of small runs: longest side of the images, px, and most Gaussians."""
+STEPS, FEWEST_STEPS = 2000, 1000
+"""Most steps of a small run; with fewer than the latter it says nothing."""
+SPENT = 0.1
+"""Most of a run's work that small runs may take."""
+STEP_COST, GAUSSIAN_COST = 20_000, 2
+"""Work of a step beside its images, and of a Gaussian in it, in pixels."""
+FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
+"""With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
+the views; otherwise about so many are held out."""
+LEAST_GAIN = 0.05
+"""Mean gain, dB, up to which two settings tie."""
+MIN_DIFFERING = 0.001
+"""Fraction of the pixels of fixed cameras that differ from their median from which something moves."""
+LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
+"""Of the look at fixed cameras: longest side of the images, px; most cameras, and images of each."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting that small runs decide about.
+
+    Attributes:
+        text: keys and values, as on the command line.
+        applied: returns a configuration with it; None where it means nothing.
+        score: compares two models on a view.
+    """
+
+    text: str
+    applied: Callable[[Config], Config | None]
+    score: PairScore = plain
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What small runs said about a setting.
+
+    Attributes:
+        setting: keys and values.
+        views: number of views compared.
+        without, gain: mean PSNR without it, and mean gain by it, dB.
+        error: standard error of the gain, dB.
+        steps: of each small run.
+        seconds: that it took.
+        taken: whether the setting is used.
+    """
+
+    setting: str
+    views: int
+    without: float
+    gain: float
+    error: float
+    steps: int
+    seconds: float
+    taken: bool
+
+    def __str__(self) -> str:
+        return (
+            f"{self.setting} {'taken' if self.taken else 'not taken'}: {self.gain:+.2f} dB (standard error "
+            f"{self.error:.2f}) to {self.without:.2f} dB on {self.views} views ({self.seconds:.0f} s)"
+        )
+
+
+def choose(config: Config) -> tuple[Config, list[Choice]]:
+    """Return ``config`` with all decided that was not requested, and what small runs said; lines say so, too.
+
+    Raises:
+        DyngsError: a capture that cannot be read, or one without times for a scene that is to move.
+        KeyboardInterrupt: during small runs; nothing has been written.
+    """
+    settings, plain_config = _settings(config), _without_auto(config)
+    base = best = plain_config
+    match plain_config.model:
+        case DynamicModel() as model:
+            capture = read_capture(config.data)
+            _require_times(config, capture.splits["train"])
+            moves = _motion_of_fixed_cameras(capture, config) if model.choose else True
+            best = _with(best, "model", choose=False)
+            if moves is None:
+                base, moving = _at_rest(plain_config), best
+                settings.insert(0, Setting("model.kind=dynamic", lambda _: moving))
+            else:
+                base = best = best if moves else as_static(plain_config)
+        case _ if settings:
+            capture = read_capture(config.data)
+        case _:
+            return best, []
+    settings = [x for x in settings if x.applied(best) is not None or x.applied(base) is not None]
+    plan = _Plan.of(best, capture, len(settings))
+    if len(plan.folds) * plan.runs < 2:
+        if settings:
+            keys = ", ".join(x.text for x in settings)
+            print(f"{keys}: too short a run, or too few views, to find out whether it pays", flush=True)
+        return best, []
+    found, choices = _decided(base, settings[: plan.runs - 1], plan)
+    if isinstance(found.model, StaticModel) and isinstance(plain_config.model, DynamicModel):
+        best = _with(as_static(plain_config), "train", exposure=found.train.exposure, robust=found.train.robust)
+        found = best.model_copy(update={"camera": found.camera})
+    return found, choices
+
+
+def _decided(config: Config, settings: Sequence[Setting], plan: _Plan) -> tuple[Config, list[Choice]]:
+    """Return ``config`` with the settings that win, each tried on top of those before it, and all figures."""
+    print(f"small runs of {plan.steps:,} steps, compared on training views that are held out:", flush=True)
+    runs, found = plan.trained(config), list[Choice]()
+    for setting in settings:
+        changed, begun = setting.applied(config), time.monotonic()
+        if changed is None:
+            continue
+        others = plan.trained(changed)
+        pairs = [
+            setting.score(one, other, index)
+            for one, other in zip(runs, others, strict=True)
+            for index in sorted(one.held_out)
+        ]
+        found.append(_choice(setting.text, pairs, plan.steps, time.monotonic() - begun))
+        print(f"  {found[-1]}", flush=True)
+        if found[-1].taken:
+            config, runs = changed, others
+    return config, found
+
+
+def _choice(text: str, pairs: Sequence[tuple[float, float]], steps: int, seconds: float) -> Choice:
+    gains = [after - before for before, after in pairs]
+    gain, error = fmean(gains), (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
+    without = fmean(before for before, _ in pairs)
+    return Choice(text, len(pairs), without, gain, error, steps, seconds, gain > max(2 * error, LEAST_GAIN))
+
+
+def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
+    """Write what small runs said into a run folder."""
+    write_text(folder / CHOICES_NAME, json.dumps([asdict(choice) for choice in choices], indent=2) + "\n")
+
+
+def as_static(config: Config) -> Config:
+    """Return ``config`` as a static scene: what was requested stays where a static one has such a key.
+
+    All else are the defaults, which the preset ``static`` has.
+    """
+    usual = {"model": StaticModel(), "init": PointsInit(), "strategy": DefaultStrategy(), "optim": OptimConfig()}
+    changed = {name: _requested(getattr(config, name), section) for name, section in usual.items()}
+    train = _requested(config.train, TrainConfig())
+    lengths = ("steps", "log_every", "save_every", "eval_every", "tensorboard")
+    kept = {name: getattr(config.train, name) for name in lengths}
+    return config.model_copy(update=changed | {"train": train.model_copy(update=kept)})
+
+
+def _at_rest(config: Config) -> Config:
+    """Return ``config`` with nothing that moves, and all else as it is."""
+    shared = {key: getattr(config.model, key) for key in StaticModel.model_fields if key != "kind"}
+    return config.model_copy(update={"model": StaticModel.model_validate(shared)})
+
+
+def _requested(given: Section, usual: Section) -> Section:
+    """Return ``usual`` with what was requested in ``given``; of another kind of init or strategy, that."""
+    keys = given.model_fields_set
+    if not isinstance(given, DynamicModel) and type(given) is not type(usual) and (not keys or "kind" in keys):
+        usual = type(given)()
+    known = type(usual).model_fields
+    return usual.model_copy(update={key: getattr(given, key) for key in keys if key in known and key != "kind"})
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Small runs that keep within their part of a run's work.
+
+    Attributes:
+        folds: sets of the training views held out; small runs are made once for each.
+        steps: of each.
+        runs: number of configurations that can be tried.
+    """
+
+    folds: Sequence[frozenset[int]]
+    steps: int
+    runs: int
+
+    @staticmethod
+    def of(config: Config, capture: Capture, num_settings: int) -> _Plan:
+        """Return the plan for a run of ``config`` in which so many settings are open; later ones may be left out."""
+        folds, view = _held_out(capture.splits["train"]), capture.splits["train"][0]
+        if config.train.minutes is not None:
+            return _Plan(folds, 0, 0)
+        spent = SPENT * config.train.steps * _work_of_step(config, view) / _work_of_step(_small(config, 1000), view)
+        for runs in range(1 + num_settings, 1, -1):
+            steps = min(STEPS, int(spent / max(runs * len(folds), 1)))
+            if steps >= FEWEST_STEPS:
+                return _Plan(folds, steps, runs)
+        return _Plan(folds, 0, 0)
+
+    def trained(self, config: Config) -> list[Trainer]:
+        """Return the trainers of ``config`` after a small run for each fold."""
+        return [_trained(_small(config, self.steps), held_out) for held_out in self.folds]
+
+
+def _trained(config: Config, held_out: frozenset[int]) -> Trainer:
+    trainer = assemble(config, held_out=held_out)
+    with Interrupts() as interrupts:
+        while trainer.done < config.train.steps:
+            if interrupts.requested:
+                raise KeyboardInterrupt("stopped before training began: nothing is written, give the command again")
+            trainer.step()
+    trainer.images.rest()
+    return trainer
+
+
+def _work_of_step(config: Config, view: View) -> float:
+    """Return the mean work of a step, in pixels."""
+    width, height = target_size(view.width, view.height, config.data.downscale, config.data.longest_side)
+    times = range(0, config.train.steps, max(1, config.train.steps // 50))
+    drawn = fmean(image_divisor(config.train, step) ** -2 for step in times)
+    return STEP_COST + width * height * drawn + GAUSSIAN_COST * min(config.strategy.growth_limit, width * height)
+
+
+def _small(config: Config, steps: int) -> Config:
+    """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits."""
+    side = min(config.data.longest_side or SMALL_SIDE, SMALL_SIDE)
+    length = {"steps": steps, "minutes": None, "save_every": 0, "eval_every": 0}
+    return config.model_copy(
+        update={
+            "data": config.data.model_copy(update={"longest_side": side}),
+            "strategy": config.strategy.limited(SMALL_GAUSSIANS),
+            "train": config.train.model_copy(update=length),
+            "budget": BudgetConfig(),
+            "prune": PruneConfig(),
+        }
+    )
+
+
+def _held_out(views: Sequence[View]) -> list[frozenset[int]]:
+    """Return the sets of views that small runs hold out, in order of time; none where views are too few."""
+    order = sorted(range(len(views)), key=lambda i: (views[i].time or 0.0, views[i].name))
+    if len(order) < FEWEST_VIEWS:
+        return []
+    if len(order) < FEW_VIEWS:
+        return [frozenset(order[1::4]), frozenset(order[3::4])]
+    every = max(3, len(order) // HELD_OUT | 1)  # odd, so that it is not always the same of several cameras
+    return [frozenset(order[every // 2 :: every])]
+
+
+def _settings(config: Config) -> list[Setting]:
+    """Return what is open in ``config``, by what it was worth in the past, the most first."""
+    model, found = config.model, list[Setting]()
+    if not isinstance(model, (StaticModel, DynamicModel)):
+        return found
+    if config.camera.refine == "auto":
+        found.append(Setting("camera.refine=always", lambda c: _with(c, "camera", refine="always"), after_pose_fit))
+    if config.train.exposure == "auto":
+        found.append(Setting("train.exposure=always", lambda c: _with(c, "train", exposure="always"), after_colour_fit))
+    if config.train.robust == "auto":
+        found.append(Setting("train.robust=always", _robust, explained))
+    if isinstance(model, DynamicModel) and model.choose:
+        if config.colour == ShColour() and not config.colour.model_fields_set:
+            found.append(Setting("colour.kind=network", _network))
+        if "move_opacities" not in model.deform.model_fields_set:
+            found.append(Setting("model.deform.move_opacities=true", _moving_opacities))
+    return found
+
+
+def _without_auto(config: Config) -> Config:
+    """Return ``config`` with all that small runs may decide left out."""
+    if not isinstance(config.model, (StaticModel, DynamicModel)):
+        return config
+    for section, name in (("camera", "refine"), ("train", "exposure"), ("train", "robust")):
+        if getattr(getattr(config, section), name) == "auto":
+            config = _with(config, section, **{name: "never"})
+    return config
+
+
+def _robust(config: Config) -> Config | None:
+    return _with(config, "train", robust="always") if isinstance(config.model, StaticModel) else None
+
+
+def _network(config: Config) -> Config | None:
+    return config.model_copy(update={"colour": NetworkColour()}) if isinstance(config.model, DynamicModel) else None
+
+
+def _moving_opacities(config: Config) -> Config | None:
+    match config.model:
+        case DynamicModel() as model:
+            deform = model.deform.model_copy(update={"move_opacities": True})
+            return _with(config, "model", deform=deform)
+        case _:
+            return None
+
+
+def _with(config: Config, section: str, **values: object) -> Config:
+    """Return ``config`` with other ``values`` in a section."""
+    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
+
+
+def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
+    """Return whether anything moves, where all cameras are fixed, and say so; None: they do not tell."""
+    views = capture.splits["train"]
+    cameras = cameras_in_place(views)
+    if sum(map(len, cameras)) <= 0.9 * len(views):
+        return None
+    side = min(config.data.longest_side or LOOK_SIDE, LOOK_SIDE)
+    loader = ImageLoader(views, config.data.model_copy(update={"longest_side": side}))
+    _, background = evaluation_background(config.data.background, capture.has_alpha)
+    used = [cameras[i] for i in evenly_spaced(len(cameras), LOOK_CAMERAS)]
+    images = [[loader[seen[i]].composite(background) for i in evenly_spaced(len(seen), LOOK_TIMES)] for seen in used]
+    fraction = differing_fraction(images)
+    moves = fraction > MIN_DIFFERING
+    said = "something moves" if moves else "nothing moves, trained as a static scene"
+    print(f"{said}: {fraction:.2%} of the pixels of fixed cameras differ from their median", flush=True)
+    return moves
+
+
+def _require_times(config: Config, views: Sequence[View]) -> None:
+    """Raise an error unless the views were taken at two times or more."""
+    if len({view.time for view in views}) < 2:
+        raise DyngsError(
+            f"{config.data.root}: the images have no times, so nothing can move; train configs/static.yaml, or add a "
+            "time to each image (docs/formats.md), or give data.times=order if their names are in the order of time"
+        )

@@ -1,0 +1,125 @@
+"""How two models are compared on a view that neither was trained on, for each setting that may differ between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.metrics import psnr
+from dyngs.training.background import background_colour
+from dyngs.training.corrections.camera_fit import fitted_to_image
+from dyngs.training.trainer import Trainer
+
+EXPLAINED = 0.8
+"""Fraction of the pixels of a view that count: those where the smaller of two models' errors is smallest."""
+SQUARES = 8
+"""The halves of an image are the two colours of a chess board of so many squares a side."""
+
+PairScore = Callable[[Trainer, Trainer, int], tuple[float, float]]
+"""PSNR, dB, of the training view at an index by two models."""
+
+
+def plain(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+    """Return the PSNR of the view; where either has exposures, after an affine colour fitted to it."""
+    image, background = one.images[index], background_colour(one.background)
+    truth, fitted = image.composite(background), _have_exposures(one, other)
+    first, second = (psnr(_drawn(x, index, fitted), truth, image.mask) for x in (one, other))
+    return first, second
+
+
+def explained(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+    """Return the PSNR over the pixels that at least one of the two explains best, the same ones for both.
+
+    Views held out show people who walk through, too, whom no model can foresee.
+    """
+    image, background = one.images[index], background_colour(one.background)
+    truth, fitted = image.composite(background), _have_exposures(one, other)
+    images = [_drawn(x, index, fitted) for x in (one, other)]
+    counts = explained_pixels(images[0], images[1], truth, image.mask)
+    return psnr(images[0], truth, counts), psnr(images[1], truth, counts)
+
+
+def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
+    """Return (H, W) the pixels, of those that ``mask`` keeps, where the smaller error of two images is smallest.
+
+    Neither image is favoured: exchanged, they give the same.
+
+    Args:
+        one, other, truth: (H, W, 3).
+        mask: (H, W); None: all pixels count.
+    """
+    error = torch.minimum((one - truth).square().mean(-1), (other - truth).square().mean(-1))
+    weight = torch.ones_like(error) if mask is None else mask
+    known = error[weight > 0]
+    if not known.numel():
+        return weight
+    rank = max(1, round(EXPLAINED * known.numel()))
+    return weight * (error <= known.sort().values[rank - 1])
+
+
+def after_pose_fit(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+    """Return the PSNR of the right half of the view from the pose in which its left half fits each model best.
+
+    Views held out have no refined cameras.
+    """
+    first, second = (_score_after_pose_fit(x, index) for x in (one, other))
+    return first, second
+
+
+def _score_after_pose_fit(trainer: Trainer, index: int) -> float:
+    image, background = trainer.images[index], background_colour(trainer.background)
+    left = torch.zeros_like(image.rgb_premultiplied[..., 0])
+    left[:, : left.shape[1] // 2] = 1
+    right = 1 - left if image.mask is None else (1 - left) * image.mask
+    options = trainer.options
+    fitted = fitted_to_image(trainer.scene, image, background, trainer.extent, options=options, weights=left)
+    with torch.no_grad():
+        shown = trainer.scene.render(fitted.cameras, fitted.time, options=options, background=background).rgb[0]
+    return psnr(shown, image.composite(background), right)
+
+
+@torch.no_grad()
+def after_colour_fit(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+    """Return the mean PSNR of the view as it is, and with each half recoloured by a fit on the other half.
+
+    Views held out have no exposures of their own. Where exposure goes with the viewpoint, as in a slow walk, colours
+    that depend on the viewpoint explain it: then the scene in one exposure is farther from images as they are.
+    """
+    first, second = (_score_after_colour_fit(x, index) for x in (one, other))
+    return first, second
+
+
+def _score_after_colour_fit(trainer: Trainer, index: int) -> float:
+    image, background = trainer.images[index], background_colour(trainer.background)
+    rendering = trainer.scene.render(image.cameras, image.time, options=trainer.options, background=background)
+    truth, rgb = image.composite(background), rendering.rgb[0]
+    fitted, light = rgb.clone(), _chess_board(*rgb.shape[:2])
+    for half in (light, ~light):
+        affine = fitted_affine([(image, rendering)], background, half.float())
+        fitted[~half] = recoloured(affine, image, rendering, background)[~half]
+    return fmean((psnr(rgb, truth, image.mask), psnr(fitted, truth, image.mask)))
+
+
+def _chess_board(height: int, width: int) -> Tensor:
+    """Return (H, W) bool, one of the two colours of a chess board."""
+    rows, columns = (torch.arange(size, device="cpu") * SQUARES // size for size in (height, width))
+    return (rows[:, None] + columns) % 2 == 0
+
+
+@torch.no_grad()
+def _drawn(trainer: Trainer, index: int, fitted: bool) -> Tensor:
+    """Return the view (H, W, 3) as the scene shows it; ``fitted``: after an affine colour that is fitted to it."""
+    image, background = trainer.images[index], background_colour(trainer.background)
+    rendering = trainer.scene.render(image.cameras, image.time, options=trainer.options, background=background)
+    if not fitted:
+        return rendering.rgb[0]
+    affine = fitted_affine([(image, rendering)], background)
+    return recoloured(affine, image, rendering, background)
+
+
+def _have_exposures(*trainers: Trainer) -> bool:
+    return any(x.exposures is not None for x in trainers)

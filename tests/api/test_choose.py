@@ -1,0 +1,196 @@
+"""What is decided by small runs: a clear gain wins, within a tenth of the run, and nothing else is asked."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from dyngs.api import choose as module
+from dyngs.api.choose import Choice, Setting, _Plan, as_static, choose, write_choices
+from dyngs.api.view_scores import explained_pixels
+from dyngs.config import Config, DynamicModel, StaticModel
+from dyngs.config.io import load_config, packaged_preset
+from dyngs.data.read import read_capture
+from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
+from dyngs.errors import DyngsError
+from dyngs.runs.folder import CHOICES_NAME
+
+LONG = "train.steps=100_000"
+
+
+def preset(root: Path, *keys: str, name: str = "dynamic") -> Config:
+    return load_config(packaged_preset(name), [f"data.root={root}", "run.threads=1", *keys])
+
+
+def scored(monkeypatch: pytest.MonkeyPatch, psnr_of: Any) -> list[Config]:
+    """Let nothing be trained: a small run has the PSNR that ``psnr_of`` gives it, and differs a little by view."""
+    tried: list[Config] = []
+
+    def trained(config: Config, held_out: frozenset[int]) -> Any:
+        tried.append(config)
+        return SimpleNamespace(config=config, held_out=held_out)
+
+    def score(one: Any, other: Any, index: int) -> tuple[float, float]:
+        return psnr_of(one.config), psnr_of(other.config) + 0.02 * (index % 2)
+
+    monkeypatch.setattr(module, "_trained", trained)
+    for name in ("plain", "explained", "after_pose_fit", "after_colour_fit"):
+        monkeypatch.setattr(module, name, score)
+    real = module._settings
+    monkeypatch.setattr(module, "_settings", lambda config: [replace(x, score=score) for x in real(config)])
+    monkeypatch.setattr(module, "Setting", lambda text, applied, _=None: Setting(text, applied, score))
+    return tried
+
+
+def test_all_runs_differ_in_one_setting_and_winners_stay(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = scored(monkeypatch, lambda c: 20.0 + isinstance(c.model, DynamicModel) - (c.colour.kind == "network"))
+    best, found = choose(preset(moving, LONG))
+    assert [choice.taken for choice in found] == [True, False, False]
+    assert isinstance(best.model, DynamicModel)
+    assert not best.model.choose
+    assert best.colour.kind == "sh"
+    assert [c.model.kind for c in tried[::2]] == ["static", "dynamic", "dynamic", "dynamic"], "twice, as views are few"
+    assert len({(c.train.steps, c.data.longest_side, c.strategy.growth_limit) for c in tried}) == 1
+
+
+def test_where_motion_does_not_pay_the_scene_is_static_and_no_more_is_asked(
+    moving: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = scored(monkeypatch, lambda c: 20.0 - isinstance(c.model, DynamicModel))
+    config = preset(moving, LONG)
+    best, found = choose(config)
+    assert best == as_static(config)
+    assert [choice.setting for choice in found] == ["model.kind=dynamic"]
+    assert len(tried) == 4, "two of each"
+
+
+def test_what_was_requested_is_not_questioned(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = scored(monkeypatch, lambda _: 20.0 + len(tried))
+    keys = ("colour.kind=sh", "model.deform.move_opacities=false", "camera.refine=never")
+    _, found = choose(preset(moving, LONG, *keys))
+    assert [choice.setting for choice in found] == ["model.kind=dynamic"]
+    assert choose(preset(moving, "model.choose=false"))[1] == []
+
+
+def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
+    still: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FEWEST_VIEWS", 2)
+    tried = scored(monkeypatch, lambda c: 20.0 + (c.train.robust == "always"))
+    config = preset(still, LONG, name="static")
+    assert choose(config) == (config, [])
+    assert not tried
+    best, found = choose(preset(still, LONG, "train.robust=auto", "train.exposure=auto", name="static"))
+    assert (best.train.robust, best.train.exposure) == ("always", "never")
+    assert [choice.setting for choice in found] == ["train.exposure=always", "train.robust=always"]
+
+
+@pytest.mark.parametrize("keys", [("train.steps=400",), (LONG, "train.minutes=3")])
+def test_short_runs_ask_nothing(keys: tuple[str, ...], moving: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = preset(moving, *keys)
+    best, found = choose(config)
+    assert isinstance(best.model, DynamicModel)
+    assert not found
+    assert "too short a run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("gains", "taken"),
+    [([0.66, 0.5, 0.8, 0.6], True), ([2.0, -1.4, 1.9, -1.3], False), ([0.03, 0.03, 0.03], False), ([5.0], False)],
+)
+def test_a_gain_counts_pair_by_pair_above_twice_its_standard_error(gains: list[float], taken: bool) -> None:
+    """However much the views themselves differ."""
+    pairs = [(10.0 * i, 10.0 * i + gain) for i, gain in enumerate(gains)]
+    found = module._choice("a=b", pairs, 500, 1.0)
+    assert found.taken is taken
+    assert found.gain == pytest.approx(fmean(gains))
+
+
+def test_small_runs_keep_within_a_tenth_and_leave_out_the_last_settings(moving: Path) -> None:
+    capture = read_capture(preset(moving).data)
+    view = capture.splits["train"][0]
+    for steps in (2000, 20_000, 50_000, 400_000):
+        config = preset(moving, f"train.steps={steps}")
+        plan = _Plan.of(config, capture, 3)
+        small = module._small(config, 1000)
+        spent = plan.runs * len(plan.folds) * plan.steps * module._work_of_step(small, view)
+        assert spent <= 0.1 * steps * module._work_of_step(config, view)
+        assert plan.runs in (0, 2, 3, 4)
+    assert _Plan.of(preset(moving, "train.steps=400_000"), capture, 3).runs == 4
+
+
+def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
+    def views(count: int) -> list[Any]:
+        return [SimpleNamespace(time=i / count, name=str(i)) for i in range(count)]
+
+    assert module._held_out(views(7)) == []
+    first, second = module._held_out(views(12))
+    assert len(first) == len(second) == 3
+    assert not first & second
+    for count in (24, 48, 100, 1000):
+        (held_out,) = module._held_out(views(count))
+        assert 8 <= len(held_out) <= count / 3
+
+
+def test_half_is_explained_and_neither_image_is_favoured() -> None:
+    truth = torch.zeros(10, 10, 3)
+    one, other = truth.clone(), truth.clone()
+    one[:5], other[5:] = 1.0, 1.0
+    one[0], other[0] = 1.0, 1.0
+    counts = explained_pixels(one, other, truth, None)
+    assert torch.equal(counts, explained_pixels(other, one, truth, None))
+    assert counts[1:].all()
+    assert not torch.equal(counts, torch.ones_like(counts)) or bool(counts[0].all())
+
+
+def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> None:
+    with pytest.raises(DyngsError, match=r"no times.*configs/static.yaml.*data\.times=order"):
+        choose(preset(still))
+
+
+def test_as_static_has_the_static_preset_and_what_was_requested(moving: Path) -> None:
+    plain = as_static(preset(moving, "train.steps=123"))
+    static = preset(moving, "train.steps=123", name="static")
+    assert plain.model_copy(update={"run": static.run}) == static
+    keys = ("model.sh_degree=2", "train.ssim_weight=0.5", "optim.lr_means=1e-3", "strategy.kind=mcmc")
+    found = as_static(preset(moving, *keys, "strategy.max_gaussians=77"))
+    assert found.model == StaticModel(sh_degree=2)
+    assert (found.train.ssim_weight, found.optim.lr_means) == (0.5, 1e-3)
+    assert (found.strategy.kind, found.strategy.growth_limit) == ("mcmc", 77)
+
+
+def test_choices_are_a_table_in_the_run_folder(tmp_path: Path) -> None:
+    write_choices(tmp_path, [Choice("a=b", 9, 20.0, 0.5, 0.1, 500, 2.0, taken=True)])
+    (row,) = json.loads((tmp_path / CHOICES_NAME).read_text())
+    assert (row["setting"], row["gain"], row["taken"]) == ("a=b", 0.5, True)
+
+
+@pytest.mark.parametrize("moves", [False])
+def test_never_worse_than_static(moves: bool, tmp_path: Path) -> None:
+    """Real small runs: motion wins where something moves, the static model where nothing does."""
+    root = tmp_path / "capture"
+    if moves:
+        write_dynamic_capture("spin", root, DynamicOptions(size=32, num_times=48, num_test=1, samples=1))
+    else:
+        write_still_capture(root, StillOptions(size=32, num_train=48, num_test=1, samples=1))
+    keys = (
+        "train.steps=40_000",
+        "init.num_random=400",
+        "model.num_random_moving=200",
+        "data.times=order",
+        "train.initial_downscale=1",
+    )
+    config = preset(root, *keys)
+    capture = read_capture(config.data)
+    plan = replace(_Plan.of(config, capture, 1), steps=500, runs=2)
+    moving = config.model_copy(update={"model": config.model.model_copy(update={"choose": False})})
+    best, (choice,) = module._decided(module._at_rest(config), [Setting("model.kind=dynamic", lambda _: moving)], plan)
+    assert choice.taken is moves, choice
+    assert isinstance(best.model, DynamicModel) is moves
