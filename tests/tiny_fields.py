@@ -97,7 +97,7 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         "trajectory": {"lr_means": 1e-2},
     }
     field = tiny_options(kind).model_copy(update=rates[kind])
-    freeze_below_px = 1.0 if kind in ("control_nodes", "trajectory") else 0.3
+    freeze_below_px = 1.5 if kind in ("control_nodes", "trajectory") else 0.3
     phases = {
         "motion_from": 8 / 24,
         "time_window": 0.4,

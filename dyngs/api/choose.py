@@ -47,6 +47,8 @@ from dyngs.training.trainer import Trainer
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
 """Of small runs: longest side of the images, px, and most Gaussians."""
+SMALL_DOWNSCALE = 2
+"""By what the sides of these images are divided at first, at most."""
 STEPS, FEWEST_STEPS = 2000, 1000
 """Most steps of a small run; with fewer than the latter it says nothing."""
 SPENT = 0.1
@@ -262,7 +264,8 @@ def _work_of_step(config: Config, view: View) -> float:
 def _small(config: Config, steps: int) -> Config:
     """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits."""
     side = min(config.data.longest_side or SMALL_SIDE, SMALL_SIDE)
-    length = {"steps": steps, "minutes": None, "save_every": 0, "eval_every": 0}
+    first = min(config.train.initial_downscale, SMALL_DOWNSCALE)  # nothing is followed in still smaller images
+    length = {"steps": steps, "minutes": None, "save_every": 0, "eval_every": 0, "initial_downscale": first}
     return config.model_copy(
         update={
             "data": config.data.model_copy(update={"longest_side": side}),
