@@ -47,8 +47,6 @@ from dyngs.training.trainer import Trainer
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
 """Of small runs: longest side of the images, px, and most Gaussians."""
-SMALL_DOWNSCALE = 2
-"""By what the sides of these images are divided at first, at most."""
 STEPS, FEWEST_STEPS = 2000, 1000
 """Most steps of a small run; with fewer than the latter it says nothing."""
 SPENT = 0.1
@@ -218,28 +216,32 @@ class _Plan:
         folds: sets of the training views held out; small runs are made once for each.
         steps: of each.
         runs: number of configurations that can be tried.
+        first_side: longest side of the images that the run itself begins with, px; small runs begin with no less.
     """
 
     folds: Sequence[frozenset[int]]
     steps: int
     runs: int
+    first_side: float
 
     @staticmethod
     def of(config: Config, capture: Capture, num_settings: int) -> _Plan:
         """Return the plan for a run of ``config`` in which so many settings are open; later ones may be left out."""
         folds, view = _held_out(capture.splits["train"]), capture.splits["train"][0]
+        first = _longest_side(config, view) / config.train.initial_downscale
         if config.train.minutes is not None:
-            return _Plan(folds, 0, 0)
-        spent = SPENT * config.train.steps * _work_of_step(config, view) / _work_of_step(_small(config, 1000), view)
+            return _Plan(folds, 0, 0, first)
+        small = _small(config, 1000, first)
+        spent = SPENT * config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
         for runs in range(1 + num_settings, 1, -1):
             steps = min(STEPS, int(spent / max(runs * len(folds), 1)))
             if steps >= FEWEST_STEPS:
-                return _Plan(folds, steps, runs)
-        return _Plan(folds, 0, 0)
+                return _Plan(folds, steps, runs, first)
+        return _Plan(folds, 0, 0, first)
 
     def trained(self, config: Config) -> list[Trainer]:
         """Return the trainers of ``config`` after a small run for each fold."""
-        return [_trained(_small(config, self.steps), held_out) for held_out in self.folds]
+        return [_trained(_small(config, self.steps, self.first_side), held_out) for held_out in self.folds]
 
 
 def _trained(config: Config, held_out: frozenset[int]) -> Trainer:
@@ -261,10 +263,19 @@ def _work_of_step(config: Config, view: View) -> float:
     return STEP_COST + width * height * drawn + GAUSSIAN_COST * min(config.strategy.growth_limit, width * height)
 
 
-def _small(config: Config, steps: int) -> Config:
-    """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits."""
+def _longest_side(config: Config, view: View) -> int:
+    return max(target_size(view.width, view.height, config.data.downscale, config.data.longest_side))
+
+
+def _small(config: Config, steps: int, first_side: float) -> Config:
+    """Return ``config`` for ``steps`` in small images, with few Gaussians and without limits.
+
+    They begin with no smaller images than the run itself, ``first_side`` px: in smaller ones motion is lost that it
+    follows.
+    """
     side = min(config.data.longest_side or SMALL_SIDE, SMALL_SIDE)
-    first = min(config.train.initial_downscale, SMALL_DOWNSCALE)  # nothing is followed in still smaller images
+    divisors = (n for n in (16, 8, 4, 2) if n <= config.train.initial_downscale and side / n >= first_side)
+    first = next(divisors, 1)
     length = {"steps": steps, "minutes": None, "save_every": 0, "eval_every": 0, "initial_downscale": first}
     return config.model_copy(
         update={

@@ -119,7 +119,7 @@ def test_small_runs_keep_within_a_tenth_and_leave_out_the_last_settings(moving: 
     for steps in (2000, 20_000, 50_000, 400_000):
         config = preset(moving, f"train.steps={steps}")
         plan = _Plan.of(config, capture, 3)
-        small = module._small(config, 1000)
+        small = module._small(config, 1000, plan.first_side)
         spent = plan.runs * len(plan.folds) * plan.steps * module._work_of_step(small, view)
         assert spent <= 0.1 * steps * module._work_of_step(config, view)
         assert plan.runs in (0, 2, 3, 4)
