@@ -1,6 +1,6 @@
 """Quality of short trainings, through what a user calls: PSNR of held-out views, motion, never worse than static.
 
-Floors are 0.3 dB below what was measured, which stands beside them: instruction sets differ by hundredths of a dB.
+Floors are 0.3 dB below what was measured, which stands beside them: instruction sets differ by up to 0.15 dB.
 """
 
 from __future__ import annotations
@@ -52,7 +52,23 @@ def test_a_static_scene(still_life: Captured) -> None:
 
 
 def test_a_static_scene_by_mcmc(still_life: Captured) -> None:
-    assert still_life.report("static_mcmc", "train.steps=400").psnr > 20.6  # 20.95
+    assert still_life.report("static_mcmc", "train.steps=600").psnr > 22.0
+
+
+def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
+    """With all decisions on: the scene ends moving, follows its material points, and is no worse than a static one."""
+    captured = Captured.of(tmp_path, "wave", "--size", "32", "--views", "32")
+    keys = ("train.steps=700", "init.num_random=1000", "strategy.max_gaussians=1500", "train.initial_downscale=1")
+    moving, static = (captured.report(preset, *keys) for preset in ("dynamic", "static"))
+    assert moving.moving_fraction > 0.9
+    assert moving.psnr > 21.6  # 21.91
+    assert moving.psnr > static.psnr - 0.15  # 21.83; with another instruction set 21.88 beside it
+    assert moving.psnr_moving is not None
+    assert static.psnr_moving is not None
+    assert moving.psnr_moving > max(17.2, static.psnr_moving + 1)  # 17.49, 15.98
+    assert moving.track_error_px is not None
+    assert moving.track_motion_px is not None
+    assert moving.track_error_px < 0.75 * moving.track_motion_px  # 0.656, 0.972
 
 
 def test_a_person(tmp_path: Path) -> None:
@@ -72,10 +88,10 @@ def test_what_stays_before_fixed_cameras_is_trained_as_static(still_life: Captur
     described = json.loads((source / "transforms_train.json").read_text())
     frames = []
     for frame in described["frames"][:3]:
-        for time in (0.0, 0.5, 1.0):
-            name = f"{frame['file_path']}_{time:g}"
+        for k in range(6):
+            name = f"{frame['file_path']}_{k}"
             shutil.copy(source / f"{frame['file_path']}.png", target / f"{name}.png")
-            frames.append(frame | {"file_path": name, "time": time})
+            frames.append(frame | {"file_path": name, "time": k / 5})
     (target / "transforms_train.json").write_text(json.dumps(described | {"frames": frames}))
     (target / "transforms_test.json").unlink()
     captured = Captured(tmp_path)

@@ -390,7 +390,9 @@ def test_a_sog_by_its_description(tmp_path: Path) -> None:
             parts.insert(rotation[3] - 252, max(0.0, 1 - sum(x * x for x in parts)) ** 0.5)
             assert abs(np.dot(parts, THREE["quats"][row])) > 0.9999
         np.testing.assert_allclose(
-            np.array(meta["scales"]["codebook"])[pixels("scales")[:, :3]], np.array(THREE["log_scales"])[order], atol=0.05
+            np.array(meta["scales"]["codebook"])[pixels("scales")[:, :3]],
+            np.array(THREE["log_scales"])[order],
+            atol=0.05,
         )
         base = np.array(THREE["sh"])[order][:, 0]
         np.testing.assert_allclose(np.array(meta["sh0"]["codebook"])[pixels("sh0")[:, :3]], base, atol=0.02)
