@@ -1,3 +1,4 @@
+# ruff: noqa: E501  (a table, one mutation to a line)
 """Breaks one place at a time and says which of the nearest tests notices: `python benchmarks/mutate.py [WORD]`.
 
 Run from a clean checkout; only places whose line holds WORD are tried. A file is changed for as long as its tests run,
