@@ -39,6 +39,7 @@ WITHOUT_MIRROR = {
     "test_docs.py": "about README.md and docs/*.md",
     "test_fuzz.py": "about all readers, by the folder fuzz beside the tests",
     "test_layout.py": "about the repository, not one module",
+    "test_quality.py": "about training as a whole, on small captures",
     "test_numerics.py": "the table of docs/numerics.md",
 }
 

@@ -63,17 +63,17 @@ def test_no_run_ends_with_more_and_a_resumed_one_knows(
     kind: str, captures: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of all checkpoints of the last tenth none has more either."""
-    config = config_of(kind, captures, tmp_path / "run", BudgetConfig(max_gaussians=60))
+    config = config_of(kind, captures, tmp_path / "run", BudgetConfig(max_gaussians=100))
     saves = config.train.model_copy(update={"save_every": config.train.steps - 1})
     folder = train(config.model_copy(update={"train": saves}))
     out = capsys.readouterr().out
-    assert "budget.max_gaussians: asked for at most 60 Gaussians" in out
+    assert "budget.max_gaussians: asked for at most 100 Gaussians" in out
     assert "dB on training views when they were removed" in out
     end = checkpoint_paths(folder)[-1]
     wanted = end.read_bytes()
-    assert len(load_run(folder).scene) <= 60
+    assert len(load_run(folder).scene) <= 100
     end.unlink()
-    assert len(load_run(folder).scene) <= 60
+    assert len(load_run(folder).scene) <= 100
     train(load_resolved(folder), resume_from=folder)
     assert end.read_bytes() == wanted
     assert out.splitlines()[-1] == capsys.readouterr().out.splitlines()[-1], "it is said again as it was"

@@ -50,6 +50,9 @@ def test_a_clip_plays_in_its_own_time() -> None:
     np.testing.assert_allclose(path.times, np.linspace(0, 1, 11))
     centers = path.cameras.centers.numpy()[:, 0]
     np.testing.assert_allclose(centers[3:9], 10 * np.sqrt(np.linspace(0, 1, 11))[3:9], atol=0.6)
+    mixed = np.random.default_rng(3).permutation(20)
+    again = path_along(cameras_at(_walk(20)[mixed]), 11, times[mixed].tolist())
+    np.testing.assert_allclose(again.cameras.centers.numpy()[:, 0], centers, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

@@ -44,6 +44,12 @@ def test_odd_camera_sets_give_finite_rigid_paths(cameras: Cameras, path: Any) ->
     assert_rigid(made)
 
 
+def test_a_spiral_rises_first() -> None:
+    """As in LLFF: from the right up to the left, which is counterclockwise in the images."""
+    heights = spiral_path(forward_facing(6), 8).centers.double().numpy() @ UP
+    assert heights[1] > heights[0] > heights[3]
+
+
 def test_a_camera_straight_above_still_orbits() -> None:
     made = orbit_path(cameras_at(look_at(np.array([0, 0, 5.0]), np.zeros(3), np.array([0, 1.0, 0]))[None]), 6)
     assert_rigid(made)

@@ -16,7 +16,14 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.deform.still_error import MIN_SAME, cameras_in_place, still_errors, two_group_threshold, views_to_compare
+from dyngs.deform.still_error import (
+    MIN_SAME,
+    cameras_in_place,
+    differing_fraction,
+    still_errors,
+    two_group_threshold,
+    views_to_compare,
+)
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 
@@ -275,3 +282,11 @@ def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale:
 @pytest.mark.parametrize("scores", [[], [0.3], [0.3] * 50, [0.0] * 5])
 def test_of_equal_scores_none_stands_out(scores: list[float]) -> None:
     assert two_group_threshold(torch.tensor(scores)) == float("inf")
+
+
+def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
+    room = 0.5 * torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0))
+    assert differing_fraction([[room, room + 0.2, room + 0.4]]) == 0
+    come = room.clone()
+    come[:4, :4] += 0.3
+    assert differing_fraction([[room, room, come]]) == 4 / 48, "of 16 blocks of 2x2 pixels in each image"

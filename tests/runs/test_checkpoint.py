@@ -145,6 +145,8 @@ def test_only_the_last_two_are_kept_with_their_times(tmp_path: Path) -> None:
     ]
     assert latest_checkpoint(tmp_path).info.step == 15
     assert (seconds_at(tmp_path, 10), seconds_at(tmp_path, 15), seconds_at(tmp_path, 99)) == (2.0, 3.0, 0.0)
+    save_checkpoint(tmp_path, _checkpoint(12), 9.0)  # by a run that went on from step 10
+    assert (seconds_at(tmp_path, 10), seconds_at(tmp_path, 12), seconds_at(tmp_path, 15)) == (2.0, 9.0, 0.0)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "altered", "header", "empty", "no safetensors", "foreign"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import zipfile
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -317,6 +318,17 @@ def test_a_splat_byte_by_byte(tmp_path: Path) -> None:
     up_to_sign(found.quats, wanted.quats, 1e-4)
 
 
+def test_bytes_of_a_splat_are_the_nearest(tmp_path: Path) -> None:
+    """Cut off instead of rounded, all colours would be darker, and rotations off to one side."""
+    scene = cloud(200, 0)
+    rows = np.frombuffer(write_splats(tmp_path / "a.splat", SplatFile(scene)).path.read_bytes(), np.uint8)
+    written = torch.from_numpy(rows.reshape(-1, 32)[:, 24:].astype(np.float32))
+    order = torch.argsort(scene.log_scales.double().sum(1).exp() * scene.opacities, descending=True, stable=True)
+    colours = torch.cat([scene.base_rgb, scene.opacities[:, None]], dim=1).clamp(0, 1) * 255
+    exact = torch.cat([colours, (scene.quats * 128 + 128).clamp(0, 255)], dim=1)[order]
+    assert float((written - exact).abs().max()) <= 0.5 + 1e-4
+
+
 def test_a_glb_of_another_program() -> None:
     """It stands on its side: half a turn about z. Colours are those of the harmonics, whatever ``COLOR_0`` says."""
     found, wanted = read_splats(KNOWN / "three.glb").gaussians, three()
@@ -343,6 +355,77 @@ def test_a_glb_is_written_as_by_another_program(tmp_path: Path) -> None:
     np.testing.assert_allclose(ours["COLOR_0"][:, :3], linear, atol=1e-5)
     np.testing.assert_allclose(((srgb[:, :3] + 0.055) / 1.055) ** 2.4, linear, atol=3e-3)  # theirs has 8 bits
     np.testing.assert_allclose(ours["COLOR_0"][:, 3], [0.81757, 0.11920, 0.56218], atol=1e-5)
+
+
+@pytest.mark.parametrize(("key", "other"), [("srgb_rec709_display", "lin_rec709_display"), ("ellipse", "splat")])
+def test_a_glb_of_another_kind_is_refused(key: str, other: str, tmp_path: Path) -> None:
+    """Linear colours would be drawn too dark."""
+    path = write_splats(tmp_path / "a.glb", SplatFile(three()), sh_degree=0).path
+    data = path.read_bytes()
+    path.write_bytes(data.replace(f'"{key}"'.encode(), f'"{other}"'.ljust(len(key) + 2).encode()))
+    with pytest.raises(DyngsError, match=rf"{other}.* is not supported, only {key}"):
+        read_splats(path)
+
+
+def test_a_sog_by_its_description(tmp_path: Path) -> None:
+    """By PlayCanvas' description of version 2, in a reader of a few lines."""
+    from PIL import Image
+
+    path = write_splats(tmp_path / "a.sog", SplatFile(three(), up="-y")).path
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+
+        def pixels(part: str, index: int = 0) -> np.ndarray:
+            with archive.open(meta[part]["files"][index]) as file, Image.open(file) as image:
+                return np.asarray(image.convert("RGBA")).reshape(-1, 4)[: meta["count"]].astype(int)
+
+        low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
+        far = low + (pixels("means", 0) + 256 * pixels("means", 1))[:, :3] / 65535 * (high - low)
+        means = np.sign(far) * (np.exp(np.abs(far)) - 1)
+        order = np.abs(means[:, None] - np.array(THREE["means"])).sum(2).argmin(1)
+        assert sorted(order) == [0, 1, 2]
+        np.testing.assert_allclose(means, np.array(THREE["means"])[order], atol=1e-4)
+        for rotation, row in zip(pixels("quats"), order, strict=True):
+            parts = ((rotation[:3] / 255 - 0.5) * 2**0.5).tolist()
+            parts.insert(rotation[3] - 252, max(0.0, 1 - sum(x * x for x in parts)) ** 0.5)
+            assert abs(np.dot(parts, THREE["quats"][row])) > 0.9999
+        np.testing.assert_allclose(
+            np.array(meta["scales"]["codebook"])[pixels("scales")[:, :3]],
+            np.array(THREE["log_scales"])[order],
+            atol=0.05,
+        )
+        base = np.array(THREE["sh"])[order][:, 0]
+        np.testing.assert_allclose(np.array(meta["sh0"]["codebook"])[pixels("sh0")[:, :3]], base, atol=0.02)
+        assert pixels("sh0")[:, 3].tolist() == [OPACITY_BYTES[row] for row in order]
+
+
+def test_a_compressed_ply_by_its_description(tmp_path: Path) -> None:
+    """By SuperSplat's description, in a reader of a few lines; values in the middle of a range are rounded."""
+    path = write_splats(tmp_path / "a.compressed.ply", SplatFile(three(), up="-y")).path
+    header, _, data = path.read_bytes().partition(b"end_header\n")
+    assert b"element chunk 1\n" in header
+    low, high = (np.frombuffer(data, "<f4", 18)[:18].reshape(3, 2, 3)[:, end] for end in (0, 1))
+    words = np.frombuffer(data, "<u4", 12, 72).reshape(3, 4).astype(np.int64)
+
+    def fractions(column: int, *bits: int) -> np.ndarray:
+        shifts = np.cumsum((0, *bits[:0:-1]))[::-1]
+        tops = 2 ** np.array(bits) - 1
+        return ((words[:, column, None] >> shifts) & tops) / tops
+
+    places = fractions(0, 11, 10, 11) * (high[0] - low[0]) + low[0]
+    order = np.abs(places[:, None] - np.array(THREE["means"])).sum(2).argmin(1)
+    assert sorted(order) == [0, 1, 2]
+    span = np.abs(places - np.array(THREE["means"])[order]) / (high[0] - low[0])
+    assert (span <= 0.5001 / np.array([2047, 1023, 2047])).all()
+    scales = fractions(2, 11, 10, 11) * (high[1] - low[1]) + low[1]
+    np.testing.assert_allclose(scales, np.array(THREE["log_scales"])[order], atol=0.51 * 4.5 / 1023)
+    colours = fractions(3, 8, 8, 8, 8)
+    rgb = np.array(THREE["sh"])[order][:, 0] * 0.28209479 + 0.5
+    np.testing.assert_allclose(colours[:, :3] * (high[2] - low[2]) + low[2], rgb, atol=0.51 / 255)
+    assert (255 * colours[:, 3]).round().tolist() == [OPACITY_BYTES[row] for row in order]
+    rest = np.frombuffer(data, np.uint8, 27, 72 + 48).reshape(3, 3, 3)  # of degree 1, by channel
+    wanted = np.array(THREE["sh"])[order][:, 1:].transpose(0, 2, 1)
+    np.testing.assert_allclose((rest + 0.5) / 256 * 8 - 4, wanted, atol=0.0157)
 
 
 def attributes(path: Path) -> dict[str, np.ndarray]:

@@ -88,7 +88,7 @@ def test_each_kind_of_gaussian_meets_its_fate() -> None:
 
 def test_huge_ones_go_only_after_the_first_reset() -> None:
     gaussians = _gaussians([1.1, 0.9], [0.5, 0.5])  # limit: 0.1 * extent = 1
-    for step, left in ((200, [0, 1]), (400, [1])):
+    for step, left in ((200, [0, 1]), (300, [0, 1]), (400, [1])):
         densifier = _densifier()
         _signal(densifier, [0.0, 0.0])
         result = densifier.edit(step, gaussians, torch.Generator())
@@ -172,6 +172,33 @@ def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> N
     assert not (chosen & ~wanted).any()
     if chosen.any() and (wanted & ~chosen).any():
         assert score[chosen].min() >= score[wanted & ~chosen].max()
+
+
+def test_which_side_the_limits_are_on() -> None:
+    """A Gaussian exactly at a limit stays, is wanted, and counts as small."""
+    options = DefaultStrategy(prune_opacity=0.5, grad_threshold=0.25)
+    for score, extent, max_scale, expected in (
+        (0.24, 100.0, 1.0, "kept"),
+        (0.25, 100.0, 1.0, "kept cloned"),
+        (0.25, 99.0, 1.0, "split"),
+        (0.25, 100.0, 0.99, ""),  # too large to stay, too small to be split
+        (0.25, 10.0, 0.99, "split"),  # its halves are small enough
+        (0.25, 10.0, 1 / 1.6 - 1e-3, ""),  # and here they are not
+        (0.25, 10.0, 1 / 1.6 + 1e-3, "split"),
+    ):
+        two = _gaussians([1.0, 0.1], [0.5, 0.9])  # log scale and logit 0; the second sees to it that one is left
+        plan = plan_edit(two, torch.tensor([score, 0.0]), options, extent, max_scale)
+        found = " ".join(name for name in ("kept", "cloned", "split") if bool(getattr(plan, name)[0]))
+        assert found == expected, (score, extent, max_scale)
+        assert bool(plan.kept[1])
+
+
+def test_a_split_that_replaces_nothing_takes_the_room_of_two() -> None:
+    """One that is too large to stay frees no room by being split."""
+    huge = _gaussians([1.5, 0.1, 0.1], [0.5, 0.5, 0.5])
+    for cap, split in ((3, False), (4, True)):
+        plan = plan_edit(huge, torch.tensor([1.0, 0.0, 0.0]), DefaultStrategy(max_gaussians=cap), EXTENT, 1.0)
+        assert plan.split.tolist() == [split, False, False]
 
 
 @settings(max_examples=25, deadline=None)

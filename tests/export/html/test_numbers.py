@@ -8,10 +8,14 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from scene_kinds import KINDS, scene_of_kind
 
 from dyngs.export.html.numbers import CHUNK, Lists, add_scene
+from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.ops.quaternions import rotation_matrices
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -53,6 +57,16 @@ def read(lists: Lists, name: str) -> NDArray[Any]:
     steps = steps.reshape(columns, planes, rows).astype(int)
     whole = steps[:, 0] if planes == 1 else steps[:, 0] * 256 + steps[:, 1]
     return ranges[:rows, :, 0] + ranges[:rows, :, 1] * whole.T
+
+
+def test_rotations_of_a_clip_begin_with_their_scalar_part() -> None:
+    scene, lists = scene_of_kind("human"), Lists()
+    add_scene(scene, lists, 0.01)
+    found = torch.from_numpy(read(lists, "clip_quats").reshape(-1, 4))
+    person = avatar_of(scene)
+    assert person is not None
+    wanted = axis_angle_to_matrix(person.moves_as.poses.reshape(-1, 3)).double()
+    torch.testing.assert_close(rotation_matrices(found.double()), wanted, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("bits", [8, 16])

@@ -68,6 +68,12 @@ def test_colours_follow_where_the_surface_faces() -> None:
         torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
 
 
+def test_no_harmonic_brightens_a_person_as_a_whole() -> None:
+    """Each is 0 in the mean over all directions, for which that over the six along axes stands."""
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    torch.testing.assert_close(harmonics(axes).mean(0), torch.zeros(8))
+
+
 def test_higher_harmonics_are_dimmed_with_the_colour() -> None:
     sh = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(0))
     light = Light(torch.tensor([[0.0, 1, 0]]).expand(5, 3), 0.3 * torch.ones(TERMS, 3))

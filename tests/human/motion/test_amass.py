@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from motion_files import random_motion, slow_vertices, tiny_body
 from scipy.spatial.transform import Rotation
 
@@ -319,25 +317,6 @@ def test_a_single_array_and_a_missing_file(tmp_path: Path) -> None:
     for name in ("x.npy", "none.npz"):
         with pytest.raises(DyngsError, match=name):
             read_amass(tmp_path / name, tiny_body())
-
-
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_damage_ends_in_one_line(tmp_path: Path, data: st.DataObject) -> None:
-    """Whatever is cut off, and whichever byte is another one."""
-    path = tmp_path / "x.npz"
-    read(tmp_path, numbers())
-    whole = path.read_bytes()
-    place, value = data.draw(st.integers(0, len(whole) - 1)), data.draw(st.integers(0, 255))
-    content = bytearray(whole)
-    content[place] = value
-    path.write_bytes(content if data.draw(st.booleans()) else whole[:place])
-    message = ""
-    try:
-        assert torch.isfinite(read_amass(path, tiny_body()).poses).all()
-    except DyngsError as error:
-        message = str(error)
-    assert "\n" not in message
 
 
 def test_the_turned_root_of_a_person_lying_on_the_back(tmp_path: Path) -> None:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from measured import cost_of
 from motion_files import (
     as_local,
@@ -150,19 +148,6 @@ def test_broken_files_say_what_is_wrong(two: Path, old: str, new: str, problem: 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"none\.bvh: cannot be read \(No such file"):
         read_bvh(tmp_path / "none.bvh")
-
-
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.integers(0, len(TWO)), st.binary(max_size=8))
-def test_damage_ends_in_one_line(two: Path, cut: int, junk: bytes) -> None:
-    """Whatever is cut off, and whatever follows."""
-    two.write_bytes(TWO.encode()[:cut] + junk)
-    message = ""
-    try:
-        assert np.isfinite(read_bvh(two).positions).all()
-    except DyngsError as error:
-        message = str(error)
-    assert "\n" not in message
 
 
 HOSTILE = {

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import io
 import os
-import pickle
 import re
 import sys
 import types
@@ -423,30 +421,6 @@ def test_arrays_of_objects_are_refused_where_needed_and_left_alone_elsewhere(tmp
     objects = np.array([1, 2], dtype=object)
     assert "'f' is not an array of numbers" in refusal(write_pickle(tmp_path / "a.pkl", model("smpl") | {"f": objects}))
     assert "'f' is not an array of numbers" in refusal(write_pickle(tmp_path / "a.pkl", model("smpl") | {"f": "text"}))
-
-
-WHOLE = {"npz": io.BytesIO(), "pkl": io.BytesIO()}
-np.savez(WHOLE["npz"], **model("smpl"))
-pickle.dump(model("smpl"), WHOLE["pkl"], 2)
-
-
-@settings(max_examples=80, deadline=None)
-@given(
-    st.sampled_from(["npz", "pkl"]), st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=6)
-)
-def test_damage_anywhere_ends_in_one_line_or_does_no_harm(kind: str, damage: list[tuple[float, int]]) -> None:
-    """Half of it falls into the first thousand bytes, where names and sizes are."""
-    content = bytearray(WHOLE[kind].getvalue())
-    for i, (where, byte) in enumerate(damage):
-        content[int(where * (min(1000, len(content) - 1) if i % 2 == 0 else len(content) - 1))] = byte
-    path = Path(f"model.{kind}")
-    path.write_bytes(content)
-    message = ""
-    try:
-        read_body(path)
-    except DyngsError as error:
-        message = str(error)
-    assert "\n" not in message
 
 
 def test_the_free_template_is_the_default() -> None:

@@ -63,6 +63,26 @@ def test_gains_are_learned_and_their_mean_is_the_identity() -> None:
     torch.testing.assert_close(mean, torch.eye(3, 4), atol=1e-5, rtol=0)
 
 
+def first_gain(scene: Tensor, truth: Tensor) -> float:
+    """Return the gain that an image begins with, by its rendering alone."""
+    exposures = ViewExposures([[]], STEPS)
+    image = Image("0", None, truth, None, None, None)  # type: ignore[arg-type]
+    exposures.applied((0, STEPS), image, shown(scene), BLACK)
+    return float(exposures.affine(0)[0, 0].detach())
+
+
+def test_the_first_gain_is_that_of_pixels_that_are_not_saturated() -> None:
+    scene = torch.full((32, 32, 3), 0.3)
+    scene[:20] = 0.9
+    assert first_gain(scene, (1.5 * scene).clamp_max(1)) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("gain", [18.0, 1 / 18])
+def test_the_first_gain_has_limits(gain: float) -> None:
+    scene = torch.full((32, 32, 3), 0.05 * max(1.0, 1 / gain))
+    assert first_gain(scene, gain * scene) == pytest.approx(8 if gain > 1 else 1 / 8)
+
+
 def test_images_that_agree_keep_the_identity() -> None:
     found = brightness(trained_on((1.0, 1.0, 1.0, 1.0)), 4)
     torch.testing.assert_close(found, torch.ones(4), atol=0.02, rtol=0)

@@ -1,0 +1,178 @@
+# ruff: noqa: E501  (a table, one mutation to a line)
+"""Breaks one place at a time and says which of the nearest tests notices: `python benchmarks/mutate.py [WORD]`.
+
+Run from a clean checkout; only places whose line holds WORD are tried. A file is changed for as long as its tests run,
+and restored whatever happens. A mutation that no test notices wants a test; one whose text is gone wants a new one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import hypothesis  # noqa: F401  here, so that each fork need not
+import pytest
+import scipy.spatial.transform  # noqa: F401
+import torch  # noqa: F401
+
+ROOT = Path(__file__).resolve().parents[1]
+MISSED = "NOT NOTICED"
+SECONDS = 240
+"""Tests that take longer have noticed: what is broken may never end."""
+
+# file, what is there once, what is put in its place, tests
+MUTATIONS = (
+    ("api/choose.py", "gains = [after - before", "gains = [before - after", "api/test_choose.py"),
+    ("api/choose.py", "settings.insert(0, Setting(", "settings.append(Setting(", "api/test_choose.py"),
+    ("api/choose.py", "base, moving = _at_rest(plain_config), best", "base, moving = best, _at_rest(plain_config)", "api/test_choose.py"),
+    ("api/choose.py", "base = best = best if moves else as_static(plain_config)", "base = best = as_static(plain_config) if moves else best", "api/test_choose.py"),
+    ("api/choose.py", "moves = fraction > MIN_DIFFERING", "moves = fraction < MIN_DIFFERING", "api/test_choose.py"),
+    ("splats/antimatter.py", "* 255).round()", "* 255)", "splats/test_formats.py"),
+    ("splats/antimatter.py", "* 128 + 128).round()", "* 128 + 128)", "splats/test_formats.py"),
+    ("splats/antimatter.py", "descending=True", "descending=False", "splats/test_formats.py"),
+    ("splats/spz.py", "_COLOUR_SCALE = 0.15", "_COLOUR_SCALE = 0.25", "splats/test_formats.py"),
+    ("splats/spz.py", "/ 16 - 10)", "/ 8 - 10)", "splats/test_formats.py"),
+    ("splats/spz.py", "- 128) / 128", "- 127) / 128", "splats/test_formats.py"),
+    ("splats/spz.py", "others < 0", "others > 0", "splats/test_formats.py"),
+    ("splats/gltf.py", '"colorSpace": "srgb_rec709_display"', '"colorSpace": "lin_rec709_display"', "splats/test_formats.py"),
+    ("splats/gltf.py", '("colorSpace", "srgb_rec709_display")', '("colorSpace", own.get("colorSpace"))', "splats/test_formats.py"),
+    ("splats/gltf.py", "((inside + 0.055) / 1.055) ** 2.4", "inside", "splats/test_formats.py"),
+    ("splats/compressed_ply.py", "_SH_RANGE = 8.0", "_SH_RANGE = 4.0", "splats/test_formats.py"),
+    ("splats/compressed_ply.py", "+ 0.5) / 256))", ") / 256))", "splats/test_formats.py"),
+    ("splats/compressed_ply.py", "_BITS_3 = (11, 10, 11)", "_BITS_3 = (10, 11, 11)", "splats/test_formats.py"),
+    ("splats/sog.py", "_MODE = 252", "_MODE = 250", "splats/test_formats.py"),
+    ("splats/packing.py", "* top + 0.5)", "* top)", "splats/test_formats.py"),
+    ("static/densify.py", "opaque = parameters.opacities >=", "opaque = parameters.opacities >", "static/test_densify.py"),
+    ("static/densify.py", "& (scale <= max_scale)", "& (scale < max_scale)", "static/test_densify.py"),
+    ("static/densify.py", "score >= options.grad_threshold", "score > options.grad_threshold", "static/test_densify.py"),
+    ("static/densify.py", "large = scale > DENSE_FRACTION * extent", "large = scale >= DENSE_FRACTION * extent", "static/test_densify.py"),
+    ("static/densify.py", "wanted & large & (scale / SPLIT_SHRINK <= max_scale)", "wanted & large", "static/test_densify.py"),
+    ("static/densify.py", "wanted & large & (scale / SPLIT_SHRINK <= max_scale)", "wanted & large & (scale <= max_scale)", "static/test_densify.py"),
+    ("static/densify.py", "wanted & ~large & survives", "wanted & ~large", "static/test_densify.py"),
+    ("static/densify.py", "torch.where(split & ~survives, 2, 1)", "torch.where(split, 1, 1)", "static/test_densify.py"),
+    ("static/densify.py", "step > self.schedule.prune_scale_after", "step >= self.schedule.prune_scale_after", "static/test_densify.py"),
+    ("static/densify.py", "DENSE_FRACTION = 0.01", "DENSE_FRACTION = 0.02", "static/test_densify.py"),
+    ("static/densify.py", "PRUNE_SCALE = 0.1", "PRUNE_SCALE = 0.2", "static/test_densify.py"),
+    ("static/mcmc.py", "opacities > self.options.min_opacity", "opacities < self.options.min_opacity", "static/test_mcmc.py"),
+    ("static/mcmc.py", "(1 + self.growth) * n", "(2 + self.growth) * n", "static/test_mcmc.py"),
+    ("static/mcmc.py", "NOISE_STEEPNESS = 100.0", "NOISE_STEEPNESS = -100.0", "static/test_mcmc.py"),
+    ("static/init.py", "EXTENT_MARGIN = 1.1", "EXTENT_MARGIN = 1.3", "static/test_init.py"),
+    ("static/init.py", "order[seen < min(MIN_VIEWS", "order[seen > min(MIN_VIEWS", "static/test_init.py data/test_scene_space.py"),
+    ("static/rates.py", "(1 - REWIND) * tuned", "REWIND * tuned", "static/test_rates.py"),
+    ("static/filters.py", "FILTER_VARIANCE = 0.2", "FILTER_VARIANCE = 0.3", "static/test_filters.py"),
+    ("gaussians/visibility.py", "self.bits[interval] | self.bits[interval + 1]", "self.bits[interval]", "gaussians/test_visibility.py"),
+    ("gaussians/parameters.py", "moved[~is_new] = x[source[~is_new]]", "moved[:] = x[source]", "gaussians/test_parameters.py"),
+    ("gaussians/parameters.py", "self.decay**progress if", "self.decay * progress if", "gaussians/test_parameters.py"),
+    ("deform/motion.py", "2 * longest *", "longest *", "deform/test_motion.py"),
+    ("deform/time_window.py", "oldest <= stray <= self.reach(step)", "oldest < stray <= self.reach(step)", "deform/test_time_window.py"),
+    ("deform/time_window.py", "step % 2 == 0", "step % 2 == 1", "deform/test_time_window.py"),
+    ("deform/trajectory.py", "k * time) / k, math.cos", "k * time), math.cos", "deform/test_trajectory.py"),
+    ("deform/still_error.py", "USUAL = 0.7", "USUAL = 0.3", "deform/test_still_error.py"),
+    ("deform/still_error.py", "gap = gap - gap.flatten(1)", "gap = gap - 0 * gap.flatten(1)", "deform/test_still_error.py"),
+    ("deform/scene.py", "rows = torch.nonzero(descent >= 0)", "rows = torch.nonzero(descent > 0)", "deform/test_scene.py"),
+    ("human/avatar/anchors.py", "kept / kept.sum(1, keepdim=True)", "kept", "human/avatar/test_anchors.py"),
+    ("human/avatar/anchors.py", "height == min(heights)", "height == max(heights)", "human/avatar/test_anchors.py"),
+    ("human/avatar/posing.py", "3 * z * z - 1", "3 * z * z", "human/avatar/test_posing.py human/avatar/test_scene.py"),
+    ("human/avatar/posing.py", "_pose_features(rotations)[1:]", "rotations[1:]", "human/avatar/test_posing.py human/avatar/test_scene.py"),
+    ("training/sampler.py", "self._position += 1", "self._position += 2", "training/test_sampler.py"),
+    ("training/schedule.py", "step / options.steps >= fraction", "step / options.steps > fraction", "training/test_schedule.py"),
+    ("training/schedule.py", "range(period, stop - period + 1, period)", "range(period, stop, period)", "training/test_schedule.py"),
+    ("training/schedule.py", "(1 - progress) * math.log(options.lr_means)", "progress * math.log(options.lr_means)", "training/test_schedule.py"),
+    ("training/corrections/exposure.py", "truth < SATURATED).all", "truth < 9).all", "training/corrections/test_exposure.py"),
+    ("training/corrections/exposure.py", "if step > self._begins + len(known)", "if step < 0", "training/corrections/test_exposure.py"),
+    ("training/corrections/exposure.py", "1 / MAX_GAIN, MAX_GAIN", "0, 1e9", "training/corrections/test_exposure.py"),
+    ("evaluate/regions.py", "kept = 1 - grown", "kept = (shown)[None, None].float()", "evaluate/test_regions.py"),
+    ("evaluate/regions.py", "~moves & inside", "~moves", "evaluate/test_regions.py"),
+    ("evaluate/temporal.py", "(after - now) / (after - before)", "(now - before) / (after - before)", "evaluate/test_temporal.py"),
+    ("evaluate/view_scores.py", "psnr(rendering.rgb[0], truth, weights[1])", "psnr(rendering.rgb[0], truth, weights[0])", "evaluate/test_view_scores.py"),
+    ("evaluate/view_scores.py", "rendering.transmittance[0][..., None] * background", "0 * background", "evaluate/test_view_scores.py"),
+    ("evaluate/tracks.py", "MIN_OPACITY = 0.3", "MIN_OPACITY = 0.0", "evaluate/test_tracks.py"),
+    ("evaluate/tracks.py", "np.minimum(np.nan_to_num(distance, nan=limit), limit)", "np.nan_to_num(distance, nan=limit)", "evaluate/test_tracks.py"),
+    ("prune/score.py", "VOLUME_POWER = 0.1", "VOLUME_POWER = -0.1", "prune/test_score.py"),
+    ("prune/score.py", "- 2 * profile", "- profile", "prune/test_score.py"),
+    ("prune/search.py", "max(self.loss, self.trained_loss)", "self.loss", "prune/test_search.py"),
+    ("prune/search.py", "keeps = tried.worst <= allowed", "keeps = tried.worst >= allowed", "prune/test_search.py"),
+    ("prune/floaters.py", "most > MAIN_FRACTION * total", "most < MAIN_FRACTION * total", "prune/test_floaters.py"),
+    ("prune/floaters.py", "count > MOST * before", "count > 10 * before", "prune/test_floaters.py"),
+    ("budget/count.py", "if count > self.most and", "if count > 2 * self.most and", "budget/test_count.py"),
+    ("budget/time.py", "AIM * given - now - self.refit_seconds - reserve", "AIM * given - now - self.refit_seconds", "budget/test_time.py"),
+    ("storage/quantize.py", "np.floor(np.abs(scaled) + rounding)", "np.floor(np.abs(scaled))", "storage/test_quantize.py"),
+    ("storage/quantize.py", "step / 8, 1 - step / 64", "step / 8, 1", "storage/test_quantize.py"),
+    ("storage/precision.py", "MOST_VISIBLE = 0.9", "MOST_VISIBLE = 0.1", "storage/test_precision.py"),
+    ("storage/precision.py", "octaves = -0.5 *", "octaves = -1.0 *", "storage/test_precision.py"),
+    ("storage/coding.py", "whole << 1 ^ whole >> 63", "whole << 1", "storage/test_coding.py"),
+    ("export/tracks.py", "positions += np.asarray(world_offset)", "positions -= np.asarray(world_offset)", "export/test_tracks.py"),
+    ("export/html/numbers.py", "np.where(step > 0, step, 1)", "np.where(step > 0, 2 * step, 1)", "export/html/test_numbers.py"),
+    ("export/html/numbers.py", "np.roll(quats, 1, axis=1)", "np.roll(quats, 2, axis=1)", "export/html/test_numbers.py export/html/test_page.py"),
+    ("runs/checkpoint.py", "[:-KEEP_CHECKPOINTS]", "[KEEP_CHECKPOINTS:]", "runs/test_checkpoint.py"),
+    ("runs/checkpoint.py", "if int(s) < step}", "if int(s) != step}", "runs/test_checkpoint.py"),
+    ("runs/lock.py", "fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "runs/test_lock.py"),
+    ("runs/folder.py", "if not same or checkpoint_paths(folder)", "if not same", "runs/test_folder.py"),
+    ("runs/folder.py", "RunConfig(seed=c.run.seed)", "RunConfig()", "runs/test_folder.py"),
+    ("files/limits.py", "amount > most and amount > allowed(most)", "amount > most", "files/test_limits.py"),
+    ("files/containment.py", "real_root.rstrip(os.sep) + os.sep", "real_root.rstrip(os.sep)", "files/test_containment.py"),
+    ("files/containment.py", "max(channels / 4, 1)", "1", "files/test_containment.py"),
+    ("files/outputs.py", "if out.is_dir():\n            self._require_no_links(out)", "if False:\n            self._require_no_links(out)", "files/test_outputs.py"),
+    ("data/geometry.py", "error > ROTATION_TOLERANCE or determinant <= 0", "error > ROTATION_TOLERANCE", "data/test_geometry.py data/readers/test_blender.py"),
+    ("data/geometry.py", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.diag([1.0, 1.0, 1.0, 1.0])", "data/readers/test_blender.py"),
+    ("data/scene_space.py", "1 / far + unit[:, 3] * (1 / near - 1 / far)", "1 / near + unit[:, 3] * (1 / near - 1 / far)", "data/test_scene_space.py"),
+    ("data/scene_space.py", "capture.world_offset + offset", "capture.world_offset - offset", "data/test_scene_space.py"),
+    ("data/times.py", "max(gaps) < _EVEN * min(gaps)", "max(gaps) >= min(gaps)", "data/test_times.py"),
+    ("data/times.py", "len({known.get(view.name) for view in seen} - {None}) == len(seen)", "True", "data/test_times.py"),
+    ("data/images/lens.py", "(2 * power + 1) * k", "(2 * power) * k", "data/images/test_lens.py"),
+    ("data/images/lens.py", "k1, k2, _, _, k3", "k1, k2, k3, _, _", "data/images/test_lens.py"),
+    ("data/readers/colmap.py", "fx, fy = values[0], values[num_focal - 1]", "fx, fy = values[0], values[0]", "data/readers/test_colmap.py"),
+    ("camera_paths/keyframes.py", "slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]", "slopes[:-1] * steps[:-1] + slopes[1:] * steps[1:]", "camera_paths/test_keyframes.py"),
+    ("camera_paths/keyframes.py", "np.exp(np.interp(t, knots, np.log(", "(np.interp(t, knots, (", "camera_paths/test_keyframes.py"),
+    ("camera_paths/aim.py", "values[0] < _LEVEL**2", "values[0] < 9", "camera_paths/test_aim.py camera_paths/test_orbit.py"),
+    ("camera_paths/orbit.py", "-np.sin(turns * phase)", "np.sin(turns * phase)", "camera_paths/test_orbit.py"),
+    ("camera_paths/along.py", "order = np.argsort(np.asarray(times, np.float64))", "order = np.arange(len(times))", "camera_paths/test_along.py"),
+)  # fmt: skip
+
+
+def outcome(tests: str) -> str:
+    """Return the first test that fails, or what else happened; in a fork, which has all packages but this one."""
+    with tempfile.TemporaryFile("w+") as output:
+        child = os.fork()
+        if child == 0:
+            os.dup2(output.fileno(), 1)
+            signal.alarm(SECONDS)
+            os.chdir(ROOT)
+            os._exit(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *(f"tests/{path}" for path in tests.split())]))
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        output.seek(0)
+        failed = [line for line in output if line.startswith(("FAILED", "ERROR"))]
+    if status == -signal.SIGALRM:
+        return "takes too long"
+    return failed[0].strip().split(" - ")[0] if failed else MISSED if status == 0 else f"ended with {status}"
+
+
+def main() -> int:
+    """Try all mutations and return how many were not noticed."""
+    sys.dont_write_bytecode = True
+    missed, word = 0, sys.argv[1] if len(sys.argv) > 1 else ""
+    for name, old, new, tests in MUTATIONS:
+        if word not in f"{name} {old} {tests}":
+            continue
+        path, begun = ROOT / "dyngs" / name, time.monotonic()
+        text = path.read_text(encoding="utf-8")
+        if text.count(old) != 1:
+            print(f"{name}: {old!r} is there {text.count(old)} times: GONE", flush=True)
+            missed += 1
+            continue
+        try:
+            path.write_text(text.replace(old, new), encoding="utf-8")
+            found = outcome(tests)
+        finally:
+            path.write_text(text, encoding="utf-8")
+        missed += found == MISSED
+        print(f"{name}: {old!r} -> {new!r}: {found} ({time.monotonic() - begun:.0f} s)", flush=True)
+    return missed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

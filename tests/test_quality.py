@@ -1,0 +1,122 @@
+"""Quality of short trainings, through what a user calls: PSNR of held-out views, motion, never worse than static.
+
+Floors are 0.3 dB below what was measured, which stands beside them: instruction sets differ by up to 0.15 dB.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import dyngs
+from dyngs.cli import main
+from dyngs.config.io import load_resolved
+from dyngs.evaluate.report import EvalReport, evaluate_run
+
+SMALL = ("init.num_random=2000", "strategy.max_gaussians=6000")
+
+
+@dataclass(frozen=True)
+class Captured:
+    """A synthetic capture, and a place for runs on it."""
+
+    root: Path
+
+    @staticmethod
+    def of(folder: Path, *words: str) -> Captured:
+        """The capture of ``dyngs data synth``."""
+        assert main(["data", "synth", *words, str(folder / "capture")]) == 0
+        return Captured(folder)
+
+    def keys(self, name: str, *keys: str) -> list[str]:
+        return [f"data.root={self.root / 'capture'}", f"run.dir={self.root / name}", "run.threads=1", *SMALL, *keys]
+
+    def trained(self, preset: str, *keys: str) -> Path:
+        return dyngs.train(dyngs.load_config(preset, self.keys(preset, *keys)))
+
+    def report(self, preset: str, *keys: str) -> EvalReport:
+        return evaluate_run(self.trained(preset, *keys))
+
+
+@pytest.fixture(scope="module")
+def still_life(tmp_path_factory: pytest.TempPathFactory) -> Captured:
+    return Captured.of(tmp_path_factory.mktemp("still"), "still", "--size", "64", "--views", "24")
+
+
+def test_a_static_scene(still_life: Captured) -> None:
+    assert still_life.report("static", "train.steps=800").psnr > 25.1  # 25.48
+
+
+def test_a_static_scene_by_mcmc(still_life: Captured) -> None:
+    assert still_life.report("static_mcmc", "train.steps=400").psnr > 19.9  # 20.24
+
+
+def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
+    """With all decisions on: the scene ends moving, follows its material points, and is no worse than a static one."""
+    captured = Captured.of(tmp_path, "wave", "--size", "32", "--views", "32")
+    keys = ("train.steps=700", "init.num_random=1000", "strategy.max_gaussians=1500", "train.initial_downscale=1")
+    moving, static = (captured.report(preset, *keys) for preset in ("dynamic", "static"))
+    assert moving.moving_fraction > 0.9
+    assert moving.psnr > 21.6  # 21.91
+    assert moving.psnr > static.psnr - 0.15  # 21.83; with another instruction set 21.88 beside it
+    assert moving.psnr_moving is not None
+    assert static.psnr_moving is not None
+    assert moving.psnr_moving > max(17.2, static.psnr_moving + 1)  # 17.49, 15.98
+    assert moving.track_error_px is not None
+    assert moving.track_motion_px is not None
+    assert moving.track_error_px < 0.75 * moving.track_motion_px  # 0.656, 0.972
+
+
+def test_a_person(tmp_path: Path) -> None:
+    """In the box of the person: in poses that were seen, and in those of a clip that was not."""
+    captured = Captured.of(tmp_path, "human", "--size", "64", "--views", "6", "--cameras", "4")
+    keys = [key for key in captured.keys("human") if key not in SMALL]
+    run = dyngs.train(dyngs.load_config("human", [*keys, "train.steps=200", "model.resolution=48"]))
+    floors = {"test": 22.5, "pose": 22.0}  # 22.85, 22.29
+    found = {split: evaluate_run(run, split).psnr_person or 0.0 for split in floors}
+    assert {split: psnr for split, psnr in found.items() if psnr <= floors[split]} == {}
+
+
+def test_what_stays_before_fixed_cameras_is_trained_as_static(still_life: Captured, tmp_path: Path) -> None:
+    """The same bytes as by the static preset, though the dynamic one was asked for."""
+    source, target = still_life.root / "capture", tmp_path / "capture"
+    shutil.copytree(source, target)
+    described = json.loads((source / "transforms_train.json").read_text())
+    frames = []
+    for frame in described["frames"][:3]:
+        for k in range(6):
+            name = f"{frame['file_path']}_{k}"
+            shutil.copy(source / f"{frame['file_path']}.png", target / f"{name}.png")
+            frames.append(frame | {"file_path": name, "time": k / 5})
+    (target / "transforms_train.json").write_text(json.dumps(described | {"frames": frames}))
+    (target / "transforms_test.json").unlink()
+    captured = Captured(tmp_path)
+    runs = [captured.trained(preset, "train.steps=20") for preset in ("dynamic", "static")]
+    assert load_resolved(runs[0]).model.kind == "static"
+    assert checkpoint_bytes(runs[0]) == checkpoint_bytes(runs[1])
+
+
+def test_what_moves_before_fixed_cameras_is_trained_as_moving(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = Captured.of(tmp_path, "room", "--size", "32", "--views", "6", "--cameras", "3")
+    run = room.trained("dynamic", "train.steps=20")
+    assert load_resolved(run).model.kind == "dynamic"
+    assert "something moves" in capsys.readouterr().out
+
+
+def test_the_command_trains_the_same_bytes_as_python(still_life: Captured) -> None:
+    keys = still_life.keys("by_command", "train.steps=100")
+    assert main(["train", "static", *keys]) == 0
+    by_python = dyngs.train(dyngs.load_config("static", still_life.keys("by_python", "train.steps=100")))
+    assert checkpoint_bytes(still_life.root / "by_command") == checkpoint_bytes(by_python)
+
+
+def checkpoint_bytes(run: Path) -> bytes:
+    """The only checkpoint of a run."""
+    (path,) = (run / "checkpoints").iterdir()
+    return path.read_bytes()
