@@ -22,6 +22,10 @@ class DyngsError(Exception):
         return printable(super().__str__())
 
 
+class NoCaptureError(DyngsError):
+    """There is no folder where a capture should be: it may have been moved."""
+
+
 @contextmanager
 def reading(path: str | os.PathLike[str], advice: str = "copy or export it again") -> Generator[None]:
     """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first error as its cause.

@@ -23,6 +23,7 @@ from dyngs.budget.time import Deadline, first_fit, refitted
 from dyngs.build import build
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.data.read import require_folder
 from dyngs.errors import DyngsError, as_word
 from dyngs.evaluate.report import evaluate_run
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
@@ -48,6 +49,7 @@ from dyngs.runs.folder import (
     default_folder,
     is_done,
     note_asked,
+    note_root,
     require_startable,
     tidy,
     was_only_begun,
@@ -121,6 +123,8 @@ def train(
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with writing(folder) as is_sole_writer, kernel_threads(threads), bytewise:
         tidy(folder, sole_writer=is_sole_writer)
+        if resume_from is not None:
+            note_root(folder, config.data)
         if resume_from is None and is_done(folder, config) and not _owes_file(config, folder):
             print(_told_again(config, folder), flush=True)
             return folder
@@ -375,6 +379,7 @@ def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -
             f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give another run.dir, and "
             "begin with so many steps"
         )
+    require_folder(stored.data.root)
     done = resumed.info.step
     longer = with_length(stored, done, steps)
     print(told(stored, longer, done), flush=True)

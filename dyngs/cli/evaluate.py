@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_device, computing_device, input_path, threads
+from dyngs.cli.arguments import add_data_root, add_device, computing_device, data_root, input_path, threads
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,6 +29,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     add_device(parser)
+    add_data_root(parser)
     parser.add_argument(
         "--refine",
         action="store_true",
@@ -56,6 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         threads=arguments.threads,
         refine_poses=arguments.refine,
         device=computing_device(arguments.device).type,
+        data_root=data_root(arguments),
     )
     Console().print(report_table(report))
     for note in report.notes:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import is_avatar_file, print_notes
+from dyngs.cli.arguments import data_root, is_avatar_file, print_notes
 from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def export_cameras(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{source}: an avatar file has no cameras; give a run")
     out: Path = arguments.out or source / "cameras"
     path = out if out.suffix.lower() == ".json" else out / NAME
-    run = load_run(source)
+    run = load_run(source, data_root(arguments))
     capture = read_capture(run.config.data)
     if path.resolve().parent == capture.root.resolve():
         raise DyngsError(f"{path}: would stand in for the cameras of the capture; give another folder")
