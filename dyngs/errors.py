@@ -81,6 +81,11 @@ def as_word(path: str | os.PathLike[str]) -> str:
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with what it counts, for people: "1 image", "1,200 images"."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def printable(text: str, length: int | None = None) -> str:
     """``text`` on one line, what a terminal would obey or cannot show as escapes, with ``...`` beyond ``length``."""
     line = " ".join(text.split())

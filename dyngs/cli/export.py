@@ -17,7 +17,7 @@ from dyngs.cli.arguments import (
     scene_time,
 )
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, known_suffix, print_redrawn
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
     from dyngs.export.redrawn import Redrawn
@@ -314,5 +314,7 @@ def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[f
     part = "moving" if arguments.dynamic else "all"
     tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)
     count, moments, _ = tracks.positions.shape
-    print_notes((f"{count:,} Gaussians, {int(tracks.moving.sum()):,} of them moving, at {moments} times",))
+    print_notes(
+        (f"{counted(count, 'Gaussian')}, {int(tracks.moving.sum()):,} of them moving, at {counted(moments, 'time')}",)
+    )
     return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]

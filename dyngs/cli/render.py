@@ -23,7 +23,7 @@ from dyngs.cli.arguments import (
     threads,
 )
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Render and print which files were written."""
     written = _render(_checked(arguments))
     folders = sorted({str(path.parent) for path in written})
-    print(f"written: {len(written)} file{'s' * (len(written) != 1)} in {', '.join(folders)}")
+    print(f"written: {counted(len(written), 'file')} in {', '.join(folders)}")
     for path in written:
         if path.suffix == ".mp4" or path.name == "sheet.png":
             print(f"         {path}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli.arguments import add_run_device, computing_device, input_path, run_device
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
-from dyngs.errors import DyngsError, as_word
+from dyngs.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -173,7 +173,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
         return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_static:
         return [f"motion:  nothing moves by {limit:g} px or more, so this became a static model"]
-    return [f"motion:  {len(scene.rows):,} of {len(scene):,} Gaussians move ({scene.moving_fraction:.1%})"]
+    return [f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"]
 
 
 def parse_config(words: Sequence[str], resume: Path | None) -> Config:
