@@ -305,7 +305,7 @@ def test_export_accepts_every_suffix_that_its_help_names(capsys: Capture) -> Non
     motions = re.search(r"motion for a person: (.*?)--max", text, re.DOTALL)
     assert motions is not None
     others = {".kind", ".js", ".root"}  # model.kind, three.js, data.root
-    found = set(re.findall(r"(?<=[\w ])\.[a-z0-9]\w+", text.replace(motions[1], ""))) - others
+    found = set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
     assert {".ply", ".spz", ".4dgs", ".safetensors", ".html"} <= found
     for suffix in found:
         arguments = argparse.Namespace(out=Path(f"x{suffix}"), format=None, times=None, motion=None, time=None)
