@@ -13,7 +13,7 @@ from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.chosen_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
@@ -156,7 +156,9 @@ def result_table(result: DemoResult) -> Table:
     from rich.table import Table
 
     report = result.report
-    table = Table(title=f"{report.num_views} test views of {report.width}x{report.height}, {report.step} steps")
+    table = Table(
+        title=f"{counted(report.num_views, 'test view')} of {report.width}x{report.height}, {report.step} steps"
+    )
     cells = {
         "PSNR dB": f"{report.psnr:.2f}",
         "SSIM": f"{report.ssim:.4f}",

@@ -22,6 +22,10 @@ class DyngsError(Exception):
         return printable(super().__str__())
 
 
+class NoCaptureError(DyngsError):
+    """There is no folder where a capture should be: it may have been moved."""
+
+
 @contextmanager
 def reading(path: str | os.PathLike[str], advice: str = "copy or export it again") -> Generator[None]:
     """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first error as its cause.
@@ -75,6 +79,11 @@ def as_word(path: str | os.PathLike[str]) -> str:
     """Return a path as a word of a command that can be copied to a shell, whatever characters it holds."""
     text = os.fspath(path)
     return shlex.quote(f"./{text}" if text.startswith("-") else text)
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with what it counts, for people: "1 image", "1,200 images"."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def printable(text: str, length: int | None = None) -> str:

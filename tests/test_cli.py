@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ import torch
 from moving_scene import moved_x, write_moving_run
 
 import dyngs
-from dyngs.cli import doctor, main
+from dyngs.cli import doctor, export, main
 from dyngs.cli.train import parse_config
 from dyngs.config.io import load_config, save_config
 from dyngs.errors import DyngsError, reading
@@ -265,6 +266,50 @@ def test_a_full_disk_gets_no_traceback() -> None:
     assert done.returncode == 2
     assert done.stderr.startswith("dyngs: error: No space left on device")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes a file descriptor in a shell")
+@pytest.mark.parametrize("command", ["docs cli >&-", "config static >&-", "config static | head -n 1", "--help >&-"])
+def test_output_that_nobody_takes_gets_no_traceback(command: str) -> None:
+    line = f"'{sys.executable}' -m dyngs {command}"
+    done = subprocess.run(line, shell=True, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends a signal")
+def test_ctrl_c_at_any_time_of_the_start_gets_no_traceback(capture: Path, tmp_path: Path) -> None:
+    """While dyngs and torch are imported, and in the first steps; a shell sees 130 each time."""
+    words = ["train", "static", f"data.root={capture}", f"run.dir={tmp_path / 'run'}", "train.steps=100000"]
+    command = [sys.executable, "-m", "dyngs", *words]
+    for wait in (0.5, 0.8, 1.2, 2.0, 3.0):
+        process = subprocess.Popen(
+            command,
+            env=ENVIRONMENT,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # tests in the background ignore it
+        )
+        time.sleep(wait)
+        process.send_signal(signal.SIGINT)
+        try:
+            error = process.communicate(timeout=60)[1].decode()
+        finally:
+            process.kill()
+        assert "Traceback" not in error, f"after {wait} s: {error}"
+        assert process.returncode in (130, -signal.SIGINT)
+
+
+def test_export_accepts_every_suffix_that_its_help_names(capsys: Capture) -> None:
+    assert main(["export", "--help"]) == 0
+    text = capsys.readouterr().out
+    motions = re.search(r"motion for a person: (.*?)--max", text, re.DOTALL)
+    assert motions is not None
+    others = {".kind", ".js", ".root"}  # model.kind, three.js, data.root
+    found = set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
+    assert {".ply", ".spz", ".4dgs", ".safetensors", ".html"} <= found
+    for suffix in found:
+        arguments = argparse.Namespace(out=Path(f"x{suffix}"), format=None, times=None, motion=None, time=None)
+        assert export._kind(arguments)
 
 
 # ---------------------------------------------------------------------------------------------------- train's words

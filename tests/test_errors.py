@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.errors import DyngsError, printable, reading, reason, require_regular
+from dyngs.errors import DyngsError, counted, printable, reading, reason, require_regular
 from dyngs.files.fields import read_json_object
 from dyngs.files.tensor_file import FileKind, read_tensors
 from dyngs.runs.checkpoint import seconds_at
@@ -108,3 +108,7 @@ def test_pipes_in_captures_and_runs_stop_nobody(tmp_path: Path) -> None:
         with pytest.raises(DyngsError, match="is no file but a pipe"):
             read(tmp_path / "transforms.json")
     assert seconds_at(tmp_path, 1) == 0
+
+
+def test_what_is_counted() -> None:
+    assert [counted(n, "image") for n in (0, 1, 2, 1200)] == ["0 images", "1 image", "2 images", "1,200 images"]

@@ -16,7 +16,7 @@ from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.config.kinds import network_of, person_of
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import read_capture
+from dyngs.data.read import read_capture, require_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
@@ -86,6 +86,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     config = _config_from(run_dir, start, out, overrides)
     if not config.prune.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
+    require_folder(config.data.root)
     with new_folder(out) as started:
         _copy_start(run_dir, started)
         save_checkpoint(started, start, 0.0)

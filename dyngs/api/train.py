@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import count as counted_from
 from pathlib import Path
 from typing import Protocol
 
@@ -23,6 +24,7 @@ from dyngs.budget.time import Deadline, first_fit, refitted
 from dyngs.build import build
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.data.read import require_folder
 from dyngs.errors import DyngsError, as_word
 from dyngs.evaluate.report import evaluate_run
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
@@ -40,6 +42,7 @@ from dyngs.runs.checkpoint import (
     seconds_at,
     step_of,
 )
+from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import (
     ASKED_NAME,
     EXPORT_FOLDER,
@@ -48,12 +51,13 @@ from dyngs.runs.folder import (
     default_folder,
     is_done,
     note_asked,
+    note_root,
     require_startable,
     tidy,
     was_only_begun,
 )
 from dyngs.runs.inputs import inputs_of
-from dyngs.runs.lock import writing
+from dyngs.runs.lock import Held, writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
 from dyngs.training.clock import Stopwatch
@@ -119,8 +123,10 @@ def train(
     keep_freed_memory()
     threads = config.run.threads or max(1, num_cores() // processes.local_size)
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
-    with writing(folder) as is_sole_writer, kernel_threads(threads), bytewise:
-        tidy(folder, sole_writer=is_sole_writer)
+    with writing(folder) as held, kernel_threads(threads), bytewise:
+        tidy(folder, sole_writer=held.alone)
+        if resume_from is not None:
+            note_root(folder, config.data)
         if resume_from is None and is_done(folder, config) and not _owes_file(config, folder):
             print(_told_again(config, folder), flush=True)
             return folder
@@ -134,10 +140,11 @@ def train(
         choices = []
         if resumed is None:
             config, choices = choose(config)
-        run = _Run(config, folder, resumed, asked, processes=processes, threads=threads)
+        run = _Run(config, folder, resumed, asked, held=held, processes=processes, threads=threads)
         if choices:
-            write_choices(folder, choices)
+            write_choices(run.folder, choices)
         run.run(listeners)
+        folder = run.folder
         note_asked(folder, asked)
     return folder
 
@@ -159,6 +166,7 @@ class _Run:
         folder: of the run.
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen.
+        held: the lock of the folder, which knows where that is if it is renamed.
         processes: that this one leads.
         threads: of the kernels in each of them.
     """
@@ -170,6 +178,7 @@ class _Run:
         resumed: Checkpoint | None,
         asked: Config,
         *,
+        held: Held,
         processes: Processes,
         threads: int,
     ) -> None:
@@ -177,8 +186,9 @@ class _Run:
         if resumed is None:
             require_room(config)
         built = build(config, restored=resumed is not None)
+        self._held = held
         self.folder, self.limits = folder, dict[str, Limit]()
-        self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
+        self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(self.folder))
         self._leader = Leader(processes, config, threads)
         self.loop.before_step = self._leader.before_step
         if resumed is not None:
@@ -193,9 +203,10 @@ class _Run:
         self._meter: CostMeter | None = None
         if self.limited is not None:
             self._set_limits(self.limited, resumed)
+        self._follow(held.folder() or folder)
         if resumed is None:
-            begin(folder, self.config)
-            note_asked(folder, asked)
+            begin(self.folder, self.config)
+            note_asked(self.folder, asked)
 
     @property
     def config(self) -> Config:
@@ -225,6 +236,7 @@ class _Run:
                 if limited is not None:
                     limited.trainer.images.rest()
             if loop.trainer.done < loop.total:
+                self._follow(self._held.folder() or self.folder)
                 if loop.trainer.done > self._saved:
                     self._save()
                 raise KeyboardInterrupt(
@@ -284,9 +296,25 @@ class _Run:
         for part, limit in self.limits.items():
             kept = {f"{part}.{name}": x for name, x in limit.state().items()}
             checkpoint = replace(checkpoint, tensors=checkpoint.tensors | kept)
+        found = self._held.folder()
+        self._follow(found or _free(self.folder))
+        if found is None:
+            write_config(self.config, self.folder)
         path = save_checkpoint(self.folder, checkpoint, self.loop.watch.seconds)
+        if found is None:
+            done, again = self.loop.trainer.done, f"dyngs train --resume {as_word(self.folder)}"
+            raise DyngsError(
+                f"the folder of the run was removed, or moved to another disk; the checkpoint after step {done} is in "
+                f"{self.folder}; go on with `{again}`"
+            )
         self._saved = self.loop.trainer.done
         self.loop.tell(Saved(self._saved, path))
+
+    def _follow(self, folder: Path) -> None:
+        """Go on in ``folder``, which that of the run is called by now."""
+        self.folder = folder
+        if self.limited is not None:
+            self.limited.folder = folder
 
     def _evaluate(self, step: int) -> None:
         """Tell the scores of the test split."""
@@ -333,6 +361,12 @@ def _tell_memory(trainer: Trainer, processes: int) -> None:
             print(f"dyngs: warning: {warning}", file=sys.stderr, flush=True)
 
 
+def _free(folder: Path) -> Path:
+    """Return ``folder`` if nothing is there, else one of a similar name."""
+    names = (folder.with_name(f"{folder.name}_{number}") for number in counted_from(2))
+    return folder if not os.path.lexists(folder) else next(path for path in names if not os.path.lexists(path))
+
+
 def _is_done_and_read_only(config: Config, folder: Path) -> bool:
     """Return whether nothing is to be done in the run folder, and nothing can be."""
     paths = checkpoint_paths(folder)
@@ -375,6 +409,7 @@ def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -
             f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give another run.dir, and "
             "begin with so many steps"
         )
+    require_folder(stored.data.root)
     done = resumed.info.step
     longer = with_length(stored, done, steps)
     print(told(stored, longer, done), flush=True)

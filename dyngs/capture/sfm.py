@@ -35,7 +35,7 @@ from dyngs.data.images.images import read_header
 from dyngs.data.images.video import frame_seconds, read_frames, read_numbered_frames
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import write_seconds
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.fields import read_json_object
 from dyngs.files.outputs import require_new_folder
@@ -123,7 +123,7 @@ def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: 
             images = _Images(gathered, is_video=False, notes=left_out)
     photos = images.photos
     if len(photos) < 3:
-        found = "; ".join((f"{source} has {len(photos)} image{'s' * (len(photos) != 1)}", *images.notes))
+        found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *images.notes))
         raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
     with quiet_colmap(options.seed):
         with nullcontext() if options.masks is None else staying_within(options.masks, options.follow_links):
@@ -218,10 +218,10 @@ def _mapped(work: Path, features: FeatureTask, first: Mapper, report: ReportProg
             second = mapped(replace(task, database=still), options.mapper)
             best = better(model, second)
             if best is second and second is not None:
-                before = "none" if model is None else f"{model.registered} images, {model.error_px:.2f} px"
+                before = "none" if model is None else f"{counted(model.registered, 'image')}, {model.error_px:.2f} px"
                 notes = (
                     f"{fraction:.0%} of the features move with something else than the scene and were left out: "
-                    f"{second.registered} images, {second.error_px:.2f} px; with them {before}",
+                    f"{counted(second.registered, 'image')}, {second.error_px:.2f} px; with them {before}",
                 )
             model = best
     if model is None:

@@ -14,6 +14,7 @@ import errno
 import io
 import os
 import re
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -40,7 +41,7 @@ from dyngs.cli import (
     view,
 )
 from dyngs.cli.arguments import require_outputs_apart
-from dyngs.errors import DyngsError, printable, require_name
+from dyngs.errors import DyngsError, NoCaptureError, printable, require_name
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -113,7 +114,17 @@ def _dispatch(arguments: list[str]) -> int:
         parser.print_help()
         return 0
     require_outputs_apart(parsed.parser, parsed)
-    return parsed.run(parsed)
+    try:
+        return parsed.run(parsed)
+    except NoCaptureError as error:
+        if not (getattr(parsed, "takes_root", False) or getattr(parsed, "resume", None)) or _names_root(parsed):
+            raise
+        again = shlex.join(["dyngs", *arguments, "data.root=FOLDER"])
+        raise DyngsError(f"{error}; if it was moved: `{again}`") from error
+
+
+def _names_root(parsed: argparse.Namespace) -> bool:
+    return any(word.partition("=")[0].strip() == "data.root" for word in parsed.overrides)
 
 
 def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:

@@ -159,6 +159,32 @@ def run_of_scene_file(path: Path) -> Path:
     return path.parent
 
 
+def add_data_root(parser: argparse.ArgumentParser) -> None:
+    """Add ``data.root=FOLDER`` to a command that reads the capture of a run."""
+    parser.add_argument(
+        "overrides", nargs="*", default=[], metavar="data.root=FOLDER", help="where the capture of the run lies by now"
+    )
+    parser.set_defaults(takes_root=True)
+
+
+def data_root(arguments: argparse.Namespace) -> Path | None:
+    """Return the folder of ``add_data_root``; None: the capture was not moved.
+
+    Raises:
+        DyngsError: another word.
+    """
+    found = None
+    for word in arguments.overrides:
+        key, equals, value = word.partition("=")
+        if key.strip() != "data.root" or not equals or not value.strip():
+            raise DyngsError(
+                f"{word!r}: the run keeps its own configuration; only data.root=FOLDER, where its capture was moved "
+                "to, may be given"
+            )
+        found = Path(value.strip())
+    return found
+
+
 def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
     """Print notes to stdout and warnings to stderr."""
     for note in notes:

@@ -6,6 +6,7 @@ import argparse
 
 from dyngs.cli.arguments import input_path, output_path, print_notes
 from dyngs.cli.splats import add_axes, print_redrawn
+from dyngs.errors import counted
 
 _EPILOG = """\
 examples:
@@ -44,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         splat = replace(splat, up=arguments.from_up)
     turned = upright(splat, arguments.up, arguments.target)
     said = f"up is {turned.up} in the file" + (f", it was {splat.up}" if turned.up != splat.up else ", as it was")
-    print_notes((*splat.notes, f"{len(splat.gaussians):,} Gaussians; {said}"))
+    print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
     written = write_splats(arguments.target, turned, sh_degree=arguments.sh_degree)
     print_redrawn(written.notes, [compare_splats(splat, written)])
     print(f"written: {written.path} ({written.path.stat().st_size / 1e6:.1f} MB)")

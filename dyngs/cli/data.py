@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import data_fit
 from dyngs.cli.arguments import data_section, input_path, output_path, threads
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
     from dyngs.config import DataConfig
@@ -263,7 +263,7 @@ def _summary(motion: Motion) -> str:
     turning = int(((motion.poses - motion.poses[:1]).norm(dim=-1).amax(0) > 1e-3).sum())
     speeds = motion.trans.diff(dim=0).norm(dim=-1) * motion.fps
     speed = speeds.max().item() if count > 1 else 0.0
-    length = f"{count} frame{'s' * (count != 1)}, {(count - 1) / motion.fps:.2f} s at {motion.fps:g} frames per second"
+    length = f"{counted(count, 'frame')}, {(count - 1) / motion.fps:.2f} s at {motion.fps:g} frames per second"
     return f"{length}; {turning} of {joints} joints turn, the root moves at up to {speed:.2f} m/s"
 
 

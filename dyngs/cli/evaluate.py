@@ -6,7 +6,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_device, computing_device, input_path, threads
+from dyngs.cli.arguments import add_data_root, add_device, computing_device, data_root, input_path, threads
+from dyngs.errors import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,6 +30,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     add_device(parser)
+    add_data_root(parser)
     parser.add_argument(
         "--refine",
         action="store_true",
@@ -56,6 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
         threads=arguments.threads,
         refine_poses=arguments.refine,
         device=computing_device(arguments.device).type,
+        data_root=data_root(arguments),
     )
     Console().print(report_table(report))
     for note in report.notes:
@@ -69,9 +72,7 @@ def report_table(report: EvalReport) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(
-        "metric", "value", title=f"{report.num_views} view{'s' * (report.num_views != 1)} of the {report.split} split"
-    )
+    table = Table("metric", "value", title=f"{counted(report.num_views, 'view')} of the {report.split} split")
     table.add_row("PSNR", f"{report.psnr:.2f} dB")
     if report.psnr_right is not None and report.psnr_right_fitted is not None:
         right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
@@ -101,7 +102,7 @@ def report_table(report: EvalReport) -> Table:
     table.add_row("model", f"{stored}{report.model_mb:.1f} MB{field}")
     table.add_row("colour", f"{report.colour_floats:.1f} numbers per Gaussian")
     table.add_row("rendering", f"{report.fps:.1f} frames/s{deforming}")
-    table.add_row("training", f"{report.step:,} steps in {report.seconds_train:.0f} s")
+    table.add_row("training", f"{counted(report.step, 'step')} in {report.seconds_train:.0f} s")
     return table
 
 
@@ -145,7 +146,7 @@ def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
     worst = min(report.psnr_per_time, key=lambda at: at.psnr)
     low, mean, high = min(values), sum(values) / len(values), max(values)
     spread = f"min {low:.2f}, mean {mean:.2f}, max {high:.2f} dB; worst at time {worst.time:g}"
-    rows = [(f"PSNR at {len(values)} times", spread)]
+    rows = [(f"PSNR at {counted(len(values), 'time')}", spread)]
     for label, name, value in (
         ("flicker", "flicker", report.flicker),
         ("flicker error", "flicker_error", report.flicker_error),

@@ -6,9 +6,18 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import input_path, is_avatar_file, output_path, print_notes, run_of_scene_file, scene_time
+from dyngs.cli.arguments import (
+    add_data_root,
+    data_root,
+    input_path,
+    is_avatar_file,
+    output_path,
+    print_notes,
+    run_of_scene_file,
+    scene_time,
+)
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, known_suffix, print_redrawn
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
     from dyngs.export.redrawn import Redrawn
@@ -82,6 +91,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
     part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
+    add_data_root(parser)
     parser.set_defaults(run=run)
 
 
@@ -123,7 +133,7 @@ def run(arguments: argparse.Namespace) -> int:
     if kind == "tracks" and arguments.static:
         raise DyngsError("--static goes with --format ply; Gaussians that never move have no tracks")
     times = _times(arguments)
-    opened = open_scene(arguments.run_dir)
+    opened = open_scene(arguments.run_dir, data_root=data_root(arguments))
     if arguments.motion is not None:
         opened = opened.in_motion(arguments.motion)
         times = opened.scene.times if times is None else times
@@ -186,10 +196,13 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
         raise DyngsError(
             f"{out}: --format dyngs writes a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
         )
-    written = write_scene_file(arguments.run_dir, out, max_change)
+    written = write_scene_file(arguments.run_dir, out, max_change, data_root=data_root(arguments))
     change = written.precision.change
     if change is None:
-        warning = "the capture cannot be read: quantisation steps are fixed, and the change of images is not measured"
+        warning = (
+            "the capture cannot be read: quantisation steps are fixed, and the change of images is not measured; if it "
+            "was moved, add data.root=FOLDER"
+        )
         print_notes((), (warning,))
     else:
         note = f"images change by {change:.2f} grey levels of 255 (root mean square over some training views)"
@@ -301,5 +314,7 @@ def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[f
     part = "moving" if arguments.dynamic else "all"
     tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)
     count, moments, _ = tracks.positions.shape
-    print_notes((f"{count:,} Gaussians, {int(tracks.moving.sum()):,} of them moving, at {moments} times",))
+    print_notes(
+        (f"{counted(count, 'Gaussian')}, {int(tracks.moving.sum()):,} of them moving, at {counted(moments, 'time')}",)
+    )
     return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]

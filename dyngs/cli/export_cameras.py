@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import is_avatar_file, print_notes
-from dyngs.errors import DyngsError, as_word
+from dyngs.cli.arguments import data_root, is_avatar_file, print_notes
+from dyngs.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
@@ -37,7 +37,7 @@ def export_cameras(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{source}: an avatar file has no cameras; give a run")
     out: Path = arguments.out or source / "cameras"
     path = out if out.suffix.lower() == ".json" else out / NAME
-    run = load_run(source)
+    run = load_run(source, data_root(arguments))
     capture = read_capture(run.config.data)
     if path.resolve().parent == capture.root.resolve():
         raise DyngsError(f"{path}: would stand in for the cameras of the capture; give another folder")
@@ -52,6 +52,7 @@ def export_cameras(arguments: argparse.Namespace) -> int:
         print_notes(("training cameras as training found them; others have the capture's poses, and known lenses",))
     written = write_cameras(path, capture, splits)
     count, root = len(all_views(capture.splits)), as_word(path.parent)
-    cameras = f"{count} camera{'s' * (count != 1)}"
-    print(f"written: {written} ({cameras}); `data.root={root} data.follow_links=true` trains with them")
+    print(
+        f"written: {written} ({counted(count, 'camera')}); `data.root={root} data.follow_links=true` trains with them"
+    )
     return 0

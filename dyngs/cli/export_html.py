@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyngs.cli.arguments import is_avatar_file, print_notes
+from dyngs.cli.arguments import data_root, is_avatar_file, print_notes
 from dyngs.errors import DyngsError
 
 _UNFIT = {
@@ -38,7 +38,7 @@ def export_page(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out or source / "scene.html"
     if out.suffix.lower() not in (".html", ".htm") or out.is_dir():
         raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
-    opened = open_scene(source)
+    opened = open_scene(source, data_root=data_root(arguments))
     if arguments.motion is not None:
         opened = opened.in_motion(arguments.motion)
     if arguments.from_up is not None:

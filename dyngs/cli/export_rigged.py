@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyngs.cli.arguments import is_avatar_file, print_notes
+from dyngs.cli.arguments import data_root, is_avatar_file, print_notes
 from dyngs.errors import DyngsError
 
 _UNFIT = ("time", "times", "static", "dynamic", "max_change", "up", "from_up", "sh_degree")
@@ -42,7 +42,7 @@ def export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         )
     if suffix == ".ply" and arguments.motion is not None:
         raise DyngsError("--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb")
-    opened, played = open_scene(source), None
+    opened, played = open_scene(source, data_root=data_root(arguments)), None
     if arguments.motion is not None:
         opened = opened.in_motion(arguments.motion)
         played = Played(arguments.motion.stem, opened.fps or FRAME_RATE)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dyngs.cli.arguments import input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import as_word
+from dyngs.errors import as_word, counted
 
 _EPILOG = """\
 examples:
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.network, arguments.capture, out, arguments.views, steps=arguments.steps, report=report
         )
     seconds = made.seconds_steps + made.seconds_maps + made.seconds_network
-    print(f"predicted: {made.num_gaussians:,} Gaussians from {', '.join(made.views)}")
+    print(f"predicted: {counted(made.num_gaussians, 'Gaussian')} from {', '.join(made.views)}")
     trained = f"{made.seconds_steps:.2f} s steps, " if arguments.steps else ""
     parts = f"{trained}{made.seconds_maps:.2f} s images, {made.seconds_network:.2f} s network"
     print(f"time:      {seconds:.2f} s ({parts})")

@@ -66,7 +66,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "overrides", nargs="*", default=[], metavar="key=value", help="other config keys of the run (docs/cli.md)"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, takes_root=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -85,7 +85,9 @@ def run(arguments: argparse.Namespace) -> int:
     folder, promise = _pruned(arguments, overrides)
     pruned = load_run(folder)
     device = computing_device(pruned.config.run.device)
-    before, after = compared([arguments.run_dir, file_of(folder)], arguments.threads or num_cores(), device)
+    before, after = compared(
+        [arguments.run_dir, file_of(folder)], arguments.threads or num_cores(), device, pruned.config.data.root
+    )
     Console().print(cost_table(before, after, promise))
     if pruned.config.prune.mask_times > 1 and pruned.scene.masks is None:
         print("note: --masks was ignored; they are for scenes in which a deformation field moves something")

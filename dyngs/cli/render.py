@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import (
+    add_data_root,
     add_device,
     computing_device,
+    data_root,
     frame_count,
     image_size,
     input_path,
@@ -21,7 +23,7 @@ from dyngs.cli.arguments import (
     threads,
 )
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 
 if TYPE_CHECKING:
@@ -100,6 +102,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     add_device(parser)
+    add_data_root(parser)
     parser.set_defaults(run=run)
 
 
@@ -119,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Render and print which files were written."""
     written = _render(_checked(arguments))
     folders = sorted({str(path.parent) for path in written})
-    print(f"written: {len(written)} file{'s' * (len(written) != 1)} in {', '.join(folders)}")
+    print(f"written: {counted(len(written), 'file')} in {', '.join(folders)}")
     for path in written:
         if path.suffix == ".mp4" or path.name == "sheet.png":
             print(f"         {path}")
@@ -176,7 +179,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not (arguments.source.is_file() or arguments.path or _has_fixed_camera(arguments)):
         with ProgressBar() as report:
-            opened = open_run(arguments.source)
+            opened = open_run(arguments.source, data_root=data_root(arguments))
             return write_split_images(opened, arguments.split or "test", arguments.out, output, report, device)
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
@@ -191,7 +194,7 @@ def _opened(arguments: argparse.Namespace) -> Opened:
     """Return what is rendered, in the motion and before the background that are requested."""
     from dyngs.runs.opened import open_scene
 
-    opened = open_scene(arguments.source, nonfinite="skip")
+    opened = open_scene(arguments.source, nonfinite="skip", data_root=data_root(arguments))
     if arguments.motion is not None:
         opened = opened.in_motion(arguments.motion)
     elif arguments.pose == "rest":

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import add_device, computing_device, input_word, output_path, threads
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -163,7 +163,7 @@ def _variants_table(rows: Sequence[TableRow], num_views: int) -> Table:
     """Return a table of all variants, with fewer columns than the files."""
     optional = ("LPIPS",) if any(row.lpips is not None for row in rows) else ()
     head = ("  changed", "PSNR", "SSIM", *optional, "fps", "speed x", "MB", "RAM MB")
-    table = _table(f"{num_views} view{'s' * (num_views != 1)}; * Pareto front of PSNR, speed and size", head)
+    table = _table(f"{counted(num_views, 'view')}; * Pareto front of PSNR, speed and size", head)
     for row in rows:
         lpips, memory = ("" if x is None else f"{x:.{n}f}" for x, n in ((row.lpips, 4), (row.memory_mb, 0)))
         quality = (f"{row.psnr:.2f}", f"{row.ssim:.4f}", *(lpips for _ in optional))

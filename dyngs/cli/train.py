@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli.arguments import add_run_device, computing_device, input_path, run_device
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
-from dyngs.errors import DyngsError, as_word
+from dyngs.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -36,6 +36,7 @@ All keys are listed in docs/cli.md.
 
 WITH_RESUME = (
     "train.steps",
+    "data.root",
     "run.threads",
     "run.device",
     "run.deterministic",
@@ -45,7 +46,8 @@ WITH_RESUME = (
     "train.tensorboard",
     "data.cache_mb",
 )
-"""Keys that may be given with ``--resume``: the first changes the run, the others nothing that it ends with."""
+"""Keys that may be given with ``--resume``: the first changes the run, the second says where its capture was moved to,
+the others change nothing that it ends with."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -171,7 +173,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
         return ["motion:  the capture has no times (or only one), so this is a static model"]
     if scene.is_static:
         return [f"motion:  nothing moves by {limit:g} px or more, so this became a static model"]
-    return [f"motion:  {len(scene.rows):,} of {len(scene):,} Gaussians move ({scene.moving_fraction:.1%})"]
+    return [f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"]
 
 
 def parse_config(words: Sequence[str], resume: Path | None) -> Config:
@@ -194,8 +196,8 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
     other = [word for word in words if word.partition("=")[0].strip() not in WITH_RESUME]
     if other:
         raise DyngsError(
-            f"{other[0]!r}: a resumed run keeps its own config; train.steps=N goes on to N steps, and for this call "
-            f"alone may be given {', '.join(WITH_RESUME[1:])}"
+            f"{other[0]!r}: a resumed run keeps its own config; train.steps=N goes on to N steps, data.root=FOLDER "
+            f"names a capture that was moved, and for this call alone may be given {', '.join(WITH_RESUME[2:])}"
         )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import threading
 
-from dyngs.cli.arguments import add_device, computing_device, input_path, threads
+from dyngs.cli.arguments import add_data_root, add_device, computing_device, data_root, input_path, threads
 from dyngs.errors import DyngsError
 
 _EPILOG = """\
@@ -48,6 +48,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
     add_device(parser)
+    add_data_root(parser)
     parser.set_defaults(run=run)
 
 
@@ -82,7 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
     motions = motion_files(arguments.motion)
-    source = open_source(arguments.source, arguments.up, arguments.capture, computing_device(arguments.device))
+    device = computing_device(arguments.device)
+    source = open_source(arguments.source, arguments.up, arguments.capture, device, data_root(arguments))
     first = first_of(source)
     if motions and first.person is None:
         raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")

@@ -76,12 +76,13 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
     return config.model_copy(update={"data": data})
 
 
-def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
+def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | None = None) -> Config:
     """Return the configuration of a finished or interrupted run.
 
     Args:
         path: a run folder, or the YAML file in it; a relative ``data.body`` there is one beside the file.
         overrides: as in ``load_config``.
+        data_root: where the capture lies by now, if it was moved.
 
     Raises:
         DyngsError: if there is none, or it is broken.
@@ -102,7 +103,9 @@ def load_resolved(path: Path, overrides: Iterable[str] = ()) -> Config:
     if isinstance(body, str):
         layers.tree["data"]["body"] = str(file.parent.absolute() / body)
     layers.add_overrides(overrides)
-    return _validate(layers)
+    config = _validate(layers)
+    root = (data_root or config.data.root).absolute()
+    return config.model_copy(update={"data": config.data.model_copy(update={"root": root})})
 
 
 def save_config(config: Config, path: Path) -> None:

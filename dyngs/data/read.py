@@ -36,7 +36,7 @@ from dyngs.data.times import (
     times_of_frames,
     unit_times,
 )
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, NoCaptureError, reading
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
 
@@ -88,9 +88,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     """
     options = source if isinstance(source, DataConfig) else DataConfig(root=Path(source))
     root = options.root
-    if not root.is_dir():
-        problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
-        raise DyngsError(f"{root}: {problem}")
+    require_folder(root)
     with reading(root, "choose another folder or change its permissions"):
         found = [format for format in FORMATS if format.recognise(root)]
     chosen = _chosen_format(options, found)
@@ -105,6 +103,13 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         note = f"read as {chosen.name}, but there is also a {others[0].name} capture; data.format= chooses"
         capture = replace(capture, warnings=(note, *capture.warnings))
     return capture
+
+
+def require_folder(root: Path) -> None:
+    """Check that the folder of a capture exists. Raises NoCaptureError."""
+    if not root.is_dir():
+        problem = "is a file; give the folder that holds it" if root.is_file() else "no such folder; check data.root"
+        raise NoCaptureError(f"{root}: {problem}")
 
 
 def is_capture(root: Path) -> bool:

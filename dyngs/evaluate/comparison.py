@@ -46,9 +46,11 @@ class Cost:
     stored: float | None = None
 
 
-def compared(folders: Sequence[Path], threads: int, device: torch.device = CPU) -> list[Cost]:
+def compared(
+    folders: Sequence[Path], threads: int, device: torch.device = CPU, data_root: Path | None = None
+) -> list[Cost]:
     """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all alike."""
-    runs = [load_run(folder) for folder in folders]
+    runs = [load_run(folder, data_root) for folder in folders]
     capture = read_capture(runs[0].config.data)
     has_test = bool(capture.splits.get("test"))
     with kernel_threads(threads), torch.no_grad():

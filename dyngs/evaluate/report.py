@@ -116,6 +116,7 @@ def evaluate_run(
     threads: int = 0,
     refine_poses: bool = False,
     device: str = "cpu",
+    data_root: Path | None = None,
 ) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
@@ -127,10 +128,11 @@ def evaluate_run(
         refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
             images themselves; always done for a run that refined its cameras.
         device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
+        data_root: where the capture lies by now, if it was moved.
     """
     draws_on = device_for(device)
     _require_possible(run_dir, split, refine_poses)
-    run = load_run(run_dir)
+    run = load_run(run_dir, data_root)
     capture = read_capture(run.config.data)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)

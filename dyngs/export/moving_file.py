@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from dyngs.conventions import SH_C0
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.export.splat_files import AS_THEY_ARE, Part, Writing, scene_part, splats_at
 from dyngs.files.write import atomic_file
 from dyngs.runs.inputs import inputs_of
@@ -72,7 +72,7 @@ def write_moving(
     data = writer.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
-    notes = (f"{len(times)} times, each shown for 1/{FPS:.0f} s",)
+    notes = (f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",)
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
         notes = (*notes, "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians")
     return MovingFile(path, splats, notes)

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.camera_paths.orbit import frame_orbit_for_points
 from dyngs.camera_paths.path import resize_cameras
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.scene import Scene
 from dyngs.metrics import psnr
@@ -44,7 +44,7 @@ class Redrawn:
     def line(self) -> str:
         """Return the figure for people."""
         figure = "the same images" if self.psnr >= 99.9 else f"{self.psnr:.1f} dB (PSNR)"
-        return f"drawn again from {self.views} cameras: {figure} compared with the scene"
+        return f"drawn again from {counted(self.views, 'camera')}: {figure} compared with the scene"
 
     @property
     def is_faint(self) -> bool:

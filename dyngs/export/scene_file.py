@@ -44,7 +44,13 @@ class SceneFile:
     num_bytes_exact: int
 
 
-def write_scene_file(run_dir: Path, out: Path, max_change: float | None = None, field_step: float = 1.0) -> SceneFile:
+def write_scene_file(
+    run_dir: Path,
+    out: Path,
+    max_change: float | None = None,
+    field_step: float = 1.0,
+    data_root: Path | None = None,
+) -> SceneFile:
     """The file in the folder ``out``, with the run's ``config.yaml`` beside it: together a run that can be drawn.
 
     Args:
@@ -53,12 +59,13 @@ def write_scene_file(run_dir: Path, out: Path, max_change: float | None = None, 
         max_change: root mean square over all values of some training images, grey levels of 255. None: what lowers
             their PSNR by ``LOSS_DB``, if it is independent of the model's own errors.
         field_step: how many times as coarsely as that the field is rounded.
+        data_root: where the capture lies by now, if it was moved.
 
     Raises:
         DyngsError: no such run, ``out`` holds another one, the images would change by more than ``max_change``, or
             the file cannot be written. Nothing is written then.
     """
-    config = load_resolved(run_dir)
+    config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)
     with folder_of_export(out, run_dir, config) as folder:
         checkpoint = latest_checkpoint(run_dir)

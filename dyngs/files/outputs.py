@@ -38,8 +38,8 @@ class Inputs:
 
         Raises:
             DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is read;
-                or it is a folder that holds such a folder or a link to an input. A run folder in a capture, and an
-                empty folder, may be written to.
+                or it is a folder that holds a link to an input. A run folder in a capture, an empty folder, and a
+                folder around a capture may be written to.
         """
         if not os.path.lexists(out):
             return
@@ -110,7 +110,7 @@ def note_sources(capture: Path, *sources: Path) -> None:
 
 
 def _require_outside(out: Path, folder: Path) -> None:
-    """Check that an existing ``out`` is not ``folder``, does not lie in it and does not hold it.
+    """Check that an existing ``out`` is not ``folder`` and does not lie in it; it may hold it.
 
     Raises:
         DyngsError: see ``Inputs.require_output``.
@@ -118,8 +118,6 @@ def _require_outside(out: Path, folder: Path) -> None:
     own, root = _identity(out), _identity(folder)
     if own == root:
         raise DyngsError(f"{out}: is the folder that is read; give another output")
-    if out.is_dir() and any(_identity(above) == own for above in Path(os.path.realpath(folder)).parents):
-        raise DyngsError(f"{out}: holds {folder}, which is read; give a folder of its own for the output")
     if out.is_dir() and not any(out.iterdir()):
         return
     for way in _ways(out):

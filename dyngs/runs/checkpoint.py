@@ -132,9 +132,12 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
                 raise  # otherwise its run has saved twice since it was found
 
 
-def load_run(run_dir: Path) -> LoadedRun:
-    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints."""
-    config = load_resolved(run_dir)
+def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
+    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints.
+
+    ``data_root`` is where its capture lies by now, if that was moved.
+    """
+    config = load_resolved(run_dir, data_root=data_root)
     if network_of(config) is not None:
         raise DyngsError(
             f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"

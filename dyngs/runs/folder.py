@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from dyngs.config import Config, RunConfig
+from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, as_word
 from dyngs.files.temporary import remove_leftovers, remove_quietly, temporary_folder_beside
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
@@ -135,6 +136,19 @@ def note_asked(folder: Path, asked: Config) -> None:
         path.unlink(missing_ok=True)
     else:
         save_config(with_body_of(asked, stored), path)
+
+
+def note_root(folder: Path, data: DataConfig) -> None:
+    """Write into the configuration of a run where its capture lies by now, if that differs.
+
+    Raises:
+        DyngsError: no capture is there; the configuration stays as it was.
+    """
+    for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
+        stored = load_resolved(path) if path.is_file() else None
+        if stored is not None and stored.data.root != data.root:
+            read_capture(data)
+            save_config(stored.model_copy(update={"data": stored.data.model_copy(update={"root": data.root})}), path)
 
 
 def asked_for(folder: Path) -> Config:

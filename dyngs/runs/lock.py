@@ -33,9 +33,36 @@ class InUseError(DyngsError):
     """Another process writes into the folder."""
 
 
+class Held:
+    """A folder that this process writes into.
+
+    Attributes:
+        alone: no other process writes into it; false where there are no locks.
+    """
+
+    def __init__(self, folder: Path, *, alone: bool) -> None:
+        self._folder, self.alone = folder, alone
+        self._opened = None if sys.platform == "win32" else os.open(folder, os.O_RDONLY)  # there it cannot be renamed
+
+    def folder(self) -> Path | None:
+        """Return where the folder is by now, also after it was renamed; None: it was removed, or cannot be found."""
+        if self._opened is None or _is_the_same(self._opened, self._folder):
+            return self._folder
+        path = _path_of(self._opened)
+        if path is None or not _is_the_same(self._opened, path):
+            return None
+        self._folder = path
+        return path
+
+    def close(self) -> None:
+        """Forget the folder."""
+        if self._opened is not None:
+            os.close(self._opened)
+
+
 @contextmanager
-def writing(folder: Path) -> Iterator[bool]:
-    """Yield whether it is certain that no other process writes into ``folder`` in the block: false without locks.
+def writing(folder: Path) -> Iterator[Held]:
+    """Yield the folder, into which no other process writes in the block, if its file system has locks.
 
     The folder is made where it is missing, and removed where nothing came of it. The lock holds for as long as the
     process lives; the file ``run.lock`` says who it is. A file system that has no locks (some network file systems) is
@@ -48,10 +75,12 @@ def writing(folder: Path) -> Iterator[bool]:
     made = _made(folder)
     try:
         file, locks = _locked(folder)
+        held = Held(folder, alone=locks)
         try:
-            yield locks
+            yield held
         finally:
-            _freed(folder / LOCK_NAME, file)
+            _freed((held.folder() or folder) / LOCK_NAME, file)
+            held.close()
     finally:
         for path in made:
             with suppress(OSError):
@@ -129,10 +158,21 @@ def _freed(path: Path, file: int) -> None:
             path.unlink()  # fails if somebody has it by now
 
 
+def _path_of(file: int) -> Path | None:
+    """Return where an open file is by now; None where the system does not say."""
+    try:
+        if sys.platform == "darwin":
+            name = fcntl.fcntl(file, fcntl.F_GETPATH, bytes(1024))
+            return Path(os.fsdecode(name.rstrip(b"\0")))
+        return Path(f"/proc/self/fd/{file}").readlink()
+    except OSError:
+        return None
+
+
 def _is_the_same(file: int, path: Path) -> bool:
     try:
         return os.path.samestat(os.fstat(file), os.stat(path))
-    except FileNotFoundError:
+    except OSError:
         return False
 
 

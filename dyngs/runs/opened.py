@@ -236,20 +236,23 @@ class Opened(LoadedRun):
         return self.person, model
 
 
-def open_scene(path: Path, *, nonfinite: Nonfinite = "error") -> Opened:
+def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | None = None) -> Opened:
     """Open a run folder, a ``scene.dyngs`` with the ``config.yaml`` of its run, an avatar, or a file of Gaussians.
 
     Args:
         path: of it. A capture is read later, when something of it is needed.
         nonfinite: of a file of Gaussians, as ``dyngs.splats.formats.read_splats``.
+        data_root: where the capture of a run lies by now, if it was moved.
 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
     if path.is_dir() or (path.name == SCENE_FILE and path.exists()):
-        return open_run(path if path.is_dir() else path.parent)
+        return open_run(path if path.is_dir() else path.parent, data_root=data_root)
     if not path.exists():
         raise DyngsError(f"{path}: no such file or folder; give what `dyngs train` or `dyngs export` wrote")
+    if data_root is not None:
+        raise DyngsError(f"{path}: a file, not a run, so it has no capture; leave out data.root")
     if path.suffix.lower() == AVATAR_SUFFIX:
         return Opened(**vars(read_avatar(path)), name=path.name)
     if known_format(path) is None:
@@ -259,9 +262,9 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error") -> Opened:
     return _of_splats(path, read_splats(path, nonfinite=nonfinite))
 
 
-def open_run(folder: Path, capture: Capture | None = None) -> Opened:
+def open_run(folder: Path, capture: Capture | None = None, data_root: Path | None = None) -> Opened:
     """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it is read already."""
-    run = load_run(folder)
+    run = load_run(folder, data_root)
     return Opened(**vars(run), name=folder.absolute().name, captured=Captured(run.config.data, capture))
 
 

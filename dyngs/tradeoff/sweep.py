@@ -21,7 +21,7 @@ from dyngs.config.io import load_resolved
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
@@ -194,7 +194,7 @@ class _Session:
             else None,
         )
         write_measurement(path, measurement)
-        counts = f"{measurement.num_gaussians:,} Gaussians, {measurement.mb:.2f} MB"
+        counts = f"{counted(measurement.num_gaussians, 'Gaussian')}, {measurement.mb:.2f} MB"
         self._log(f"{variant.name}: {measurement.psnr:.2f} dB, {counts}")
         return measurement
 

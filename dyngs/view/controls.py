@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dyngs.errors import counted
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import has_timeline, views_of
 from dyngs.view.frusta import Frusta
@@ -280,7 +281,7 @@ def add_path_controls(browsing: Browsing) -> None:
     def record(recording: Recording) -> None:
         recorded[0] = recording
         count, duration = len(recording), recording.duration if len(recording) else 0.0
-        status.content = f"{count} keyframe{'s' * (count != 1)}, {duration:.1f} s" if count else "no keyframes yet"
+        status.content = f"{counted(count, 'keyframe')}, {duration:.1f} s" if count else "no keyframes yet"
 
     def add(_: Any) -> None:
         if session.eye is not None:

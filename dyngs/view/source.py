@@ -109,13 +109,20 @@ class Source:
     network: PeopleNetwork | None = None
 
 
-def open_source(path: Path, up: str | None = None, capture: Path | None = None, device: torch.device = CPU) -> Source:
+def open_source(
+    path: Path,
+    up: str | None = None,
+    capture: Path | None = None,
+    device: torch.device = CPU,
+    data_root: Path | None = None,
+) -> Source:
     """Return what is to be seen of a run, a file, a folder of runs or a network; the first scene is not loaded yet.
 
     Args:
         path: of it.
         up: up axis; None: that of the capture, or of the file.
         capture: for a network: a person, or a folder of people.
+        data_root: where the capture of a run lies by now, if it was moved.
         device: draws the scenes.
 
     Raises:
@@ -130,7 +137,9 @@ def open_source(path: Path, up: str | None = None, capture: Path | None = None, 
         raise DyngsError(f"--capture goes with the run of a network of people, {path} is none; leave it out")
     if not path.is_dir() or _is_run(path):
         name = path.name or str(path)
-        return Source((name,), lambda _: open_to_view(path, name, up).to(device))
+        return Source((name,), lambda _: open_to_view(path, name, up, data_root).to(device))
+    if data_root is not None:
+        raise DyngsError(f"data.root= goes with one run, {path} is none; leave it out")
     runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
     if not runs:
         known = command_for(path)
@@ -139,22 +148,25 @@ def open_source(path: Path, up: str | None = None, capture: Path | None = None, 
     return Source(tuple(runs), lambda name: open_to_view(runs[name], name, up).to(device))
 
 
-def open_to_view(path: Path, name: str, up: str | None = None) -> Opened:
+def open_to_view(path: Path, name: str, up: str | None = None, data_root: Path | None = None) -> Opened:
     """Open a run or a file; where its capture is gone, a note says what lacks.
 
     Args:
         path: of it.
         name: that it is shown by.
         up: up axis such as "z" or "-y"; None: that of the capture, or as the file or its format has it.
+        data_root: where the capture of a run lies by now, if it was moved.
 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    opened = replace(open_scene(path, nonfinite="skip"), name=name)
+    opened = replace(open_scene(path, nonfinite="skip", data_root=data_root), name=name)
     if up is not None:
         opened = replace(opened, stated_up=up)
     if opened.captured is not None and opened.missing is not None:
-        opened = opened.noted(f"without the capture, so no cameras and no truth: {opened.missing}")
+        opened = opened.noted(
+            f"without the capture, so no cameras and no truth: {opened.missing}; if it was moved, add data.root=FOLDER"
+        )
     return opened
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
+from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import StepReport, Trainer
 
 # Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.
@@ -206,6 +208,41 @@ def test_a_run_is_never_overwritten(
         train(config.model_copy(update={"run": config.run.model_copy(update={"seed": 7})}))
     assert train(config, resume_from=tmp_path / "run") == tmp_path / "run"  # finished: nothing to do
     assert _final_bytes(tmp_path / "run") == before
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is")
+def test_a_folder_that_is_renamed_gets_its_run(capture: Path, tmp_path: Path) -> None:
+    still, moved = tmp_path / "still", tmp_path / "moved"
+    train(_config(capture, still, steps=12))
+
+    def rename(event: Event) -> None:
+        if isinstance(event, StepDone) and event.step == 5:
+            (tmp_path / "run").rename(moved)
+
+    assert train(_config(capture, tmp_path / "run", steps=12), listeners=[rename]) == moved
+    assert not (tmp_path / "run").exists()
+    assert _final_bytes(moved) == _final_bytes(still)
+    assert [line["step"] for line in _log(moved)] == [line["step"] for line in _log(still)]
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_a_folder_that_is_removed_loses_nothing_but_its_log(capture: Path, tmp_path: Path, is_replaced: bool) -> None:
+    run, still = tmp_path / "run", tmp_path / "still"
+    train(_config(capture, still, steps=12))
+
+    def remove(event: Event) -> None:
+        if isinstance(event, StepDone) and event.step == 5:
+            shutil.rmtree(run)
+            if is_replaced:
+                run.write_text("mine")
+
+    with pytest.raises(DyngsError, match=r"step 12 is in .*; go on with `dyngs train --resume") as caught:
+        train(_config(capture, run, steps=12), listeners=[remove])
+    found = tmp_path / ("run_2" if is_replaced else "run")
+    assert f"--resume {found}`" in str(caught.value)
+    assert _final_bytes(found) == _final_bytes(still)
+    assert train(load_resolved(found), resume_from=found) == found
+    assert not is_replaced or run.read_text() == "mine"
 
 
 def test_a_run_is_known_by_what_was_asked_for(

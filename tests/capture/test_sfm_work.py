@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from dyngs.capture.sfm_work import work_folder_of, working
 from dyngs.errors import DyngsError
@@ -39,3 +44,30 @@ def test_an_error_leaves_nothing_and_two_at_once_are_refused(tmp_path: Path) -> 
     with pytest.raises(DyngsError, match="another process"), working(out, "task"), working(out, "task"):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+FULL = """
+import resource, signal, sys
+from dyngs.cli import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+sys.exit(main(["data", "sfm", sys.argv[1], sys.argv[2]]))
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits the size of files")
+def test_a_disk_without_room_is_told_in_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    photos, out = tmp_path / "photos", tmp_path / "capture"
+    photos.mkdir()
+    for number in range(3):
+        noise = np.random.default_rng(number).integers(0, 256, (64, 64, 3), np.uint8)
+        Image.fromarray(noise).save(photos / f"{number}.png")
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(photos), str(out)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("dyngs: error") == 1
+    assert "free some space" in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]

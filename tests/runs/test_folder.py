@@ -36,7 +36,6 @@ OWN = {
     "metrics": {"metrics.json": "{}"},
     "scene": {"scene.dyngs": "a model"},
     "export": {"export/scene.dyngs": "a model"},
-    "export of earlier versions": {"small/scene.dyngs": "a model"},
     "checkpoint": {"checkpoints/step_0000009.safetensors": "a model"},
     "checkpoints is a file": {"checkpoints": "mine"},
     "timing": {"timing.json": "{}"},

@@ -61,8 +61,8 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert json.loads((run / LOCK_NAME).read_text())["pid"] == process.pid
-        with writing(run) as is_sole_writer:
-            assert is_sole_writer
+        with writing(run) as held:
+            assert held.alone
             assert json.loads((run / LOCK_NAME).read_text())["pid"] == os.getpid()
     assert not run.exists() or not list(run.iterdir())
 
@@ -100,6 +100,25 @@ def test_a_lock_file_that_is_none_is_told_and_left(tmp_path: Path) -> None:
         raise AssertionError
 
 
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the system does not say where an open folder is")
+def test_a_folder_that_is_renamed_is_found(tmp_path: Path) -> None:
+    (tmp_path / "above").mkdir()
+    with writing(tmp_path / "above" / "a") as held:
+        (tmp_path / "above" / "a").rename(tmp_path / "above" / "b")
+        assert held.folder() == tmp_path / "above" / "b"
+        (tmp_path / "above").rename(tmp_path / "below")
+        (tmp_path / "above" / "b").mkdir(parents=True)  # another one takes its place
+        assert held.folder() == tmp_path / "below" / "b"
+        with pytest.raises(InUseError), writing(tmp_path / "below" / "b"):
+            raise AssertionError
+    assert list((tmp_path / "below" / "b").iterdir()) == []  # the lock went with it
+    with writing(tmp_path / "c") as held:
+        (tmp_path / "c" / LOCK_NAME).unlink()
+        assert held.folder() == tmp_path / "c"
+        (tmp_path / "c").rmdir()
+        assert held.folder() is None
+
+
 def test_without_locks_a_line_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,8 +126,8 @@ def test_without_locks_a_line_says_so(
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(run_lock, "_lock", no_locks)
-    with writing(tmp_path / "run") as is_sole_writer:
-        assert not is_sole_writer
+    with writing(tmp_path / "run") as held:
+        assert not held.alone
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert "no locks" in told

@@ -130,10 +130,12 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
     cameras: defaultdict[int, set[bytes]] = defaultdict(set)
     for view in views:
         cameras[view.camera_id].add(view.cam_from_world.round(9).tobytes())
-    what = "camera" + ("s" if len(cameras) > 1 else "")
     moving = sum(len(poses) > 1 for poses in cameras.values())
     motion = "" if not moving else " (moving)" if moving == len(cameras) else f" ({moving} moving)"
-    yield "sequence", f"{len(cameras)} {what}{motion} x {len(times)} times, {len(views)} images"
+    yield (
+        "sequence",
+        f"{counted(len(cameras), 'camera')}{motion} x {counted(len(times), 'time')}, {counted(len(views), 'image')}",
+    )
     if capture.fps is not None:
         yield "frame rate", f"{capture.fps:.6g} per second"
     if capture.seconds is not None:

@@ -21,7 +21,7 @@ from dyngs.capture.multi_video.lags import motion_of
 from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
 from dyngs.data.images.video import opened_video, orientation_of, read_frames
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import as_word, reading
+from dyngs.errors import as_word, counted, reading
 from dyngs.files.containment import inside
 
 MAX_FRAMES = 3000
@@ -132,7 +132,8 @@ def _sharpness(sharpness: np.ndarray) -> str:
     typical = float(np.median(sharpness))
     blurred = int((sharpness < BLURRED * typical).sum())
     low, high = sharpness.min() / max(typical, 1e-9), sharpness.max() / max(typical, 1e-9)
-    return f"{low:.2f} to {high:.2f} of the typical frame; {blurred or 'no'} blurred frame{'s' * (blurred != 1)}"
+    found = counted(blurred, "blurred frame") if blurred else "no blurred frames"
+    return f"{low:.2f} to {high:.2f} of the typical frame; {found}"
 
 
 def _camera(small: SmallImages, steady: Steadiness) -> str:

@@ -17,6 +17,7 @@ from dyngs.camera import Cameras
 from dyngs.camera_paths.aim import look_at_point
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture, View
+from dyngs.errors import counted
 from dyngs.export.chosen_path import front_of, orbit_around, view_to_show
 from dyngs.export.html.numbers import Lists, add_scene
 from dyngs.files.write import write_text
@@ -170,7 +171,7 @@ def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
     fixed |= {"style_hash": _hash(style), "script_hash": _hash(script), "title": html.escape(title)}
     fixed |= {"header": _script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
-    fixed["about"] = f"{header['count']:,} Gaussians, {size / 1e6:.1f} MB"
+    fixed["about"] = f"{counted(header['count'], 'Gaussian')}, {size / 1e6:.1f} MB"
     pieces = page.split("{{")
     filled = [pieces[0]]
     for piece in pieces[1:]:

@@ -24,7 +24,7 @@ from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, counted, reading
 from dyngs.files.outputs import require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
@@ -150,13 +150,13 @@ class FittedCapture:
     def summary(self) -> str:
         """Return lines for people: how good the fit is."""
         found, frames = self.found, len(self.found.motion.clip)
-        where = f"{found.held_out} views left out of the fit" if found.held_out else "the views fitted to"
+        where = f"{counted(found.held_out, 'view')} left out of the fit" if found.held_out else "the views fitted to"
         worst = int(np.nanargmin(found.chosen.per_frame))
         tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
         lens = "" if found.lens is None else f"\n{found.lens.summary()}"
         others = [x.summary() for x in (self.new_poses, *self.by_avatar) if x is not None]
         return (
-            f"{frames} frames; overlap of silhouettes (IoU) on {where}: {tried}\n"
+            f"{counted(frames, 'frame')}; overlap of silhouettes (IoU) on {where}: {tried}\n"
             f"taken: {found.chosen.name}; worst frame {found.motion.frames[worst]} with "
             f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}"
             + "".join(f"\n{line}" for line in others)

@@ -16,7 +16,7 @@ from dyngs.data.body_frames import read_body_file
 from dyngs.data.capture import BodyFrames, View
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, counted, reading
 from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.fit.inputs import KnownAvatar
@@ -85,7 +85,7 @@ class AvatarPoses:
 
     def summary(self) -> str:
         """Return a line for people."""
-        where = f"{self.left_out} views left out of the fit" if self.left_out else "the views fitted to"
+        where = f"{counted(self.left_out, 'view')} left out of the fit" if self.left_out else "the views fitted to"
         what = "taken" if self.taken else "not taken"
         return (
             f"poses by the silhouette of the person's avatar: {what}; overlap on {where} {self.before:.3f} -> "
