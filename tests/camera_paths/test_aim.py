@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from camera_rings import UP, cameras_at, forward_facing
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,3 +35,18 @@ def test_cameras_held_askew_vote() -> None:
         c, s = np.cos(angle), np.sin(angle)
         poses[i, :3, :3] = poses[i, :3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     assert up_direction(cameras_at(poses)) @ UP > 0.95
+
+
+@pytest.mark.parametrize(("roll", "is_level"), [(5.0, True), (15.0, False)])
+def test_cameras_that_are_not_held_level_have_the_mean_of_their_ups(roll: float, is_level: bool) -> None:
+    """Half a circle of cameras that look down by 30 degrees, rolled to either side by turns."""
+    poses = []
+    for k, azimuth in enumerate(np.linspace(0, np.pi, 40)):
+        forward = np.array([np.cos(azimuth) * 0.866, np.sin(azimuth) * 0.866, -0.5])
+        pose = look_at(np.zeros(3), forward, np.array([0.0, 0.0, 1.0]))
+        angle = np.radians(roll) * (-1) ** k
+        rolled = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pose[:3, :3] = pose[:3, :3] @ rolled
+        poses.append(pose)
+    found = up_direction(cameras_at(np.stack(poses)))
+    assert (found @ [0, 0, 1] > 0.99) == is_level
