@@ -339,21 +339,6 @@ def test_other_words_may_not(words: list[str], capsys: Capture) -> None:
     assert f"unrecognized arguments: {words[-1]} " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "new"),
-    [
-        (["compact", "RUN", "--out", "X"], "`dyngs prune`"),
-        (["export", "RUN", "--format", "compact"], "--format dyngs"),
-        (["export", "--format=compact", "RUN"], "--format dyngs"),
-    ],
-)
-def test_old_spellings_name_the_new_ones(words: list[str], new: str, capsys: Capture) -> None:
-    assert main(words) == 2
-    line = capsys.readouterr().err
-    assert new in line
-    assert line.count("\n") == 1
-
-
 def test_words_after_train() -> None:
     config = parse_config(["static", "data.root=x", "train.steps=5", "run.threads=2"], None)
     assert (config.train.steps, config.run.threads, config.data.root) == (5, 2, Path("x").absolute())

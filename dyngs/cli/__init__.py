@@ -49,8 +49,6 @@ _OUT_OF_MEMORY = "out of memory; use smaller images (data.longest_side) or a sma
 _TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
 _GPU_OUT_OF_MEMORY = "CUDA out of memory"
 _GPU_IS_FULL = "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
-_RENAMED = {"compact": "prune"}
-"""Commands of earlier versions and what they are called now."""
 _OF_DATA = ("inspect", "sfm", "motion", "synth")
 """Commands of ``dyngs data``."""
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
@@ -100,9 +98,6 @@ def _show_any_name() -> None:
 def _dispatch(arguments: list[str]) -> int:
     for word in arguments:
         require_name(word)
-    if arguments and arguments[0] in _RENAMED:
-        new = _RENAMED[arguments[0]]
-        raise DyngsError(f"the command {arguments[0]!r} is called {new!r} now: run `dyngs {new}` with the same options")
     if arguments and arguments[0] in _OF_DATA:
         raise DyngsError(f"the command {arguments[0]!r} belongs to data: run `dyngs data {arguments[0]}`")
     parser = make_parser()

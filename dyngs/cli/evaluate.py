@@ -37,7 +37,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; "
         "always done after camera.refine",
     )
-    parser.add_argument("--refine-poses", dest="refine", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(run=run)
 
 

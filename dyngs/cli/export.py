@@ -29,6 +29,25 @@ if TYPE_CHECKING:
 _OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
 _OTHER_SUFFIXES |= {".html": "html", ".json": "cameras"}
 
+_TIMES, _PARTS, _AXES = ("time", "times"), ("static", "dynamic"), ("up", "from_up", "sh_degree")
+_FOR_DYNGS = {"max_change": "it goes with --format dyngs"}
+_FOR_SPLATS = dict.fromkeys(_AXES, "it goes with files of Gaussians")
+_UNFIT: dict[str, dict[str, str]] = {
+    "cameras": dict.fromkeys((*_TIMES, "motion", "max_change", *_PARTS, *_AXES), ""),
+    "html": {
+        "times": "the page plays the whole clip",
+        **dict.fromkeys(_PARTS, "the page shows the whole scene"),
+        **_FOR_DYNGS,
+        "up": "the page turns with the scene; --from-up names its axis",
+        "sh_degree": "the page has the colours of the run",
+    },
+    "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up") | _FOR_DYNGS,
+    "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
+    "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
+    "tracks": _FOR_SPLATS,
+}
+"""Options that do not go with a format, and why."""
+
 _EPILOG = """\
 examples:
   dyngs export runs/bench                                         runs/bench/splats.ply
@@ -61,7 +80,6 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder, or an avatar file (.safetensors)")
     parser.add_argument(
         "--format",
-        type=_format,
         choices=(*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras"),
         help="file format (default: what the suffix of --out names, else ply)",
     )
@@ -95,11 +113,13 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.set_defaults(run=run)
 
 
-def _format(text: str) -> str:
-    """Return the name of a format; the former name of ``dyngs`` is refused with the new one."""
-    if text == "compact":
-        raise argparse.ArgumentTypeError("the format 'compact' is called 'dyngs' now: give --format dyngs")
-    return text
+def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
+    """Raise for the first option that does not go with a format, with the reason."""
+    wanted = "--joints" if arguments.joints else f"--format {kind}"
+    for name, reason in _UNFIT.get("mesh" if arguments.joints else kind, {}).items():
+        given = getattr(arguments, name)
+        if given is not None and given is not False:  # a time may be 0
+            raise DyngsError(f"--{name.replace('_', '-')} does not go with {wanted}{reason and f': {reason}'}")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -111,6 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     arguments.run_dir = run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
+    _require_fitting(arguments, kind)
     if kind == "mesh" or arguments.joints:
         return export_rigged(arguments, kind)
     if kind == "html":
@@ -120,10 +141,6 @@ def run(arguments: argparse.Namespace) -> int:
     is_file = is_avatar_file(arguments.run_dir)
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
-    if kind in ("tracks", "avatar", "dyngs"):
-        unfit = [name for name in ("up", "from_up", "sh_degree") if getattr(arguments, name) is not None]
-        if unfit:
-            raise DyngsError(f"--{unfit[0].replace('_', '-')} goes with files of Gaussians, not with --format {kind}")
     if kind == "avatar":
         return _export_avatar(arguments)
     if kind == "dyngs":
@@ -184,10 +201,6 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
     from dyngs.export.scene_file import write_scene_file
     from dyngs.storage.measure import SMALLEST_CHANGE
 
-    options = ("time", "times", "motion", "static", "dynamic")
-    given = [name for name in options if getattr(arguments, name) not in (None, False)]
-    if given:
-        raise DyngsError(f"--{given[0]} does not go with --format dyngs, which stores the whole run")
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
         raise DyngsError(f"--max-change {max_change:g}: give {SMALLEST_CHANGE:g} to 64 grey levels of 255")
@@ -217,10 +230,6 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
     from dyngs.runs.avatar import write_avatar
     from dyngs.runs.checkpoint import load_run
 
-    given = ("motion", "time", "times", "static", "dynamic")
-    unfit = [f"--{name}" for name in given if getattr(arguments, name) not in (None, False)]
-    if unfit:
-        raise DyngsError(f"{unfit[0]} does not go with --format avatar, which is the same in all poses")
     path = write_avatar(load_run(arguments.run_dir), arguments.out or arguments.run_dir / "avatar.safetensors")
     print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0

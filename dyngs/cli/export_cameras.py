@@ -13,8 +13,6 @@ from dyngs.errors import DyngsError, as_word, counted
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
 
-_UNFIT = ("time", "times", "motion", "max_change", "static", "dynamic", "up", "from_up", "sh_degree")
-
 
 def export_cameras(arguments: argparse.Namespace) -> int:
     """Write the cameras of a run, and print where they are and what of them was refined.
@@ -29,9 +27,6 @@ def export_cameras(arguments: argparse.Namespace) -> int:
     from dyngs.runs.cameras import found_corrections
     from dyngs.runs.checkpoint import load_run
 
-    for name in _UNFIT:
-        if getattr(arguments, name) not in (None, False):
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with --format cameras")
     source: Path = arguments.run_dir
     if is_avatar_file(source):
         raise DyngsError(f"{source}: an avatar file has no cameras; give a run")

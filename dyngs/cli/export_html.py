@@ -8,15 +8,6 @@ from pathlib import Path
 from dyngs.cli.arguments import data_root, is_avatar_file, print_notes
 from dyngs.errors import DyngsError
 
-_UNFIT = {
-    "times": "the page plays the whole clip",
-    "static": "the page shows the whole scene",
-    "dynamic": "the page shows the whole scene",
-    "max_change": "it goes with --format dyngs",
-    "up": "the page turns with the scene; --from-up names its axis",
-    "sh_degree": "the page has the colours of the run",
-}
-
 
 def export_page(arguments: argparse.Namespace) -> int:
     """Write the page of a run or an avatar file, and print where it is and how large.
@@ -29,9 +20,6 @@ def export_page(arguments: argparse.Namespace) -> int:
     from dyngs.export.html.page import write_page
     from dyngs.runs.opened import open_scene
 
-    for name, reason in _UNFIT.items():
-        if getattr(arguments, name) not in (None, False):
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with --format html: {reason}")
     source: Path = arguments.run_dir
     if arguments.out is None and is_avatar_file(source):
         raise DyngsError(f"{source}: where to? Give --out FILE.html")

@@ -8,8 +8,6 @@ from pathlib import Path
 from dyngs.cli.arguments import data_root, is_avatar_file, print_notes
 from dyngs.errors import DyngsError
 
-_UNFIT = ("time", "times", "static", "dynamic", "max_change", "up", "from_up", "sh_degree")
-
 
 def export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     """Write a person as a skinned mesh, or as Gaussians with joints, and print where the file is and how large.
@@ -22,11 +20,6 @@ def export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     from dyngs.runs.opened import FRAME_RATE, open_scene
 
     wanted = "--joints" if arguments.joints else "--format mesh"
-    for name in _UNFIT:
-        given = getattr(arguments, name)
-        if given is not None and given is not False:
-            reason = "the file has the rest pose, y up" if name != "max_change" else "it goes with --format dyngs"
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with {wanted}: {reason}")
     if arguments.joints and kind not in ("ply", "glb"):
         raise DyngsError(f"--joints goes with --format ply and glb, not with {kind}")
     suffix = ".ply" if kind == "ply" else ".glb"

@@ -1,12 +1,14 @@
 """Arguments that name files: every command says which it reads and which it writes, and no output replaces an input.
 
-Both tests walk the parser, so that a new command, or a new argument, cannot forget it.
+The first tests walk the parser, so that a new command, or a new argument, cannot forget it.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,19 +16,21 @@ import pytest
 
 from dyngs.cli import main, make_parser
 from dyngs.cli.arguments import input_path, input_word, output_path
-from dyngs.config.io import RESOLVED_NAME, load_config, packaged_preset, save_config
+from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.view.source import open_source
 
 INPUTS, OUTPUT = (input_path, input_word), output_path
 WORDS = {
+    "eval": {"overrides"},
     "data fit": {"overrides"},
     "data inspect": {"overrides", "format"},
     "data motion": {"clip"},
     "data sfm": {"overrides", "start"},
     "train": {"overrides", "host"},
-    "view": {"host"},
+    "view": {"host", "overrides"},
     "prune": {"overrides", "prune", "masks", "steps"},
-    "render": {"times", "view"},
-    "export": {"times"},
+    "render": {"times", "view", "overrides"},
+    "export": {"times", "overrides"},
     "tradeoff": {"overrides", "vary", "require", "minimize", "maximize"},
     "bench deform": {"kind"},
     "config": {"overrides"},
@@ -148,10 +152,95 @@ def test_overrides_are_read_and_written_as_well(
 ) -> None:
     capture = known["capture"]
     before = contents(tmp_path)
-    for out in (capture, capture / "images", capture / "images" / "1.jpg", tmp_path):
+    for out in (capture, capture / "images", capture / "images" / "1.jpg"):
         require_refused(["train", "static", f"data.root={capture}", f"run.dir={out}"], capsys)
         require_refused(["tradeoff", "static", f"data.root={capture}", "--out", str(out)], capsys)
     (tmp_path / "own.yaml").write_text("{}")
     require_refused(["train", str(tmp_path / "own.yaml"), f"run.dir={tmp_path / 'own.yaml'}"], capsys)
     (tmp_path / "own.yaml").unlink()
     assert contents(tmp_path) == before
+
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A run of 10 steps, and where its capture was moved to."""
+    folder = tmp_path_factory.mktemp("moved")
+    assert main(["data", "synth", "still", str(folder / "old"), "--size", "24", "--views", "6"]) == 0
+    words = [f"data.root={folder / 'old'}", "train.steps=10", "init.num_random=200", "run.threads=1"]
+    assert main(["train", "static", *words, f"run.dir={folder / 'my run'}"]) == 0
+    (folder / "old").rename(folder / "new place")
+    return folder / "my run", folder / "new place"
+
+
+READERS = (
+    "eval RUN",
+    "render RUN --out OUT/images",
+    "render RUN --time 0 --view 0 --out OUT/fixed",
+    "render RUN --path along --out OUT/frames --frames 2",
+    "export RUN --format cameras --out OUT/cameras",
+    "prune RUN --out OUT/pruned --prune 0.5 --steps 2",
+)
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_the_command_says_how_and_works_so(
+    command: str, moved: tuple[Path, Path], tmp_path: Path, capsys: Capture
+) -> None:
+    run, new = moved
+    before = (run / "config.yaml").read_bytes()
+    words = [word.replace("OUT", str(tmp_path)).replace("RUN", str(run)) for word in command.split()]
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert "no such folder" in error
+    said = shlex.split(error.split("`")[1])
+    assert said == ["dyngs", *words, "data.root=FOLDER"]
+    assert main([*said[1:-1], f"data.root={new}"]) == 0
+    assert (run / "config.yaml").read_bytes() == before
+    if command.startswith("prune"):
+        assert load_resolved(tmp_path / "pruned").data.root == new
+
+
+@pytest.mark.parametrize(("name", "suffix"), [("dyngs", ""), ("html", "/page.html"), ("ply", "/splats.ply")])
+def test_exports(name: str, suffix: str, moved: tuple[Path, Path], tmp_path: Path, capsys: Capture) -> None:
+    run, new = moved
+    out = tmp_path / f"out{suffix}"
+    assert main(["export", str(run), "--format", name, "--out", str(out), f"data.root={new}"]) == 0
+    assert "cannot be read" not in capsys.readouterr().err
+
+
+def test_view(moved: tuple[Path, Path], tmp_path: Path) -> None:
+    run, new = moved
+    without = open_source(run).load("my run")
+    assert any("if it was moved, add data.root=FOLDER" in note for note in without.notes)
+    opened = open_source(run, data_root=new).load("my run")
+    assert not opened.notes
+    assert opened.capture.root == new
+
+
+def test_other_words_are_refused(moved: tuple[Path, Path], capsys: Capture) -> None:
+    run, new = moved
+    for word in ("data.longest_side=9", "data.root=", "model.sh_degree=0"):
+        assert main(["eval", str(run), word]) == 2
+        assert "only data.root=FOLDER" in capsys.readouterr().err
+    assert main(["eval", str(run), f"data.root={new}/nowhere"]) == 2
+    assert capsys.readouterr().err.count("no such folder") == 1
+
+
+def test_resuming_notes_it_for_later_commands(
+    moved: tuple[Path, Path], capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, new = moved
+    before = (run / "config.yaml").read_bytes()
+    assert main(["train", "--resume", str(run), "train.steps=12"]) == 2
+    assert "data.root=FOLDER`" in capsys.readouterr().err
+    assert main(["train", "--resume", str(run), "data.root=nowhere"]) == 2
+    assert (run / "config.yaml").read_bytes() == before
+    monkeypatch.chdir(new.parent)
+    assert main(["train", "--resume", str(run), f"data.root={new.name}"]) == 0  # it is finished: only this is noted
+    assert load_resolved(run).data.root == new
+    assert main(["train", "--resume", str(run), "train.steps=12"]) == 0
+    assert main(["eval", str(run)]) == 0
+    assert json.loads((run / "metrics.json").read_text())["step"] == 12

@@ -52,7 +52,7 @@ def test_cameras_of_a_run_that_refined_none_are_those_of_the_capture(
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--format cameras --time 0.5", "--time does not go with"),
+        ("--format cameras --time 0", "--time does not go with"),
         ("--format cameras --static", "--static does not go with"),
         ("--format cameras --out cameras.ply", "--format cameras does not write"),
     ],

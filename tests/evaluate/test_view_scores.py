@@ -229,7 +229,7 @@ def test_refined_poses_stand_beside_those_as_given(
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
     stored = {}
-    for name, more in (("given", []), ("refined", ["--refine"]), ("former name", ["--refine-poses"])):
+    for name, more in (("given", []), ("refined", ["--refine"]), ("again", ["--refine"])):
         assert main(["eval", str(run), "--split", "pose", *more]) == 0
         stored[name] = json.loads((run / "metrics_pose.json").read_text())
     out = capsys.readouterr().out
@@ -242,7 +242,7 @@ def test_refined_poses_stand_beside_those_as_given(
         [{k: x for k, x in view.items() if k not in timed} for view in own["per_view"]] for own in (given, refined)
     ]
     assert views[0] == views[1], "as given is not touched"
-    own, again = refined["own_poses"], stored["former name"]["own_poses"]
+    own, again = refined["own_poses"], stored["again"]["own_poses"]
     assert own["psnr"] == refined["psnr_own_poses"] == again["psnr"]
     assert own["psnr_person"] == again["psnr_person"], "the same on every run"
     assert own["psnr_black"] > given["psnr_black"] - 0.1

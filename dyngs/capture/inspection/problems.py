@@ -252,7 +252,7 @@ def _image_problems(capture: Capture, deep: bool) -> list[str]:
                 channels[header.channels] += 1
     problems = listed(unreadable, str) + listed(sizes, str)
     if len(channels) > 1:
-        problems.append("images have different numbers of channels: " + counted(channels))
+        problems.append("images have different numbers of channels: " + tallied(channels))
     return problems
 
 
@@ -286,7 +286,7 @@ def transforms_file_problems(root: Path, known: str) -> list[str]:
     return [line for line in problems if line not in known]
 
 
-def counted(counter: Counter[Any]) -> str:
+def tallied(counter: Counter[Any]) -> str:
     """Return the most frequent keys with their counts."""
     return ", ".join(f"{key} ({count})" if len(counter) > 1 else f"{key}" for key, count in counter.most_common(6))
 

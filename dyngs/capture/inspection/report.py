@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.capture.first_points import checked_points
-from dyngs.capture.inspection.problems import counted, listed, problems_of, transforms_file_problems
+from dyngs.capture.inspection.problems import listed, problems_of, tallied, transforms_file_problems
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import camera_center
 from dyngs.data.images.lens import is_pinhole, kept_fraction
 from dyngs.data.times import distinct_times
-from dyngs.errors import DyngsError, printable, reading
+from dyngs.errors import DyngsError, counted, printable, reading
 from dyngs.files.containment import images_up_to, leaving_links
 
 SAME_LIGHT = 1.05
@@ -39,11 +39,11 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
     facts = [
         ("format", capture.format),
         ("views", ", ".join(f"{len(views)} {split}" for split, views in capture.splits.items() if views)),
-        ("sizes", counted(sizes)),
+        ("sizes", tallied(sizes)),
         ("cameras", str(len({view.camera_id for view in views}))),
         ("focal length", f"{_range(focal_px)} px"),
         ("field of view", f"{_range(fov_deg)} degrees across"),
-        ("lens", counted(lenses) + _kept(views)),
+        ("lens", tallied(lenses) + _kept(views)),
         *_exposures(views),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
         ("masks", _masks(views)),
