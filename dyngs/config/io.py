@@ -102,10 +102,13 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     body = layers.value_at(("data", "body"))
     if isinstance(body, str):
         layers.tree["data"]["body"] = str(file.parent.absolute() / body)
+    stored_root = layers.value_at(("data", "root"))
     layers.add_overrides(overrides)
     config = _validate(layers)
-    root = (data_root or config.data.root).absolute()
-    return config.model_copy(update={"data": config.data.model_copy(update={"root": root})})
+    root = data_root or config.data.root
+    if data_root is None and root == Path(str(stored_root)):
+        return config
+    return config.model_copy(update={"data": config.data.model_copy(update={"root": root.absolute()})})
 
 
 def save_config(config: Config, path: Path) -> None:
