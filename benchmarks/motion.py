@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, PointsInit, RandomInit, StaticModel, TrajectoryField
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
@@ -51,12 +51,14 @@ from dyngs.gaussians.scene import Scene
 from dyngs.metrics import Lpips
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.static.init import StartValues, initial_gaussians
-from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.static.rates import Rates
-from dyngs.static.training import FilterUpdate, StaticTraining
+from dyngs.gaussians.init import StartValues, initial_gaussians
+from dyngs.gaussians.optimizer import GaussianOptimizer
+from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.static.training import StaticTraining
 from dyngs.training.trainer import Trainer
-from dyngs.training.views import surroundings, training_cameras, training_times
+from dyngs.gaussians.init import surroundings
+from dyngs.models.views import training_cameras, training_times
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
 REST = 1.0

@@ -61,20 +61,15 @@ from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.captured import captured_motion
 from dyngs.human.template.load import load_template, rest_shape
 from dyngs.ops.device import device_for
-from dyngs.static.densify import DefaultDensifier, Densifier
-from dyngs.static.fixed import FixedDensifier
-from dyngs.static.init import StartValues, initial_gaussians
-from dyngs.static.mcmc import McmcDensifier
-from dyngs.static.optimizer import GaussianOptimizer
+from dyngs.gaussians.densify import DefaultDensifier, Densifier
+from dyngs.gaussians.densify import Densifier
+from dyngs.gaussians.init import StartValues, initial_gaussians
+from dyngs.gaussians.mcmc import McmcDensifier
+from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.static.scene import StaticScene
-from dyngs.static.training import FilterUpdate, StaticTraining
-from dyngs.training.background import (
-    IMAGES,
-    AlphaWeight,
-    background_colour,
-    evaluation_background,
-    measured_alpha_weight,
-)
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.static.training import StaticTraining
+from dyngs.models.views import IMAGES, AlphaWeight, background_colour, evaluation_background, measured_alpha_weight
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import exposures_of
 from dyngs.training.corrections.robust import RobustMasks
@@ -84,25 +79,13 @@ from dyngs.training.prediction import assemble_network
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
 from dyngs.training.sampler import ViewSampler
-from dyngs.training.schedule import (
-    deform_schedule,
-    densify_schedule,
-    filter_steps,
-    grad_threshold,
-    growth_per_change,
-    hold_out_until,
-    image_divisor,
-    rates_of,
-)
-from dyngs.training.state import OTHER_CONFIG, Checkpoint
+from dyngs.deform.schedule import deform_schedule
+from dyngs.gaussians.schedule import densify_schedule, filter_steps, grad_threshold, growth_per_change, rates_of
+from dyngs.models.schedule import hold_out_until, image_divisor
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.training.trainer import Trainer
-from dyngs.training.views import (
-    held_out_views,
-    resolved_background,
-    surroundings,
-    training_cameras,
-    training_times,
-)
+from dyngs.models.views import held_out_views, resolved_background, training_cameras, training_times
+from dyngs.gaussians.init import surroundings
 
 MAX_STANDING = 12
 """Cameras that stand still from which tracks are found, at most."""
@@ -445,7 +428,7 @@ def _densifier(config: Config, background: str, extent: float) -> Densifier:
             options = strategy.model_copy(update={"grad_threshold": grad_threshold(strategy, steps)})
             return DefaultDensifier(options, densify_schedule(strategy, steps, on_white), extent)
         case FixedStrategy():
-            return FixedDensifier()
+            return Densifier()
         case _:
             assert_never(strategy)
 

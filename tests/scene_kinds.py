@@ -26,7 +26,7 @@ from dyngs.human.template.load import default_template
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 from dyngs.state import State, part_of, tensors_of
-from dyngs.static.rates import Rates
+from dyngs.gaussians.schedule import Rates
 from dyngs.static.scene import StaticScene
 
 KINDS = ("static", *FIELDS, "masked", "human")

@@ -10,14 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.build import (
-    assemble,
-    resolved_background,
-    surroundings,
-    training_cameras,
-    training_times,
-    with_points,
-)
+from dyngs.kinds import assemble, with_points
+from dyngs.models.views import resolved_background, training_cameras, training_times
+from dyngs.gaussians.init import surroundings
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -39,11 +34,11 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
 from dyngs.state import tensors_of
-from dyngs.static.densify import DefaultDensifier
-from dyngs.static.fixed import FixedDensifier
-from dyngs.static.mcmc import McmcDensifier
+from dyngs.gaussians.densify import DefaultDensifier
+from dyngs.gaussians.densify import Densifier
+from dyngs.gaussians.mcmc import McmcDensifier
 from dyngs.static.scene import StaticScene
-from dyngs.training.background import AlphaWeight
+from dyngs.models.views import AlphaWeight
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +94,7 @@ def test_a_fixed_set_of_gaussians_stays(capture: Path) -> None:
         budget=BudgetConfig(max_gaussians=20),
     )
     trainer = assemble(config)
-    assert isinstance(trainer.densifier, FixedDensifier)
+    assert isinstance(trainer.densifier, Densifier)
     trainer.step()
     assert len(trainer.scene.gaussians) == 30, "a limit on their number removes some later on, none are added"
 
@@ -222,7 +217,7 @@ def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeyp
     def refuse(*_: object) -> None:
         raise AssertionError("triangulated again")
 
-    monkeypatch.setattr("dyngs.build.with_first_points", refuse)
+    monkeypatch.setattr("dyngs.kinds.with_first_points", refuse)
     again = assemble(config, restored=True)
     again.restore(trainer.checkpoint())
     assert again.step().loss == trainer.step().loss

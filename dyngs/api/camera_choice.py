@@ -15,7 +15,7 @@ from dyngs.api.candidate import Candidate, Choice, Comparison, Evidence
 from dyngs.api.small_runs import drawn
 from dyngs.config import Config, DynamicModel, StaticModel
 from dyngs.metrics import psnr
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 from dyngs.training.corrections.camera_fit import fitted_to_image
 from dyngs.training.trainer import Trainer
 

@@ -18,7 +18,7 @@ from dyngs.config import Config, DynamicModel, StaticModel
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.metrics import psnr
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 from dyngs.training.trainer import Trainer
 
 CLEAR_GAIN = 0.1

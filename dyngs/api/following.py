@@ -17,7 +17,7 @@ from enum import IntEnum
 import torch
 from safetensors.torch import load, save
 
-from dyngs.build import build
+from dyngs.kinds import build
 from dyngs.config import Config
 from dyngs.errors import DyngsError
 from dyngs.ops.device import deterministic, device_for
@@ -27,7 +27,7 @@ from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.loop import Trainable
 from dyngs.training.processes import Processes
-from dyngs.training.state import Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.training.trainer import Trainer
 
 

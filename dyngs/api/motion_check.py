@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, DefaultStrategy, PointsInit, StaticModel
 from dyngs.data.capture import Capture, View
 from dyngs.data.frame_selection import evenly_spaced
@@ -16,7 +16,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.times import are_scattered
 from dyngs.deform.evidence import MIN_DIFFERING, Evidence, Verdict, agreement_over_time, differing_fraction
 from dyngs.deform.still_error import cameras_in_place, signed_errors
-from dyngs.training.background import evaluation_background
+from dyngs.models.views import evaluation_background
 from dyngs.training.trainer import Trainer
 
 LONGEST_SIDE = 96

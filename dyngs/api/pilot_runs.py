@@ -15,7 +15,7 @@ from statistics import fmean
 from dyngs.api.small_runs import held_out_scores, is_gain, trained
 from dyngs.config import Config, ControlNodesField, DynamicModel, NetworkColour
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 
 FRACTION, FEWEST_STEPS = 0.25, 1000
 """A pilot run has at most this fraction of the run's steps; with fewer steps than these it says nothing."""

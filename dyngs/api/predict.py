@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, DataConfig, HumanPredictorModel
 from dyngs.config.io import load_config, load_resolved, packaged_preset
 from dyngs.config.kinds import network_of, person_of
@@ -22,8 +22,8 @@ from dyngs.human.template.load import load_template
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import new_folder, require_empty
-from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.static.rates import Rates
+from dyngs.gaussians.optimizer import GaussianOptimizer
+from dyngs.gaussians.schedule import Rates
 from dyngs.training.adaptation import adapt_network
 from dyngs.training.prediction import filmed, human_options, load_network, new_network, scene_of
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from dyngs.api.train import num_cores, train
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.config.kinds import network_of, person_of
@@ -29,7 +29,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, new_folder, require_empty
 from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
-from dyngs.training.state import Checkpoint
+from dyngs.models.checkpoint import Checkpoint
 
 SEARCH_STEPS = 1000
 """Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise."""

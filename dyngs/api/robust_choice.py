@@ -13,7 +13,7 @@ from dyngs.api.candidate import Candidate, Choice, Comparison
 from dyngs.api.small_runs import drawn
 from dyngs.config import Config, StaticModel
 from dyngs.metrics import psnr
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 from dyngs.training.trainer import Trainer
 
 EXPLAINED = 0.8

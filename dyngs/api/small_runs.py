@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import BudgetConfig, Config, DefaultStrategy, FixedStrategy, McmcStrategy, PruneConfig, Strategy
 from dyngs.data.capture import View
 from dyngs.data.loader import Image

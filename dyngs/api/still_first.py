@@ -17,7 +17,7 @@ from torch import Tensor
 from dyngs.api.motion_check import motion_evidence
 from dyngs.api.pilot_runs import with_choices
 from dyngs.api.small_runs import FEWEST_VIEWS, drawn, held_out_scores, hold_out_every, is_gain, small_run
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, DynamicModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.config.still import as_still
@@ -32,10 +32,10 @@ from dyngs.gaussians.scene import Scene
 from dyngs.metrics import psnr
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import STILL_FOLDER, begin
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 from dyngs.training.events import Event, Message, StepDone
 from dyngs.training.loop import Loop
-from dyngs.training.schedule import hold_out_until
+from dyngs.models.schedule import hold_out_until
 from dyngs.training.trainer import Trainer
 
 STILL_STEPS = 2000

@@ -22,7 +22,7 @@ from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, first_fit, refitted
-from dyngs.build import build
+from dyngs.kinds import build
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.errors import DyngsError

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, DeformField
 from dyngs.config.io import load_config
 from dyngs.config.kinds import field_of

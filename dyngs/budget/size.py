@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.build import restored_scene
+from dyngs.kinds import restored_scene
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
@@ -23,7 +23,7 @@ from dyngs.storage.drawable import drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.quantize import step_below
-from dyngs.training.state import Checkpoint
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7

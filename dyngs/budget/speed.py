@@ -28,9 +28,9 @@ from dyngs.prune.selection import highest
 from dyngs.prune.stage import default_scores, training_quality
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE
-from dyngs.training.schedule import scaled
+from dyngs.models.schedule import scaled
 from dyngs.training.trainer import Trainer
-from dyngs.training.views import training_cameras
+from dyngs.models.views import training_cameras
 
 FEW = 300
 """Number of Gaussians with which the fixed cost of drawing is measured."""

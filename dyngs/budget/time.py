@@ -14,13 +14,14 @@ from statistics import fmean
 from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config
 from dyngs.config.kinds import harmonics_measured_after
 from dyngs.errors import DyngsError
 from dyngs.runs.config_file import write_config
 from dyngs.training.events import Event, StepDone
-from dyngs.training.schedule import image_divisor, motion_begins_after, scaled
+from dyngs.models.schedule import image_divisor, scaled
+from dyngs.deform.schedule import motion_begins_after
 from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.deform.field import Offsets, deformed
 from dyngs.deform.nodes import spread_out
 from dyngs.gaussians import Gaussians
-from dyngs.static.scene import filtered
+from dyngs.gaussians.filters import filtered
 
 PIECES = 16
 """Number of pieces, at most, that what moves is divided into."""

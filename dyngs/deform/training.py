@@ -28,20 +28,19 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.parameters import Parameters
-from dyngs.gaussians.scene import Moment, Scene, Variant
+from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, fields_moved_to, with_role
-from dyngs.static.filters import FILTER_VARIANCE, filter_std
-from dyngs.static.rates import Rates
-from dyngs.static.training import FilterUpdate
+from dyngs.gaussians.filters import FILTER_VARIANCE, filter_std
+from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.filters import FilterUpdate
 
 SURELY_MOVING = 1.5
 """Multiple of ``motion_threshold`` above which an error always counts as motion."""
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
-TRIAL, MIN_TRIAL = 0.015, 40
-"""Steps of a trial, as a fraction of the run, and fewest of them."""
 MIN_MOVING_FRACTION = 0.02
 """Fraction of surely moving Gaussians up to which the scene counts as still."""
 
@@ -97,7 +96,7 @@ class TrainingViews:
     matched: ComparedViews | None = None
 
 
-class DynamicTraining:
+class DynamicTraining(SceneTraining[DynamicScene]):
     """See ``SceneTraining``.
 
     Attributes:
@@ -134,16 +133,16 @@ class DynamicTraining:
         if scene.field is not None:
             scene.field.extend(seen, self._window.bounds(step))
 
-    def moment(self, scene: DynamicScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: DynamicScene, image: Image, step: int) -> GaussianTimeStep:
         """Return the moment drawn for ``image`` at its time, and the regularizers of motion."""
         if scene.field is None:
-            return scene.moment(image.time)
+            return scene.time_step(image.time)
         time = self._jittered(image.time or 0.0, step)
         gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
         penalties = scene.field.penalties(time) | self._sparsity(offsets)
         if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the images
             penalties.pop("node acceleration", None)
-        return Moment(gaussians, image.time, None, penalties)
+        return GaussianTimeStep(gaussians, image.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         """Update the field."""
@@ -171,10 +170,19 @@ class DynamicTraining:
             scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         return self._frozen(scene) if step in self.schedule.splits else scene
 
-    def grown(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene with random Gaussians to begin motion with; None where a static model explains all."""
-        if step != self.schedule.fine:
+    def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
+        """Return the scene where motion begins, nodes form rigid groups, or only motion that pays is to stay."""
+        if step == self.schedule.fine:
+            return self._with_motion(scene)
+        if scene.field is None:
             return None
+        if step == self.schedule.groups:
+            grouped = scene.field.with_groups(scene.gaussians.means.detach()[scene.moving])
+            return None if grouped is None else (replace(scene, field=grouped), EditResult(None))
+        return self._with_paid_motion(scene) if step in self.schedule.splits[-1:] else None
+
+    def _with_motion(self, scene: DynamicScene) -> tuple[DynamicScene, EditResult] | None:
+        """Return the scene with random Gaussians to begin motion with; None where a static model explains all."""
         now = scene.gaussians
         found = self.capture.still_errors(lambda _: now)
         floor = self.options.motion_threshold
@@ -203,26 +211,6 @@ class DynamicTraining:
         field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
 
-    def variant(self, scene: DynamicScene, step: int) -> Variant[DynamicScene] | None:
-        """Return the scene with its nodes in rigid groups, or with time windows, once all times are seen.
-
-        After the last freezing, with motion only where it pays.
-        """
-        if scene.field is not None and step in self.schedule.splits[-1:]:
-            return self._with_paid_motion(scene)
-        if scene.field is None or step not in (self.schedule.groups, self.schedule.lifetimes):
-            return None
-        means = scene.gaussians.means.detach()[scene.moving]
-        if step == self.schedule.groups:
-            name, key, field = "rigid groups of control nodes", "rigid_groups", scene.field.with_groups(means)
-        else:
-            name, key, field = "time windows of moving Gaussians", "lifetimes", scene.field.with_lifetimes(means)
-        if field is None:
-            return None
-        steps = self.schedule.rates.steps
-        count = min(max(MIN_TRIAL, round(TRIAL * steps)), (steps - step) // 2)
-        return Variant(name, replace(scene, field=field), 0 if key in field.taken_untried else count)
-
     def all_moving(self, scene: DynamicScene, extent: float) -> DynamicScene:
         if not scene.is_static:
             return scene
@@ -231,13 +219,9 @@ class DynamicTraining:
         field = new_field(self.options.deform, setup, torch.Generator()).to(means.device)
         return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
-    def follow(self, edit: TopologyEdit) -> None:
-        """Do nothing: nothing is kept per Gaussian."""
-
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> DynamicScene:
-        scene = DynamicScene.restored(self.options, gaussians, tensors)
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
         self._on_its_way("tracked" in tensors)
-        return replace(scene, colour=like.colour, options=like.options, background=like.background)
+        return DynamicScene.restored(self.options, gaussians, tensors)
 
     def state(self) -> State:
         """Return whether tracks are known, so that all times are trained on."""
@@ -284,7 +268,7 @@ class DynamicTraining:
         before, after = (views.error(lambda time, x=x: x.deformed_at(time)[0], times) for x in (scene, tried))
         return tried if after < before else scene
 
-    def _with_paid_motion(self, scene: DynamicScene) -> Variant[DynamicScene] | None:
+    def _with_paid_motion(self, scene: DynamicScene) -> tuple[DynamicScene, EditResult] | None:
         """Return the scene in which only pieces move whose motion pays; None where no view is held out to tell."""
         field, scores = scene.field, self.capture.held_out
         if field is None or scores is None or not len(scene.moving):
@@ -294,7 +278,7 @@ class DynamicTraining:
         motion = measure_motion(field, now.select(scene.moving), self.times, torch.ones_like(means[:, 0]))
         part = MovingPart(now, scene.moving, lambda time: field.offsets(means, time), motion.mean, scene.filter_std)
         found = paid_motion(part, scores)
-        return Variant("motion", _with_frozen(scene, motion.mean, found.stays), 0, str(found))
+        return _with_frozen(scene, motion.mean, found.stays), EditResult(None, finding=f"motion {found}")
 
     def _jittered(self, time: float, step: int) -> float:
         """Return ``time`` with the annealed noise of Deformable-3DGS (Yang et al. 2024), against overfitting."""

@@ -21,7 +21,7 @@ from dyngs.metrics import psnr
 from dyngs.ops.device import CPU, finish
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
-from dyngs.training.background import evaluation_background
+from dyngs.models.views import evaluation_background
 
 COMPARED_VIEWS = 20
 """Number of views compared per split; enough for before and after, not for a benchmark."""

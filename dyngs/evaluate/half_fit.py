@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 from dyngs.metrics import psnr
 
 

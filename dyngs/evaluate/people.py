@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.data.images.silhouettes import silhouette_box
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 from dyngs.metrics import Lpips, psnr, ssim
 
 

@@ -30,8 +30,8 @@ from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
-from dyngs.training.background import evaluation_background
-from dyngs.training.views import training_cameras
+from dyngs.models.views import evaluation_background
+from dyngs.models.views import training_cameras
 
 REGION_METRICS: dict[str, RegionName] = {
     "psnr_foreground": "foreground",

@@ -20,7 +20,8 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.people import person_scores
 from dyngs.evaluate.regions import Regions, RegionScores
-from dyngs.gaussians.rendering import Rendering, RenderOptions
+from dyngs.models.renderable import Rendering
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, flip, psnr, ssim
@@ -160,7 +161,7 @@ def _timed_render(
         device = scene.gaussians.means.device
         finish(device)
         start = time.perf_counter()
-        moment = scene.moment(image.time)
+        moment = scene.time_step(image.time)
         finish(device)
         deformed = time.perf_counter()
         rendering = scene.render(image.cameras, moment, options=options, background=background)

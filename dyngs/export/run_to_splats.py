@@ -136,7 +136,7 @@ def splats_at(run: LoadedRun, scene: Scene, time: float, how: Writing = AS_THEY_
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked for."""
     model = run.config.model
     with torch.no_grad():
-        moment = scene.moment(time)
+        moment = scene.time_step(time)
     gaussians, shader = moment.gaussians, scene.shader(moment)
     comments = [f"step: {run.step}"] if scene.is_static else [f"step: {run.step}", f"dyngs time {time!r}"]
     if shader is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from dyngs.build import restored_scene
+from dyngs.kinds import restored_scene
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
@@ -20,7 +20,7 @@ from dyngs.storage.drawable import FIELD, drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
-from dyngs.training.state import Checkpoint
+from dyngs.models.checkpoint import Checkpoint
 
 MISSED = 1.05
 """A file whose images change by so many times what is allowed is not written; less is rounding of the drawing."""

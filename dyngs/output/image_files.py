@@ -117,7 +117,7 @@ def write_split_images(
     with _FrameWriter(out_dir, output, files_of(capture)) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             image = loader[i]
-            frame = render_frame(scene, scene.moment(image.time), image.cameras, options, background)
+            frame = render_frame(scene, scene.time_step(image.time), image.cameras, options, background)
             writer.write(stem, frame)
             report("views", i + 1, len(views))
             if i in shown:

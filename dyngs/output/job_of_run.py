@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyngs.build import training_cameras
+from dyngs.models.views import training_cameras
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View

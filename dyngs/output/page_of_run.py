@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.build import training_cameras
+from dyngs.models.views import training_cameras
 from dyngs.camera import Cameras
 from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture

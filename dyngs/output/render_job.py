@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Moment, Scene
+from dyngs.gaussians.scene import GaussianTimeStep, Scene
 from dyngs.output.camera_paths import CameraPath
 
 DEFAULT_FRAMES = 120
@@ -92,7 +92,7 @@ class RenderJobOptions:
 
 def render_frame(
     scene: Scene,
-    moment: Moment,
+    moment: GaussianTimeStep,
     camera: Cameras,
     options: RenderOptions = DEFAULT_OPTIONS,
     background: Tensor | None = None,
@@ -123,7 +123,7 @@ def job_frames(job: RenderJob) -> Iterator[Frame]:
         time = None if times is None or job.scene.is_static else times[i]
         if moment is None or time != moment_time:
             with torch.no_grad():
-                moment, moment_time = job.scene.moment(time), time
+                moment, moment_time = job.scene.time_step(time), time
         yield render_frame(job.scene, moment, job.path.cameras.select(i), job.options, job.background)
 
 

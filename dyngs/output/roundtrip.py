@@ -69,7 +69,7 @@ def compare_run(run: LoadedRun, scene: Scene, time: float, meant: SplatFile, rea
     """
     options = render_options(run.config.model)
     with torch.no_grad():
-        moment = scene.moment(time)
+        moment = scene.time_step(time)
         for cameras in (capture_cameras(run), with_scene(around(meant), inverse(meant.turned))):
             if cameras is None:
                 continue

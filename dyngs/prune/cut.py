@@ -17,7 +17,7 @@ from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_depen
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.ops.transfer import sent
 from dyngs.prune.stage import remove_
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 from dyngs.training.trainer import Trainer
 
 
@@ -134,5 +134,5 @@ def _looks(trainer: Trainer, indices: Sequence[int], background: Tensor) -> Iter
     """Yield training views as they are drawn now."""
     for image in (trainer.images[i] for i in indices):
         with torch.no_grad():
-            now = trainer.training.moment(trainer.scene, image, trainer.done).gaussians.detach()
+            now = trainer.training.time_step(trainer.scene, image, trainer.done).gaussians.detach()
         yield MeasuredView(now, image.cameras, image.composite(background), image.mask)

@@ -16,7 +16,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import StaticModel
 from dyngs.gaussians.rendering import contributions
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer

@@ -28,7 +28,7 @@ from dyngs.gaussians.scene import Scene
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
 from dyngs.prune.stage import PROBED_VIEWS, chosen_scores, probe_images, quality_of
 from dyngs.storage.coarsest import CoarseFile, coarsest_file
-from dyngs.training.state import Checkpoint
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.trainer import Trainer
 
 HELD_OUT_FRACTION, MOST_HELD_OUT = 1 / 8, 32

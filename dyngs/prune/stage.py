@@ -26,8 +26,8 @@ from dyngs.metrics import psnr
 from dyngs.ops.transfer import sent
 from dyngs.prune.score import Importance, ScoringViews, importance
 from dyngs.prune.selection import highest
-from dyngs.static.fixed import FixedDensifier
-from dyngs.training.background import background_colour
+from dyngs.gaussians.densify import Densifier
+from dyngs.models.views import background_colour
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer
@@ -105,7 +105,7 @@ def remove_(trainer: Trainer, scores: Tensor | None) -> None:
     if scores is not None:
         kept = highest(scores, options.fraction)
         trainer.keep(kept)
-    trainer.densifier = FixedDensifier()
+    trainer.densifier = Densifier()
     if options.mask_times > 1 and field_of(trainer.config) is not None and not whole.is_static:
         trainer.scene = replace(trainer.scene, masks=_masks(trainer, whole, kept))
 

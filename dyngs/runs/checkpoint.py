@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from dyngs.build import restored_scene
+from dyngs.kinds import restored_scene
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.config.kinds import network_of
@@ -27,7 +27,7 @@ from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene
 from dyngs.storage.file import read_scene
-from dyngs.training.state import Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"

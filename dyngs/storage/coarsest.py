@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from dyngs.build import restored_scene
+from dyngs.kinds import restored_scene
 from dyngs.config import Config
 from dyngs.gaussians.scene import Scene
 from dyngs.storage.drawable import completed, drawable
@@ -14,7 +14,7 @@ from dyngs.storage.measure import storage_plan
 from dyngs.storage.precision import rounded
 from dyngs.storage.quantize import step_below
 from dyngs.storage.tensors import COARSENESS
-from dyngs.training.state import Checkpoint
+from dyngs.models.checkpoint import Checkpoint
 
 FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))
 """Factors on the usual steps that are tried, by bisection."""

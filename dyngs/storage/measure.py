@@ -10,7 +10,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from dyngs.build import restored_scene
+from dyngs.kinds import restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import Config
 from dyngs.data.capture import Capture, View
@@ -28,9 +28,9 @@ from dyngs.storage.precision import (
     measured_precision,
 )
 from dyngs.storage.tensors import COARSENESS
-from dyngs.training.background import evaluation_background
-from dyngs.training.state import Checkpoint
-from dyngs.training.views import training_cameras
+from dyngs.models.views import evaluation_background
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.views import training_cameras
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""

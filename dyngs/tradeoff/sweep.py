@@ -30,7 +30,7 @@ from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
 from dyngs.tradeoff.variants import Variant, Variation, single_changes
-from dyngs.training.background import evaluation_background
+from dyngs.models.views import evaluation_background
 
 TIMED_VIEWS = 8
 """Number of views for timing, evenly spread over the split; quality is measured on all."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores, train
-from dyngs.build import assemble, restored_scene
+from dyngs.kinds import assemble, restored_scene
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.kinds import field_of, network_of

@@ -12,17 +12,11 @@ from dyngs.config import AutoColour, Config, DynamicModel, HumanModel, TrainConf
 from dyngs.config.kinds import harmonics_measured_after, network_of
 from dyngs.deform.training import DeformSchedule
 from dyngs.errors import DyngsError
-from dyngs.static.rates import Rates
+from dyngs.gaussians.schedule import Rates
 from dyngs.training.corrections.exposure import WARM_UP
-from dyngs.training.schedule import (
-    PUBLISHED_STEPS,
-    deform_schedule,
-    hold_out_until,
-    means_rate,
-    motion_begins_after,
-    rates_of,
-    scaled,
-)
+from dyngs.models.schedule import PUBLISHED_STEPS, hold_out_until, scaled
+from dyngs.deform.schedule import deform_schedule, motion_begins_after
+from dyngs.gaussians.schedule import means_rate, rates_of
 
 MOST_FRACTION = 1 - 1e-9
 """Largest fraction of a run, for keys that must be below 1."""

@@ -9,7 +9,7 @@ from typing import Protocol
 from dyngs.errors import DyngsError
 from dyngs.ops.adam import Count
 from dyngs.training.events import Event, Listener, Message, Started, StepDone, StepReport, TotalChanged
-from dyngs.training.state import Checkpoint
+from dyngs.models.checkpoint import Checkpoint
 
 
 class Trainable(Protocol):

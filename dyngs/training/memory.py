@@ -26,7 +26,7 @@ from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.ops.device import gpu_memory, num_gpus
 from dyngs.training.limits import num_field_values
-from dyngs.training.schedule import densify_schedule, growth_per_change
+from dyngs.gaussians.schedule import densify_schedule, growth_per_change
 from dyngs.training.trainer import Trainer
 
 COPIES = 7

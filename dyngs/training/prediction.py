@@ -13,7 +13,7 @@ from dyngs.config.kinds import network_of
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 from dyngs.gaussians.scene import render_options
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
@@ -27,12 +27,12 @@ from dyngs.ops.device import CPU, device_for
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.transfer import sent
 from dyngs.state import fields_moved_to
-from dyngs.static.rates import Rates
+from dyngs.gaussians.schedule import Rates
 from dyngs.tensor_checks import require_tensor
-from dyngs.training.background import background_colour, evaluation_background
+from dyngs.models.views import background_colour, evaluation_background
 from dyngs.training.events import StepReport
 from dyngs.training.sampler import ViewSampler
-from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 
 WARM_UP = 0.05
 """Fraction of the run in which the highest learning rate is reached."""
@@ -127,7 +127,7 @@ class NetworkTrainer:
         sitter, maps = person.sitter_on(self.device), person.maps(choice, self.device)
         avatar = predict_gaussians(sitter, maps, self.mean, self.network, self.model.min_silhouette_fraction)
         scene, training = scene_of(human_options(self.model), avatar, Rates(1))
-        moment = training.moment(scene, targets[0], step)
+        moment = training.time_step(scene, targets[0], step)
         total = torch.zeros((), device=self.mean.device)
         for image in targets:
             rendering = scene.render(image.cameras, moment, options=drawing, background=background)

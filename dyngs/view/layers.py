@@ -13,8 +13,8 @@ from torch.nn import functional
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.files.write import to_uint8
-from dyngs.gaussians.rendering import Rendering
-from dyngs.gaussians.scene import Moment, Scene
+from dyngs.models.renderable import Rendering
+from dyngs.gaussians.scene import GaussianTimeStep, Scene
 from dyngs.output.contact_sheet import color_map, depth_to_rgb
 from dyngs.output.render_job import resize_cameras
 from dyngs.view.viewed import Viewed
@@ -126,7 +126,7 @@ def _rendering(viewed: Viewed, part: Part, camera: Cameras, time: float | None, 
     scene = _part(viewed, part)
     options = replace(viewed.options, depth="expected") if with_depth else viewed.options
     background = viewed.background.to(scene.gaussians.means.device)
-    made = scene.render(camera, viewed.moment(part, scene, time), options=options, background=background)
+    made = scene.render(camera, viewed.time_step(part, scene, time), options=options, background=background)
     return made.to(device="cpu")
 
 
@@ -150,7 +150,7 @@ def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> 
             moves[scene.rows] = True
         coloured = coloured.select(moves if part == "moving" else ~moves)
     plain = replace(scene, colour=None, background=None)
-    made = plain.render(camera, Moment(coloured, time), options=replace(viewed.options, sh_degree=0))
+    made = plain.render(camera, GaussianTimeStep(coloured, time), options=replace(viewed.options, sh_degree=0))
     return to_uint8(made.rgb[0].clamp(0, 1).cpu().numpy())
 
 

@@ -13,7 +13,7 @@ from dyngs.config import Config
 from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
-from dyngs.training.background import evaluation_background
+from dyngs.models.views import evaluation_background
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.gate import free_port

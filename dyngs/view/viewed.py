@@ -22,7 +22,7 @@ from dyngs.evaluate.report import scene_of_split
 from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.export.avatar import read_avatar
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Moment, Scene, render_options
+from dyngs.gaussians.scene import GaussianTimeStep, Scene, render_options
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction
 from dyngs.output.aim import look_at_point
@@ -33,8 +33,8 @@ from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.splats.formats import known_format, read_splats
 from dyngs.splats.splat_file import splat_options
 from dyngs.static.scene import StaticScene
-from dyngs.training.background import evaluation_background
-from dyngs.training.views import training_cameras
+from dyngs.models.views import evaluation_background
+from dyngs.models.views import training_cameras
 
 _STILL_SECONDS = 4.0
 """Seconds from time 0 to 1 where nobody knows."""
@@ -136,11 +136,11 @@ class Viewed:
             self.derived[name] = compute()
         return self.derived[name]
 
-    def moment(self, name: str, scene: Scene, time: float | None) -> Moment:
+    def time_step(self, name: str, scene: Scene, time: float | None) -> GaussianTimeStep:
         """Return ``scene``, this one or the part ``name`` of it, at a time; that of the last time is kept."""
         kept = self.derived.get(f"moment {name}")
         if kept is None or kept[0] != time:
-            kept = (time, scene.moment(time))
+            kept = (time, scene.time_step(time))
             self.derived[f"moment {name}"] = kept
         return kept[1]
 

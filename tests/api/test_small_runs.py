@@ -9,7 +9,7 @@ import pytest
 from tiny_fields import busy_config
 
 from dyngs.api.small_runs import SMALL_GAUSSIANS, SMALL_SIDE, hold_out_every, is_gain, small_run
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import BudgetConfig, DefaultStrategy, TrainConfig
 from dyngs.data.capture import View
 

@@ -15,7 +15,7 @@ from tiny_fields import KINDS, busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import (
     Config,
     DataConfig,
@@ -320,7 +320,7 @@ def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path
     assert scene.is_static == (steps == 2)
     for time in (0.0, 0.37, 1.0):
         image = replace(trainer.images[0], time=time)
-        drawn = trainer.training.moment(trainer.scene, image, steps + 1).gaussians
+        drawn = trainer.training.time_step(trainer.scene, image, steps + 1).gaussians
         for name, x in scene.at(time).tensors().items():
             torch.testing.assert_close(x, drawn.tensors()[name].detach(), rtol=1e-6, atol=1e-7)
 

@@ -10,7 +10,7 @@ from tiny_fields import busy_config
 
 from dyngs.api.train import train
 from dyngs.budget.count import CountLimit
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import (
     BudgetConfig,
     Config,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from limited import limited, said
 
 from dyngs.budget.run import STAGES, stage
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, StaticModel, TrainConfig
 from dyngs.prune.stage import training_quality
 from dyngs.training.events import Event, Message, TopologyChanged

@@ -10,7 +10,7 @@ import torch
 
 from dyngs.api.train import train
 from dyngs.budget.size import write_within
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import BudgetConfig, Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture

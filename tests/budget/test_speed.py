@@ -24,7 +24,7 @@ from dyngs.budget.speed import (
     drawing_seconds,
     least_seconds,
 )
-from dyngs.build import assemble, restored_scene
+from dyngs.kinds import assemble, restored_scene
 from dyngs.config import (
     BudgetConfig,
     Config,

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_fields import busy_config, tiny_options
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config
 from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.scene import DynamicScene

@@ -14,7 +14,7 @@ from scenes import look_around, weights
 from tiny_fields import KINDS, busy_config, cloud, stir, stirred_field, tiny_field, tiny_options, write_tiny_capture
 from torch import Tensor
 
-from dyngs.build import assemble, restored_scene
+from dyngs.kinds import assemble, restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
 from dyngs.deform.control_nodes import ControlNodes

@@ -9,7 +9,7 @@ from flat_wall import BLACK, cameras_before_wall, seen_from
 
 from dyngs.data.loader import Image
 from dyngs.evaluate.half_fit import right_half_scores
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 
 
 def image_and_rendering() -> tuple[Image, Rendering]:

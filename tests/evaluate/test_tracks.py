@@ -24,7 +24,7 @@ from dyngs.data.true_tracks import TrueTracks, read_true_tracks
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.training.views import training_cameras
+from dyngs.models.views import training_cameras
 
 
 def imported(path: str) -> ModuleType:

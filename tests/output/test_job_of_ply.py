@@ -71,6 +71,6 @@ def test_exported_file_is_drawn_like_the_run(tmp_path) -> None:
     options = splat_options(splat)
     assert (options.mode, options.eps2d) == (RasterizeMode.ANTIALIASED, 0.1)
     scenes = [StaticScene(gaussians=x) for x in (two_balls(), splat.gaussians)]
-    wanted, got = (render_frame(scene, scene.moment(None), cameras_around(1), options) for scene in scenes)
+    wanted, got = (render_frame(scene, scene.time_step(None), cameras_around(1), options) for scene in scenes)
     np.testing.assert_array_equal(got.rgb, wanted.rgb)
     assert splat_options(SplatFile(two_balls())) == RenderOptions()

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dyngs.api.train import train
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture

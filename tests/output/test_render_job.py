@@ -65,7 +65,7 @@ def test_each_frame_shows_the_scene_at_its_time() -> None:
     scene, times = moving_scene(Sliding()), (0.0, 0.3, 1.0)
     frames = list(job_frames(RenderJob(scene, static_path(camera(), times))))
     for frame, time in zip(frames, times, strict=True):
-        np.testing.assert_array_equal(frame.rgb, render_frame(scene, scene.moment(time), camera()).rgb)
+        np.testing.assert_array_equal(frame.rgb, render_frame(scene, scene.time_step(time), camera()).rgb)
     assert np.abs(frames[0].rgb - frames[2].rgb).max() > 0.1
 
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from tiny_fields import busy_config
 
-from dyngs.build import assemble, restored_scene
+from dyngs.kinds import assemble, restored_scene
 from dyngs.config import Config, DynamicModel
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, cut_config, field_size
-from dyngs.training.state import Checkpoint
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dyngs.api.train import train
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.camera import Cameras
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import PruneConfig
 from dyngs.prune.cut import Cut
 from dyngs.prune.search import Candidate, Limit, Search, _fewest, _halved, evenly_held_out

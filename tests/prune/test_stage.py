@@ -11,7 +11,7 @@ from tiny_fields import KINDS, busy_config
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.camera import Cameras
 from dyngs.config import (
     Config,
@@ -28,7 +28,7 @@ from dyngs.data.frame_selection import evenly_spaced
 from dyngs.deform.scene import DynamicScene
 from dyngs.prune.stage import Pruned, PruneStage, distinct_cameras, prune_
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.static.fixed import FixedDensifier
+from dyngs.gaussians.densify import Densifier
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop, Stopwatch
 from dyngs.training.trainer import Trainer
@@ -103,7 +103,7 @@ def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
     before = len(trainer.scene.gaussians)
     found = prune_(trainer)
     assert found.before == before
-    assert isinstance(trainer.densifier, FixedDensifier)
+    assert isinstance(trainer.densifier, Densifier)
     for _ in range(4):
         trainer.step()
     assert len(trainer.scene.gaussians) == found.after == before - before // 2
@@ -140,7 +140,7 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     scene = trainer.scene
     assert scene.masks is not None
     image = trainer.images[3]
-    drawn = trainer.training.moment(scene, image, trainer.done + 1)
+    drawn = trainer.training.time_step(scene, image, trainer.done + 1)
     active = scene.masks.active(scene.masks.interval(image.time or 0.0))
     assert len(drawn.gaussians) == len(active)
     drawn.gaussians.means.sum().backward()

@@ -17,7 +17,7 @@ import torch
 from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
-from dyngs.build import restored_scene
+from dyngs.kinds import restored_scene
 from dyngs.config import Config, DataConfig, RunConfig, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
@@ -35,7 +35,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.static.filters import fuse_filter
+from dyngs.gaussians.filters import fuse_filter
 from dyngs.storage.drawable import drawable
 
 REPOSITORY = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ import pytest
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.runs.remaining import RemainingTime
-from dyngs.training.schedule import image_divisor
+from dyngs.models.schedule import image_divisor
 
 STEPS = 6000
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from moving_scene import write_moving_run
 
-from dyngs.build import restored_scene
+from dyngs.kinds import restored_scene
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import Scene
 from dyngs.runs.checkpoint import latest_checkpoint

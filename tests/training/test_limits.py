@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tiny_fields import busy_config, tiny_options, write_tiny_capture
 
 from dyngs.api.train import train
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import (
     BudgetConfig,
     Config,

@@ -10,7 +10,7 @@ import pytest
 from pretend_gpu import GPU, pretend_gpu
 from tensor_bytes import TensorBytes
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import (
     Config,
     DataConfig,
@@ -72,7 +72,7 @@ def _config(capture: Path, **changes: object) -> Config:
 
 
 def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     monkeypatch.setattr(memory, "card_memory", lambda _: (3 * GB, 8 * GB))
     monkeypatch.setattr("dyngs.data.loader.card_memory", lambda _: (2000, 8 * GB))
     config = _config(capture, strategy=DefaultStrategy(max_gaussians=10**7), train=TrainConfig(steps=30_000))

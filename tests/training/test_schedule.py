@@ -9,19 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
-from dyngs.static.rates import Rates
-from dyngs.training.schedule import (
-    MAX_GROWTH,
-    MIN_RESET_GAP,
-    active_sh_degree,
-    deform_schedule,
-    densify_schedule,
-    filter_steps,
-    grad_threshold,
-    growth_per_change,
-    image_divisor,
-    means_rate,
-)
+from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import MAX_GROWTH, MIN_RESET_GAP, active_sh_degree, densify_schedule, filter_steps, grad_threshold, growth_per_change, means_rate
+from dyngs.deform.schedule import deform_schedule
+from dyngs.models.schedule import image_divisor
 
 
 def test_at_30000_steps_it_is_the_published_one() -> None:

@@ -16,7 +16,7 @@ import torch
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
-from dyngs.build import assemble, restored_scene
+from dyngs.kinds import assemble, restored_scene
 from dyngs.config import (
     AutoColour,
     Config,
@@ -37,7 +37,7 @@ from dyngs.files.tensor_file import write_tensors
 from dyngs.files.write import write_image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.gaussians.scene import Moment, Scene, SceneTraining
+from dyngs.gaussians.scene import GaussianTimeStep, Scene, SceneTraining
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
 from dyngs.state import Role, State, with_role
 from dyngs.training.trainer import Trainer
@@ -78,8 +78,8 @@ class _LiftedScene(Scene):
     def rows(self) -> Tensor:
         return torch.arange(len(self))
 
-    def moment(self, time: float | None) -> Moment:
-        return Moment(self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time)
+    def time_step(self, time: float | None) -> GaussianTimeStep:
+        return GaussianTimeStep(self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time)
 
     def edited(self, edit: TopologyEdit) -> _LiftedScene:
         return replace(self, gaussians=self.gaussians.edited(edit))
@@ -100,9 +100,9 @@ class _Lifted:
     def trains_on(self, time: float | None, step: int) -> bool:
         return True
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         penalties = {"height": self.penalty * scene.gaussians.means[:, 2].abs().sum()} if self.penalty else {}
-        return replace(scene.moment(image.time), penalties=penalties)
+        return replace(scene.time_step(image.time), penalties=penalties)
 
     def optimize(self, scene: _LiftedScene, step: int) -> int:
         self.steps.append(step)
@@ -296,19 +296,19 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
 class _Exploding(_Lifted):
     """From step 3 on it draws positions and rotations that are not finite."""
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         if step < 3:
-            return super().moment(scene, image, step)
+            return super().time_step(scene, image, step)
         now, factor = scene.gaussians, float("nan")
-        return Moment(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
+        return GaussianTimeStep(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
 
 
 class _Overweight(_Lifted):
     """From step 3 on it has an infinite penalty."""
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         self.penalty = 0.0 if step < 3 else float("inf")
-        return super().moment(scene, image, step)
+        return super().time_step(scene, image, step)
 
 
 def _stops_in_step_3(trainer: Trainer) -> str:

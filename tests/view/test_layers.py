@@ -20,7 +20,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Viewed:
 def test_colours_are_those_of_dyngs_render() -> None:
     viewed = balls()
     shown = draw(viewed, Shot(camera(80, 56), 0.3))
-    wanted = render_frame(viewed.scene, viewed.scene.moment(0.3), camera(80, 56), background=torch.ones(3)).rgb
+    wanted = render_frame(viewed.scene, viewed.scene.time_step(0.3), camera(80, 56), background=torch.ones(3)).rgb
     assert np.abs(shown / 255.0 - wanted).max() <= 0.5 / 255 + 1e-6
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.data.images.images import area_downscale
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT
 from dyngs.ops.loss import l1_ssim_loss
 

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.gaussians.rendering import Rendering, RenderOptions
-from dyngs.gaussians.scene import Moment
+from dyngs.models.renderable import Rendering
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
 from dyngs.human.avatar.pose_comparison import IMAGES, Comparison
 from dyngs.human.avatar.posing import BodyPose
@@ -195,7 +196,7 @@ class _Fit:
         size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
         return torch.stack(losses).mean() + size
 
-    def _drawn(self, image: Image, moment: Moment) -> Rendering:
+    def _drawn(self, image: Image, moment: GaussianTimeStep) -> Rendering:
         """Return the person at ``moment`` as the camera of an image sees it."""
         return self.scene.render(image.cameras, moment, options=self.options, background=self.background)
 

@@ -24,7 +24,7 @@ from dyngs.training.priors.agreement import (
 from dyngs.training.priors.depth_maps import Kind
 from dyngs.training.priors.point_motion import Glance
 from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
-from dyngs.training.views import training_cameras
+from dyngs.models.views import training_cameras
 
 _NEAR_TIME = 0.1
 """Depth is judged by images whose times differ by less; the less, the less has moved."""

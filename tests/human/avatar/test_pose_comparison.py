@@ -9,7 +9,7 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 from dyngs.human.avatar.pose_comparison import difference_of_images, difference_of_silhouettes, shrunk
 
 WHITE = torch.ones(3)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.capture import View
 from dyngs.files.write import write_image

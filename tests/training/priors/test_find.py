@@ -7,7 +7,7 @@ import torch
 from tiny_captures import edit_json
 from tiny_priors import with_priors
 
-from dyngs.build import assemble
+from dyngs.kinds import assemble
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.data.loader import ImageLoader

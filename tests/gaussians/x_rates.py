@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.static.rates import Rates
+from dyngs.gaussians.schedule import Rates
 
 
 @given(st.integers(1, 1000), st.floats(0, 1))

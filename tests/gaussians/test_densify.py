@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.config import DefaultStrategy
 from dyngs.gaussians import Gaussians
-from dyngs.static.densify import DefaultDensifier, DensifySchedule, plan_edit, rotate
+from dyngs.gaussians.densify import DefaultDensifier, DensifySchedule, plan_edit, rotate
 
 EXTENT = 10.0
 SMALL, LARGE = 0.05, 0.5  # either side of dense_fraction * extent = 0.1
