@@ -111,8 +111,8 @@ def _block_matching(config: Config) -> Config | None:
 
 def _rigid_groups(config: Config) -> Config | None:
     match config.model:
-        case DynamicModel(deform=ControlNodesField(rigid_groups="never")) as model:
-            return _with_field(config, model, rigid_groups="always")
+        case DynamicModel(deform=ControlNodesField(rigid_groups=False)) as model:
+            return _with_field(config, model, rigid_groups=True)
         case _:
             return None
 
@@ -131,5 +131,5 @@ CHOICES = (
     Choice("model.deform.block_matching=true", _block_matching),
     Choice("colour.kind=network", _colour_network),
     Choice("model.deform.move_opacities=true", _moving_opacities),
-    Choice("model.deform.rigid_groups=always", _rigid_groups),
+    Choice("model.deform.rigid_groups=true", _rigid_groups),
 )

@@ -21,8 +21,6 @@ from torch import Tensor
 from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes
 from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, NetworkField, Offsets, chosen
-from dyngs.deform.lifetimes import RATES as LIFE_RATES
-from dyngs.deform.lifetimes import SIZES, lived, long_lives
 from dyngs.deform.node_shifts import SeenShift, spline_changes
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, nodes_of_label, spread_out, turned
 from dyngs.deform.rigid_groups import (
@@ -98,7 +96,7 @@ class ControlNodes(NetworkField):
         if "centers" in buffers:
             groups = checked_shape(buffers["centers"], learned["group_quats"])
             require_indices("labels", buffers["labels"], (count,), groups[0] + 1)
-        own = field._extended(groups, moving, lives=any(name in learned for name in SIZES))
+        own = field._extended(groups, moving)
         field.parameters = own.restored(learned, dict.fromkeys(head_sizes(self.options), count))
         if count and ("radii" in buffers or "followed" in buffers):  # both are found where nodes are first needed
             require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
@@ -136,11 +134,6 @@ class ControlNodes(NetworkField):
         own = dict.fromkeys(PER_GAUSSIAN, Role.PER_MOVING) | {"neighbours": Role.TRAINING}
         buffers = {name: StateTensor(x, own.get(name, Role.SHARED)) for name, x in self.buffers.items()}
         return super().state() | prefixed("buffers", buffers)
-
-    @property
-    def taken_untried(self) -> tuple[str, ...]:
-        choices = {"rigid_groups": self.options.rigid_groups, "lifetimes": self.options.lifetimes}
-        return tuple(name for name, choice in choices.items() if choice == "always")
 
     @property
     def num_values(self) -> int:
@@ -190,10 +183,10 @@ class ControlNodes(NetworkField):
         field = ControlNodes(options, self.setup, torch.Generator())
         splines = {name: refitted(x.detach()[kept], pieces) for name, x in self._splines().items()}
         is_new = torch.full((len(kept),), pieces != self.num_pieces, device=kept.device)
-        extended = field._extended(self._group_shape, len(means), lives=self.has_lives)
+        extended = field._extended(self._group_shape, len(means))
         like = extended if pieces != self.num_pieces else self.parameters
         field.parameters = like.rearranged(splines, kept, is_new)
-        if self.has_groups or self.has_lives:
+        if self.has_groups:
             others = {name: x for name, x in self.parameters.values().items() if name not in splines}
             state = tensors_of(field.parameters.state()) | others
             field.parameters = field.parameters.restored({name: x.clone() for name, x in state.items()})
@@ -225,9 +218,7 @@ class ControlNodes(NetworkField):
         if others is not None and binding is not None:
             others, binding = chosen(others, rows), chosen(binding, rows)
             found = bound(found, replace(nodes, followed=others), means, now, binding)
-        if not self.has_lives:
-            return found
-        return lived(found, time, *(chosen(self.parameters[name], rows) for name in SIZES))
+        return found
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in squared spacings."""
@@ -329,7 +320,7 @@ class ControlNodes(NetworkField):
 
         Of Gaussians that follow nodes of several groups, the two with most weight remain.
         """
-        wanted = self.options.rigid_groups != "never" and self.options.move_rotations
+        wanted = self.options.rigid_groups and self.options.move_rotations
         if self.has_groups or not wanted or not len(means):
             return None
         nodes, pieces = self.nodes_for(means), round(GROUP_PIECES_PER_TIME * self.setup.num_times)
@@ -360,7 +351,7 @@ class ControlNodes(NetworkField):
         is_torn = top.values[:, 1] > LEAST
         binding = torch.where(is_torn, (top.values[:, 1] / top.values[:, 0]).clamp_min(LEAST).log(), ALONE)
         shape, count = points["group_quats"].shape, len(nodes.positions)
-        template = self._extended((shape[0], shape[1]), len(means), lives=self.has_lives, nodes=count)
+        template = self._extended((shape[0], shape[1]), len(means), count)
         now = tensors_of(template.state()) | tensors_of(self.parameters.state()) | {"binding": binding[:, None]}
         moments = self._moments(nodes, bodies, shape[1])
         field = self.with_parameters(template.restored(now | moments | dict(points)))
@@ -389,21 +380,8 @@ class ControlNodes(NetworkField):
             found[f"exp_avg_sq.{name}"] = total[:-1, None, None].expand(shape[name]).contiguous()
         return found
 
-    @property
-    def has_lives(self) -> bool:
-        """Return whether Gaussians have time windows."""
-        return "life_centers" in self.parameters
-
-    @torch.no_grad()
-    def with_lifetimes(self, means: Tensor) -> ControlNodes | None:
-        if self.options.lifetimes == "never" or self.has_lives or not len(means):
-            return None
-        template = self._extended(self._group_shape, len(means), lives=True, nodes=self.num_nodes)
-        now = tensors_of(template.state()) | tensors_of(self.parameters.state()) | long_lives(len(means))
-        return self.with_parameters(template.restored(now))
-
-    def _extended(self, groups: tuple[int, int] | None, moving: int, *, lives: bool, nodes: int = 0) -> Parameters:
-        """Return the parameters of ``nodes`` that stand still, and of groups and of ``moving`` time windows, all zero.
+    def _extended(self, groups: tuple[int, int] | None, moving: int, nodes: int = 0) -> Parameters:
+        """Return the parameters of ``nodes`` that stand still, and of groups that bind ``moving`` Gaussians, all zero.
 
         Args:
             groups: number of rigid groups and of control points of their splines; None: no groups.
@@ -415,10 +393,7 @@ class ControlNodes(NetworkField):
             tensors["group_quats"] = torch.zeros(*groups, 4, device=device)
             tensors["binding"] = torch.zeros(moving, 1, device=device)
             rates |= GROUP_RATES | {"group_shifts": rates["means"]}
-        if lives:
-            tensors |= {name: torch.zeros(moving, size, device=device) for name, size in SIZES.items()}
-            rates |= LIFE_RATES | {"life_velocities": rates["means"]}
-        roles = {name: Role.PER_MOVING if name in ("binding", *SIZES) else Role.SHARED for name in tensors}
+        roles = {name: Role.PER_MOVING if name == "binding" else Role.SHARED for name in tensors}
         return Parameters(tensors, rates, LR_DECAY, roles)
 
     @torch.no_grad()

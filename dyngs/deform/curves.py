@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, Offsets
-from dyngs.deform.lifetimes import SIZES
 from dyngs.deform.nodes import FOLLOWED
 from dyngs.deform.rigid_groups import is_alone
 from dyngs.deform.spline_fit import SPAN, spline_basis
@@ -36,7 +35,6 @@ class Curves:
         pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own, about itself.
         followed: (M, B) drivers of each Gaussian, B = 4, or 8 where some follow two rigid groups; None as above.
         shares: (M, B) of theirs, rows sum to 1; None as above.
-        lives: (M, 5) velocity, world units per clip, middle and span of each Gaussian's time window; or None.
         error: of a driver's place: the quantile ``CHECKED``, in world units.
     """
 
@@ -44,7 +42,6 @@ class Curves:
     pivots: Tensor | None = None
     followed: Tensor | None = None
     fractions: Tensor | None = None
-    lives: Tensor | None = None
     error: float = 0.0
 
 
@@ -124,11 +121,7 @@ def _curves_of_nodes(field: ControlNodes, means: Tensor, tolerance: float) -> Cu
         other, weights = _padded(others, replace(nodes, followed=others).weights(means))
         followed = torch.cat([followed, other], dim=1)
         fractions = torch.cat([(1 - second) * fractions, second * weights], dim=1)
-    lives = None
-    if field.has_lives:
-        center, log_span, velocity = (field.parameters[name] for name in SIZES)
-        lives = torch.cat([velocity, center, log_span.exp()], dim=1)
-    return Curves(heads, nodes.positions, followed, fractions, lives, error)
+    return Curves(heads, nodes.positions, followed, fractions, error)
 
 
 def _padded(followed: Tensor, fractions: Tensor) -> tuple[Tensor, Tensor]:

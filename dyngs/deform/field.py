@@ -87,11 +87,6 @@ class DeformationField(Protocol):
         """Number of values that the field stores."""
         ...
 
-    @property
-    def taken_untried(self) -> tuple[str, ...]:
-        """Options ("rigid_groups", "lifetimes") that are on whether they win a trial or not."""
-        ...
-
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """Return the offsets at ``time``.
 
@@ -116,10 +111,6 @@ class DeformationField(Protocol):
 
     def with_groups(self, means: Tensor) -> DeformationField | None:
         """Return the field with rigid groups that move ``means`` (M, 3) nearly as now; None: there are none."""
-        ...
-
-    def with_lifetimes(self, means: Tensor) -> DeformationField | None:
-        """Return the field with a long time window for each of ``means`` (M, 3); None: it has none, or has them."""
         ...
 
     def shifted(self, means: Tensor, seen: Sequence[SeenShift]) -> DeformationField | None:
@@ -158,11 +149,6 @@ class NetworkField:
     def num_values(self) -> int:
         return self.parameters.num_values
 
-    @property
-    def taken_untried(self) -> tuple[str, ...]:
-        """Return nothing: only nodes form groups."""
-        return ()
-
     def penalties(self, time: float) -> dict[str, Tensor]:
         return {}
 
@@ -174,9 +160,6 @@ class NetworkField:
 
     def with_groups(self, means: Tensor) -> DeformationField | None:
         """Return None: only nodes form groups."""
-
-    def with_lifetimes(self, means: Tensor) -> DeformationField | None:
-        """Return None: only what follows nodes has time windows."""
 
     def shifted(self, means: Tensor, seen: Sequence[SeenShift]) -> DeformationField | None:
         """Return None: only splines of nodes are fitted to shifts."""

@@ -14,8 +14,6 @@ MATCH_FRACTION, MATCHES_UNTIL = 0.04, 0.85
 """Fraction of the run between two rounds of block matching, and after which there are no more."""
 GROUPS = 0.12
 """The step at which nodes may form rigid groups, likewise: after the first split."""
-LIFETIMES = 0.16
-"""The step at which Gaussians may get time windows, likewise."""
 
 
 def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
@@ -32,8 +30,8 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
         sorted({full + round(fraction * (steps - full)) for fraction in SPLITS}) if model.freeze_below_px > 0 else []
     )
     splits = tuple(step for step in splits if step > full)
-    groups, lifetimes = (full + round(fraction * (steps - full)) for fraction in (GROUPS, LIFETIMES))
-    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, lifetimes, _matches(model, fine, steps))
+    groups = full + round(GROUPS * (steps - full))
+    return DeformSchedule(fine, opens, full, decays, splits, rates, groups, _matches(model, fine, steps))
 
 
 def _matches(model: DynamicModel, fine: int, steps: int) -> tuple[int, ...]:

@@ -56,7 +56,6 @@ class DeformSchedule:
         splits: steps after which Gaussians that do not move are frozen.
         rates: how the field's rates fall.
         groups: step after which what moves may form rigid groups.
-        lifetimes: step after which moving Gaussians may get time windows.
         matches: steps after which motion is corrected by block matching.
     """
 
@@ -67,7 +66,6 @@ class DeformSchedule:
     splits: tuple[int, ...]
     rates: Rates
     groups: int = 0
-    lifetimes: int = 0
     matches: tuple[int, ...] = ()
 
 

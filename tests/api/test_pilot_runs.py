@@ -72,7 +72,7 @@ def test_what_was_asked_for_stays(moving: Path, monkeypatch: pytest.MonkeyPatch)
         "model.deform.move_opacities=true",
         "model.deform.block_matching=true",
         "colour.kind=auto",
-        "model.deform.rigid_groups=auto",
+        "model.deform.rigid_groups=true",
     )
     tried = score_by(monkeypatch, lambda given: 20.0 + len(tried))
     chosen = with_choices(config, EVERY, None)

@@ -297,7 +297,7 @@ def test_the_place_of_a_gaussian_matters() -> None:
 def two_bodies() -> tuple[ControlNodes, Tensor]:
     """A field with nodes on two touching bodies, and (80, 3) Gaussians there: one spins, one shifts; noise on both."""
     means = torch.cat([cloud(50).means * 0.3, cloud(30, seed=1).means * 0.2 + torch.tensor([1.2, 0.0, 0.0])])
-    field = placed(means, nodes=40, pieces=8, num_times=20, rigid_groups="auto")
+    field = placed(means, nodes=40, pieces=8, num_times=20, rigid_groups=True)
     positions = field.buffers["positions"].double()
     times = torch.linspace(0, 1, 30)
     spin = Rotation.from_rotvec(np.array([0, 0, 2 * np.pi]) * (times.numpy()[:, None] - 0.5))
@@ -347,8 +347,8 @@ def test_in_groups_everything_moves_as_before() -> None:
 def test_groups_are_looked_for_only_where_they_are_wanted_and_possible() -> None:
     means = cloud().means
     assert placed(means).with_groups(means) is None
-    assert placed(means, rigid_groups="auto", move_rotations=False).with_groups(means) is None
-    grouped = placed(cloud(30).means, nodes=12, rigid_groups="auto").with_groups(cloud(30).means)
+    assert placed(means, rigid_groups=True, move_rotations=False).with_groups(means) is None
+    grouped = placed(cloud(30).means, nodes=12, rigid_groups=True).with_groups(cloud(30).means)
     assert grouped is not None, "what stands is rigid, too"
     assert grouped.with_groups(cloud(30).means) is None
 
@@ -397,20 +397,17 @@ def test_groups_that_do_not_fit_are_refused(name: str, value: int) -> None:
 
 
 @pytest.mark.parametrize("pieces", [6, 8])
-def test_groups_and_time_windows_stay_when_nodes_and_pieces_are_reduced(pieces: int) -> None:
+def test_groups_stay_when_nodes_and_pieces_are_reduced(pieces: int) -> None:
     """And the tensors are its own: to train the smaller one changes nothing of the larger one."""
     field, means = two_bodies()
-    field.options = field.options.model_copy(update={"lifetimes": "auto"})
     grouped = field.with_groups(means)
     assert grouped is not None
-    lives = grouped.with_lifetimes(means)
-    assert lives is not None
-    before = outputs(lives.offsets(means, 0.3))
-    small = lives.reduced(15, pieces, means)
+    before = outputs(grouped.offsets(means, 0.3))
+    small = grouped.reduced(15, pieces, means)
     assert 15 <= small.num_nodes <= 17
-    moved = lives.offsets(means, 0.3).means.detach()
+    moved = grouped.offsets(means, 0.3).means.detach()
     apart = (small.offsets(means, 0.3).means.detach() - moved).norm(dim=1)
     assert float(apart.median()) < 0.02, "what is rigid needs few nodes"
     for x in small.parameters.values().values():
         x += 1.0
-    assert torch.equal(outputs(lives.offsets(means, 0.3)), before)
+    assert torch.equal(outputs(grouped.offsets(means, 0.3)), before)

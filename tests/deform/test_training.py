@@ -92,7 +92,7 @@ class Run:
         return int(left_out)
 
     def grow(self, step: int) -> EditResult | None:
-        grown = self.training.grown(self.scene, step)
+        grown = self.training.revised(self.scene, step)
         if grown is None:
             return None
         self.scene, result = grown
@@ -576,7 +576,7 @@ def test_motion_begins_on_a_gpu_as_on_the_cpu() -> None:
 
         run = new_run(flat_cloud(), times, errors, deform=ControlNodesField(nodes=32), num_random_moving=300)
         run.training.capture = replace(run.training.capture, standing=lambda: footage)
-        grown = run.training.grown(run.scene.to(device), FINE)
+        grown = run.training.revised(run.scene.to(device), FINE)
         assert grown is not None
         assert grown[0].gaussians.means.device == device
         return grown[0].at(0.3).means.detach().cpu()

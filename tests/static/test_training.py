@@ -55,7 +55,7 @@ def test_nothing_depends_on_time() -> None:
 
 def test_the_set_is_left_to_the_strategy() -> None:
     training = StaticTraining(FilterUpdate())
-    assert all(training.grown(training.first_scene(_gaussians(2.0)), step) is None for step in (1, 2, 100))
+    assert all(training.revised(training.first_scene(_gaussians(2.0)), step) is None for step in (1, 2, 100))
 
 
 def test_the_filter_is_kept_until_it_is_due() -> None:

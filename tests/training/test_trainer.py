@@ -111,11 +111,8 @@ class _Lifted:
     def after_step(self, scene: _LiftedScene, step: int, edited: bool) -> _LiftedScene:
         return scene
 
-    def grown(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
+    def revised(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         return None
-
-    def variant(self, scene: _LiftedScene, step: int) -> None:
-        """Try nothing else."""
 
     def window(self, step: int) -> tuple[float, float]:
         return 0.0, 1.0
@@ -171,7 +168,7 @@ def test_penalties_of_the_training_are_part_of_the_loss(capture: Path) -> None:
 class _Growing(_Lifted):
     """It wants each Gaussian once more after step 2."""
 
-    def grown(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
+    def revised(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         assert self.steps[-1] == step, "it has followed the step already"
         if step != 2:
             return None

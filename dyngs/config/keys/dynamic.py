@@ -87,15 +87,8 @@ class ControlNodesField(FieldSection):
         description="now and then look up to three small pixels around for where moving blocks of the drawn image "
         "belong in the true one, and correct the splines by that where it lowers the error",
     )
-    rigid_groups: Literal["never", "auto", "always"] = Field(
-        default="never",
-        description="nodes that move rigidly get one motion per body once all times are seen; auto: if that wins a "
-        "trial",
-    )
-    lifetimes: Literal["never", "auto", "always"] = Field(
-        default="never",
-        description="each moving Gaussian gets a time window and a velocity once all times are seen, for things that "
-        "come and go; auto: if that wins a trial",
+    rigid_groups: bool = Field(
+        default=False, description="nodes that move rigidly get one motion per body once all times are seen"
     )
 
 

@@ -151,7 +151,6 @@ class Motion {
     this.drivers = scene.curves ? new Drivers(scene) : null;
     this.bones = scene.bones ? new Bones(scene) : null;
     this.means = lists.means;
-    this.lives = lists.lives; // (moving, 5): velocity, middle, span
     this.masks = scene.masks ? { times: scene.masks.times, bits: lists.masks, bytes: Math.ceil(this.count / 8) } : null;
     if (this.drivers) {
       this.perGaussian = lists.followed ? lists.followed.length / this.moving : 1;
@@ -201,10 +200,6 @@ class Motion {
       for (let k = i * this.perGaussian; k < (i + 1) * this.perGaussian; ++k) {
         const at = 4 * this.followed[k];
         depth += this.shares[k] * (a * axes[at] + b * axes[at + 1] + c * axes[at + 2] + axes[at + 3]);
-      }
-      if (this.lives) {
-        const at = 5 * i, since = this.time - this.lives[at + 3];
-        depth += since * (x * this.lives[at] + y * this.lives[at + 1] + z * this.lives[at + 2]);
       }
       out[i] = depth;
     }

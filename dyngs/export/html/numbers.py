@@ -99,8 +99,6 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
         lists.exact("pivots", _numpy(curves.pivots))
         lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
         lists.exact("shares", _fractions(curves.fractions[order]))
-    if curves.lives is not None:
-        lists.exact("lives", _numpy(curves.lives[order]))
     count, points, _ = curves.heads["means"].shape
     return {"count": count, "points": points, "moving": len(order), "error": curves.error}
 

@@ -17,7 +17,6 @@ uniform sampler2D uBonedShares;  // 2: their shares
 // Of each Gaussian that moves:
 uniform usampler2D uDriven;      // SETS: its drivers
 uniform sampler2D uDrivenShares; // SETS: their shares
-uniform sampler2D uLives;        // 2: velocity and middle; span
 // Of each driver, each bone, and the network:
 uniform sampler2D uDrivers;      // 6: rows of the affine map; changes of quaternion; of log scales and logit; of colour
 uniform sampler2D uBones;        // 3: rows of the affine map
@@ -119,12 +118,6 @@ void drive(int i, inout Gaussian g) {
   g.logScales += sizes.xyz;
   g.logit += sizes.w;
   g.base += color;
-#if LIVES
-  vec4 life = at(uLives, 2 * i);
-  float since = uTime - life.w, far = since / at(uLives, 2 * i + 1).x;
-  g.mean += life.xyz * since;
-  g.logit -= 0.5 * far * far;
-#endif
 }
 #endif
 

@@ -35,7 +35,6 @@ class Renderer {
       HARMONIC_TEXELS: Math.ceil((3 * terms) / 4),
       SETS: motion.drivers ? Math.ceil(motion.perGaussian / 4) : 0,
       MOVING: motion.moving,
-      LIVES: motion.lives ? 1 : 0,
       BONES: motion.bones ? 1 : 0,
       FILTERED: scene.filtered ? 1 : 0,
       LAYERS: network ? network.layers : 0,
@@ -144,11 +143,6 @@ class Renderer {
     } else {
       this.list("uDriven", motion.followed, "16UI");
       this.list("uDrivenShares", motion.shares, "32F");
-    }
-    if (motion.lives) {
-      const lives = new Float32Array(8 * motion.moving);
-      for (let i = 0; i < motion.moving; ++i) lives.set(motion.lives.subarray(5 * i, 5 * i + 5), 8 * i);
-      this.list("uLives", lives, "32F");
     }
   }
 

@@ -116,8 +116,8 @@ def test_harmonics_and_modes(mode: RasterizeMode, browser: Browser, tmp_path: Pa
 
 
 @needs_browser
-def test_two_rigid_groups_and_time_windows(browser: Browser, tmp_path: Path) -> None:
-    """Gaussians of two bodies that turn differently; some are between them, and some do not show all the time."""
+def test_two_rigid_groups(browser: Browser, tmp_path: Path) -> None:
+    """Gaussians of two bodies that turn differently; some are between them."""
     scene, view = two_bodies(), large(camera(), 6)
     write(scene, tmp_path / "page.html", view)
     page = opened(browser, tmp_path / "page.html")
@@ -241,12 +241,12 @@ def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
 
 
 def two_bodies() -> Scene:
-    """Two bodies of 40 Gaussians: one turns, one goes; some follow both, and none shows all the time."""
+    """Two bodies of 40 Gaussians: one turns, one goes; some follow both."""
     generator = torch.Generator().manual_seed(3)
     means = torch.rand(80, 3, generator=generator) * 1.2 - torch.tensor([1.2, 0.6, 0.6])
     means[40:, 0] += 1.2
     setup = FieldSetup(torch.zeros(3), torch.ones(3), 12, len(means), 1.0)
-    options = ControlNodesField(nodes=30, pieces=4, rigid_groups="always", lifetimes="always")
+    options = ControlNodesField(nodes=30, pieces=4, rigid_groups=True)
     field = ControlNodes(options, setup, generator)
     field.offsets(means, 0.0)
     positions, times = field.buffers["positions"], torch.linspace(0, 1, 20)
@@ -260,12 +260,7 @@ def two_bodies() -> Scene:
         field.parameters[name].data[:] = fitted_splines(times, values, field.num_points).float()
     grouped = field.with_groups(means)
     assert grouped is not None
-    lives = grouped.with_lifetimes(means)
-    assert lives is not None
-    lives.parameters["life_centers"].data[:, 0] = torch.rand(80, generator=generator)
-    lives.parameters["life_log_spans"].data[:] = -1.2
-    lives.parameters["life_velocities"].data[:] = 0.2 * torch.randn(80, 3, generator=generator)
-    assert int((lives.parameters["binding"] > 0.5 * ALONE).sum()) > 3
+    assert int((grouped.parameters["binding"] > 0.5 * ALONE).sum()) > 3
     gaussians = Gaussians(
         means,
         torch.randn(80, 4, generator=generator),
@@ -273,7 +268,7 @@ def two_bodies() -> Scene:
         torch.full((80,), 2.0),
         torch.randn(80, 4, 3, generator=generator),
     )
-    return DynamicScene(gaussians=gaussians, seen_at=tuple(times.tolist()), field=lives, moving=torch.arange(80))
+    return DynamicScene(gaussians=gaussians, seen_at=tuple(times.tolist()), field=grouped, moving=torch.arange(80))
 
 
 def sliding_scene() -> Scene:
