@@ -150,4 +150,4 @@ def _refuse(trainer: Trainer) -> None:
 
 def _nudge(trainer: Trainer) -> None:
     with torch.no_grad():
-        trainer.scene.gaussians.means[0, 0] += 1e-6
+        trainer.model.scene.gaussians.means[0, 0] += 1e-6

@@ -22,8 +22,8 @@ from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry.recenter import recenter
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.models.renderable import Rendering
 from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.models.renderable import Rendering
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, rasterize
 

@@ -14,10 +14,10 @@ import torch
 from dyngs.api.candidate import Candidate, Choice, Comparison, Evidence
 from dyngs.api.small_runs import drawn
 from dyngs.config import Config, DynamicModel, StaticModel
+from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
 from dyngs.models.views import background_colour
 from dyngs.training.corrections.camera_fit import fitted_to_image
-from dyngs.training.trainer import Trainer
 
 WRONG = 0.1
 """Mean gain, dB, of views held out by a fitted pose from which the cameras may be wrong."""
@@ -25,7 +25,7 @@ CLEAR_GAIN = 0.1
 """Mean gain, dB, that refined training cameras must bring at least."""
 
 
-def evidence(plain: Trainer) -> Evidence:
+def evidence(plain: GaussianTrainer) -> Evidence:
     """Return whether the cameras of a small run without refinement may be wrong."""
     scores = [_scores(plain, index) for index in sorted(plain.held_out)]
     gain = fmean(fitted - given for given, fitted in scores)
@@ -33,22 +33,22 @@ def evidence(plain: Trainer) -> Evidence:
     return Evidence(gain >= WRONG, text)
 
 
-def compared(one: Trainer, other: Trainer) -> Comparison:
+def compared(one: GaussianTrainer, other: GaussianTrainer) -> Comparison:
     """Compare two models on the views held out, each after the same fit."""
     held_out = sorted(one.held_out)
     return Comparison([(_scores(one, i)[1], _scores(other, i)[1]) for i in held_out])
 
 
-def _scores(trainer: Trainer, index: int) -> tuple[float, float]:
+def _scores(trainer: GaussianTrainer, index: int) -> tuple[float, float]:
     """Return PSNR, dB, of the right half of a view: from its own pose, and from one fitted on the left half."""
     image, background = trainer.images[index], background_colour(trainer.background)
     left = torch.zeros_like(image.rgb_premultiplied[..., 0])
     left[:, : left.shape[1] // 2] = 1
     right = 1 - left if image.mask is None else (1 - left) * image.mask
-    options = trainer.options
-    fitted = fitted_to_image(trainer.scene, image, background, trainer.extent, options=options, weights=left)
+    options = trainer.model.options
+    fitted = fitted_to_image(trainer.model.scene, image, background, trainer.extent, options=options, weights=left)
     truth = image.composite(background)
-    plain, moved = (psnr(drawn(trainer.scene, x, options, background), truth, right) for x in (image, fitted))
+    plain, moved = (psnr(drawn(trainer.model.scene, x, options, background), truth, right) for x in (image, fitted))
     return plain, moved
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dyngs.config import Config
-from dyngs.training.trainer import Trainer
+from dyngs.kinds import GaussianTrainer
 
 Choice = Literal["never", "always"]
 
@@ -38,7 +38,7 @@ class Comparison:
     objection: str = ""
 
 
-def no_evidence(plain: Trainer) -> Evidence:
+def no_evidence(plain: GaussianTrainer) -> Evidence:
     """Return that nothing can be said without a second run."""
     return Evidence(True)
 
@@ -61,6 +61,6 @@ class Candidate:
     does: str
     asked: Callable[[Config], bool]
     decided: Callable[[Config, Choice], Config]
-    compared: Callable[[Trainer, Trainer], Comparison]
+    compared: Callable[[GaussianTrainer, GaussianTrainer], Comparison]
     clear_gain: float
-    evidence: Callable[[Trainer], Evidence] = no_evidence
+    evidence: Callable[[GaussianTrainer], Evidence] = no_evidence

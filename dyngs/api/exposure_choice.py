@@ -17,9 +17,9 @@ from dyngs.api.candidate import Candidate, Choice, Comparison, Evidence
 from dyngs.config import Config, DynamicModel, StaticModel
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
 from dyngs.models.views import background_colour
-from dyngs.training.trainer import Trainer
 
 CLEAR_GAIN = 0.1
 """Mean gain, dB, from which exposures are tried, and then taken."""
@@ -31,7 +31,7 @@ SQUARES = 8
 """The halves of an image are the two colours of a chess board of so many squares a side."""
 
 
-def evidence(plain: Trainer) -> Evidence:
+def evidence(plain: GaussianTrainer) -> Evidence:
     """Return whether the images of a small run without exposures ask for them."""
     trained_on = [i for i in range(len(plain.images)) if i not in plain.held_out]
     chosen = [trained_on[i] for i in evenly_spaced(len(trained_on), LOOKED_AT)]
@@ -44,7 +44,7 @@ def evidence(plain: Trainer) -> Evidence:
     return Evidence(fmean(gains) >= CLEAR_GAIN, text)
 
 
-def compared(one: Trainer, other: Trainer) -> Comparison:
+def compared(one: GaussianTrainer, other: GaussianTrainer) -> Comparison:
     """Compare two models on the views held out, each after the same fit.
 
     Where exposure goes with the viewpoint, as in a slow walk, colours that depend on the viewpoint explain it. Then a
@@ -58,10 +58,12 @@ def compared(one: Trainer, other: Trainer) -> Comparison:
 
 
 @torch.no_grad()
-def _scored(trainer: Trainer, index: int) -> tuple[float, float]:
+def _scored(trainer: GaussianTrainer, index: int) -> tuple[float, float]:
     """Return PSNR, dB, of an image as the scene shows it, and with each half by a fit on the other half."""
     image, background = trainer.images[index], background_colour(trainer.background)
-    rendering = trainer.scene.render(image.cameras, image.time, options=trainer.options, background=background)
+    rendering = trainer.model.scene.render(
+        image.cameras, image.time, options=trainer.model.options, background=background
+    )
     truth, rgb = image.composite(background), rendering.rgb[0]
     fitted, light = rgb.clone(), _chess_board(*rgb.shape[:2])
     for half in (light, ~light):

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from dyngs.kinds import assemble
 from dyngs.config import Config, DefaultStrategy, PointsInit, StaticModel
 from dyngs.data.capture import Capture, View
 from dyngs.data.frame_selection import evenly_spaced
@@ -16,8 +15,8 @@ from dyngs.data.read import read_capture
 from dyngs.data.times import are_scattered
 from dyngs.deform.evidence import MIN_DIFFERING, Evidence, Verdict, agreement_over_time, differing_fraction
 from dyngs.deform.still_error import cameras_in_place, signed_errors
+from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.models.views import evaluation_background
-from dyngs.training.trainer import Trainer
 
 LONGEST_SIDE = 96
 """Of the images that are looked at, px: enough to see what moves, and soon learned by a small model."""
@@ -92,13 +91,15 @@ def _small(config: Config) -> Config:
     )
 
 
-def _errors(trainer: Trainer, order: Sequence[int], background: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _errors(
+    trainer: GaussianTrainer, order: Sequence[int], background: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Return errors and weights as ``agreement_over_time`` wants them."""
     found = []
     for i in order:
         image = trainer.images[i]
         with torch.no_grad():
-            shown = trainer.scene.render(image.cameras, image.time, background=background).rgb[0]
-        gaussians = trainer.scene.gaussians.detach()
-        found.append(signed_errors(gaussians, image, trainer.options, background, shown))
+            shown = trainer.model.scene.render(image.cameras, image.time, background=background).rgb[0]
+        gaussians = trainer.model.scene.gaussians.detach()
+        found.append(signed_errors(gaussians, image, trainer.model.options, background, shown))
     return torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])

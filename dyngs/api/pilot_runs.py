@@ -86,7 +86,7 @@ def _scores(config: Config, every: int, steps: int) -> list[float]:
     """Return the PSNR of the held-out views after a pilot run, dB."""
     trainer = trained(config, every, steps)
     background = background_colour(trainer.background)
-    return held_out_scores(trainer.scene, trainer, background)
+    return held_out_scores(trainer.model.scene, trainer, background)
 
 
 def _colour_network(config: Config) -> Config | None:

@@ -12,9 +12,9 @@ from torch import Tensor
 from dyngs.api.candidate import Candidate, Choice, Comparison
 from dyngs.api.small_runs import drawn
 from dyngs.config import Config, StaticModel
+from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
 from dyngs.models.views import background_colour
-from dyngs.training.trainer import Trainer
 
 EXPLAINED = 0.8
 """Fraction of the pixels of a view that count: those where the smaller of the two errors is smallest."""
@@ -30,13 +30,16 @@ def _asked(config: Config) -> bool:
             return False
 
 
-def compared(one: Trainer, other: Trainer) -> Comparison:
+def compared(one: GaussianTrainer, other: GaussianTrainer) -> Comparison:
     """Compare two models on the views held out, over the pixels that one of them explains."""
     background, found = background_colour(one.background), []
     for index in sorted(one.held_out):
         image = one.images[index]
         truth = image.composite(background)
-        images = [drawn(x.scene, image, x.options, background, fitted=x.exposures is not None) for x in (one, other)]
+        images = [
+            drawn(x.model.scene, image, x.model.options, background, fitted=x.exposures is not None)
+            for x in (one, other)
+        ]
         counts = explained(images[0], images[1], truth, image.mask)
         found.append((psnr(images[0], truth, counts), psnr(images[1], truth, counts)))
     return Comparison(found)

@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.kinds import assemble
 from dyngs.config import BudgetConfig, Config, DefaultStrategy, FixedStrategy, McmcStrategy, PruneConfig, Strategy
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.metrics import psnr
-from dyngs.training.trainer import Trainer
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
 """Longest side of the images, px, and most Gaussians.
@@ -46,7 +45,7 @@ def small_run(config: Config, every: int, steps: int) -> Config:
     )
 
 
-def trained(config: Config, every: int, steps: int) -> Trainer:
+def trained(config: Config, every: int, steps: int) -> GaussianTrainer:
     """Return the trainer after a small run of ``config``; see ``small_run``."""
     trainer = assemble(small_run(config, every, steps))
     while trainer.done < steps:
@@ -71,12 +70,12 @@ def drawn(scene: Scene, image: Image, options: RenderOptions, background: Tensor
     return recoloured(affine, image, rendering, background)
 
 
-def held_out_scores(scene: Scene, trainer: Trainer, background: Tensor) -> list[float]:
+def held_out_scores(scene: Scene, trainer: GaussianTrainer, background: Tensor) -> list[float]:
     """Return the PSNR of the images that ``trainer`` holds out, dB, in order of their indices.
 
     Where exposures are learned, those of images held out are not: they are fitted.
     """
-    options, fitted = trainer.options, trainer.exposures is not None
+    options, fitted = trainer.model.options, trainer.exposures is not None
     shown = [trainer.images[i] for i in sorted(trainer.held_out)]
     return [psnr(drawn(scene, x, options, background, fitted=fitted), x.composite(background), x.mask) for x in shown]
 

@@ -15,7 +15,7 @@ from dyngs.api.small_runs import FEWEST_VIEWS, hold_out_every, is_gain, trained
 from dyngs.config import Config, DynamicModel
 from dyngs.config.still import as_still
 from dyngs.data.read import read_capture
-from dyngs.training.trainer import Trainer
+from dyngs.kinds import GaussianTrainer
 
 STEPS, FRACTION, FEWEST_STEPS = 1500, 0.2, 400
 """Steps of each small run; at most this fraction of the run's own. With fewer steps than these it says nothing."""
@@ -52,8 +52,8 @@ def decided(config: Config) -> Config:
 
 
 def _tried(
-    candidate: Candidate, config: Config, plain: Trainer, every: int, steps: int
-) -> tuple[Config, Trainer] | None:
+    candidate: Candidate, config: Config, plain: GaussianTrainer, every: int, steps: int
+) -> tuple[Config, GaussianTrainer] | None:
     """Return the configuration with a setting and its small run, None where it does not pay; a line says why."""
     begun, evidence = time.monotonic(), candidate.evidence(plain)
     if not evidence.is_worth:
@@ -71,7 +71,7 @@ def _tried(
     return (changed, other) if pays else None
 
 
-def _trained(config: Config, every: int, steps: int) -> Trainer:
+def _trained(config: Config, every: int, steps: int) -> GaussianTrainer:
     match config.model:
         case DynamicModel():
             return trained(as_still(config), every, steps)

@@ -17,7 +17,6 @@ from torch import Tensor
 from dyngs.api.motion_check import motion_evidence
 from dyngs.api.pilot_runs import with_choices
 from dyngs.api.small_runs import FEWEST_VIEWS, drawn, held_out_scores, hold_out_every, is_gain, small_run
-from dyngs.kinds import assemble
 from dyngs.config import Config, DynamicModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.config.still import as_still
@@ -29,14 +28,14 @@ from dyngs.deform.evidence import Verdict
 from dyngs.deform.still_error import signed_errors
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.metrics import psnr
+from dyngs.models.schedule import hold_out_until
+from dyngs.models.views import background_colour
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.folder import STILL_FOLDER, begin
-from dyngs.models.views import background_colour
 from dyngs.training.events import Event, Message, StepDone
 from dyngs.training.loop import Loop
-from dyngs.models.schedule import hold_out_until
-from dyngs.training.trainer import Trainer
 
 STILL_STEPS = 2000
 """Most steps of the static model that is compared with."""
@@ -126,7 +125,7 @@ class StillComparison:
         is_lost: the static model is better.
     """
 
-    def __init__(self, folder: Path, trainer: Callable[[], Trainer], loop: Loop) -> None:
+    def __init__(self, folder: Path, trainer: Callable[[], GaussianTrainer], loop: Loop) -> None:
         self._folder, self._trainer, self._loop = folder, trainer, loop
         self.is_lost = self._is_done = False
 
@@ -158,16 +157,20 @@ class StillComparison:
 
 @torch.no_grad()
 def _compared(
-    trainer: Trainer, still: Scene, image: Image, small: Image
+    trainer: GaussianTrainer, still: Scene, image: Image, small: Image
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
     """Return PSNR of a small image with motion and without, whole and where nothing that moves is in front."""
-    background, options, fitted = background_colour(trainer.background), trainer.options, trainer.exposures is not None
+    background, options, fitted = (
+        background_colour(trainer.background),
+        trainer.model.options,
+        trainer.exposures is not None,
+    )
     size, truth = (small.cameras.width, small.cameras.height), small.composite(background)
     images = [
-        area_downscale(drawn(trainer.scene, image, options, background, fitted=fitted), *size),
+        area_downscale(drawn(trainer.model.scene, image, options, background, fitted=fitted), *size),
         drawn(still, small, options, background, fitted=fitted),
     ]
-    alpha = trainer.scene.part("moving").render(image.cameras, image.time, options=options).alpha[0]
+    alpha = trainer.model.scene.part("moving").render(image.cameras, image.time, options=options).alpha[0]
     stands = (area_downscale(alpha[..., None], *size)[..., 0] < CLEAR).float()
     stands = stands * (1.0 if small.mask is None else small.mask)
     whole = psnr(images[0], truth, small.mask), psnr(images[1], truth, small.mask)
@@ -201,8 +204,8 @@ def _small_still_model(folder: Path) -> tuple[float, list[float]]:
     fails = total = 0.0
     for index in sorted(trainer.held_out):
         image = trainer.images[index]
-        shown = drawn(scene, image, trainer.options, background, fitted=trainer.exposures is not None)
-        errors, weights = signed_errors(scene.gaussians, image, trainer.options, background, shown)
+        shown = drawn(scene, image, trainer.model.options, background, fitted=trainer.exposures is not None)
+        errors, weights = signed_errors(scene.gaussians, image, trainer.model.options, background, shown)
         mean: Tensor = errors.abs().mean(1) / weights.clamp_min(1e-6)
         fails += float(weights[mean > ERRS].sum())
         total += float(weights.sum())

@@ -6,14 +6,16 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 from torch import Tensor
 
 from dyngs.api import still_choices, still_first
+from dyngs.api.before_training import with_capture
 from dyngs.api.following import Leader
 from dyngs.api.still_first import StillComparison
 from dyngs.budget.cost import CostMeter
@@ -22,11 +24,14 @@ from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, first_fit, refitted
-from dyngs.kinds import build
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.data.capture import Capture
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
+from dyngs.kinds import GaussianTrainer, build, prepared
 from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.memory import keep_freed_memory
 from dyngs.ops.native import kernel_threads
@@ -71,6 +76,11 @@ _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
 """Names of the limits' states in a checkpoint."""
 
 
+@contextmanager
+def _no_progress() -> Iterator[ReportProgress]:
+    yield report_nothing
+
+
 class Limit(Protocol):
     """A listener whose state belongs into checkpoints."""
 
@@ -91,8 +101,12 @@ def train(
     resume_from: Path | None = None,
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
+    progress: Callable[[], AbstractContextManager[ReportProgress]] = _no_progress,
 ) -> Path:
     """Train and return the run folder.
+
+    Photos and videos without poses go through structure from motion first, and a body is fitted to a person where that
+    is needed, as by the command.
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
@@ -101,6 +115,7 @@ def train(
             before its first: the result has the same bytes as if the run had never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
+        progress: shows how far what comes before training is.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
@@ -115,6 +130,9 @@ def train(
     if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
         latest_checkpoint(folder)
         return folder
+    if resume_from is None:
+        with progress() as report:
+            config = with_capture(config, report=report)
     keep_freed_memory()
     threads = config.run.threads or max(1, num_cores() // processes.local_size)
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
@@ -130,7 +148,8 @@ def train(
             print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
             return folder
         asked = asked_for(folder) if resume_from is not None else config
-        new_run = partial(_Run, processes=processes, threads=threads)
+        capture = _capture(config, begins=resumed is None)
+        new_run = partial(_Run, capture=capture, processes=processes, threads=threads)
         if resumed is None:
             config = _chosen(config, folder, partial(_train_still, new_run))
         if not new_run(config, folder, resumed, asked).run(listeners):
@@ -146,6 +165,13 @@ def _chosen(config: Config, folder: Path, train_still: Callable[[Config, Path], 
     What holds for still and moving scenes comes first, as the comparison of the two builds on it.
     """
     return still_choices.decided(still_first.start(still_choices.decided(config), folder, train_still))
+
+
+def _capture(config: Config, *, begins: bool) -> Capture | None:
+    """Return the capture of a run, which all of it reads from; None for a network, which has several."""
+    if config.model.is_network:
+        return None
+    return prepared(config) if begins else read_capture(config.data)
 
 
 def _told_again(config: Config, folder: Path) -> str:
@@ -177,6 +203,7 @@ class _Run:
         folder: of the run.
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen; None: this one.
+        capture: with its first points where the run begins; None: of a network.
         processes: that this one leads.
         threads: of the kernels in each of them.
     """
@@ -188,22 +215,25 @@ class _Run:
         resumed: Checkpoint | None,
         asked: Config | None = None,
         *,
+        capture: Capture | None,
         processes: Processes,
         threads: int,
     ) -> None:
         watch = Stopwatch()
         if resumed is None:
             require_room(config)
-        built = build(config, restored=resumed is not None)
-        self.folder, self.limits = folder, dict[str, Limit]()
-        self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
+        trainer = build(config, capture, restored=resumed is not None)
+        self.folder, self.limits, self._capture = folder, dict[str, Limit](), capture
+        self.loop = Loop(trainer, config.total_steps, watch, lambda: last_good(folder))
         self._leader = Leader(processes, config, threads)
         self.loop.before_step = self._leader.before_step
         if resumed is not None:
-            built.trainer.restore(resumed)
+            trainer.restore(resumed)
             watch.pause(-seconds_at(folder, resumed.info.step))
         self.limited = (
-            None if built.scene_trainer is None else LimitedRun(folder, config, self.loop, built.scene_trainer)
+            LimitedRun(folder, config, self.loop, cast(GaussianTrainer, trainer))
+            if config.model.made_of_gaussians
+            else None
         )
         self._config, self._saved = config, self.loop.trainer.done
         if self.limited is not None and asked is not None:
@@ -246,8 +276,8 @@ class _Run:
             try:
                 loop.run(lambda: interrupts.requested or _is_lost(comparison))
             finally:
-                if limited is not None:
-                    limited.trainer.images.rest()
+                if isinstance(loop.trainer, Trainer):
+                    loop.trainer.images.rest()
             if _is_lost(comparison):
                 return False
             if loop.trainer.done < loop.total:
@@ -318,7 +348,7 @@ class _Run:
     def _evaluate(self, step: int) -> None:
         """Tell the scores of the test split."""
         start = time.perf_counter()
-        report = evaluate_run(self.folder, "test")
+        report = evaluate_run(self.folder, "test", capture=self._capture)
         seconds = time.perf_counter() - start
         self.loop.watch.pause(seconds)
         self.loop.tell(Evaluated(step, "test", report.psnr, report.ssim, seconds))
@@ -346,7 +376,7 @@ class _Run:
             yield self.limits[_SPEED].reached()
 
 
-def _tell_memory(trainer: Trainer, processes: int) -> None:
+def _tell_memory(trainer: GaussianTrainer, processes: int) -> None:
     """Print how much memory a run will take, and a warning where that is likely to be more than is there.
 
     Raises:

@@ -15,13 +15,13 @@ from statistics import fmean, median
 from dyngs.budget.run import LimitedRun
 from dyngs.budget.time import with_steps
 from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy
+from dyngs.deform.schedule import motion_begins_after
+from dyngs.gaussians.schedule import growth_per_change
+from dyngs.models.schedule import image_divisor, scaled
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.remaining import FIXED, MOTION, PER_GAUSSIAN, PER_MEGAPIXEL
 from dyngs.training.events import Event, StepDone
 from dyngs.training.memory import gaussian_bytes, num_changes, peak_memory
-from dyngs.gaussians.schedule import growth_per_change
-from dyngs.models.schedule import image_divisor, scaled
-from dyngs.deform.schedule import motion_begins_after
 
 SLOWER = 0.1
 """Power of the number of changes with which each adds fewer Gaussians."""

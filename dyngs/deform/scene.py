@@ -12,12 +12,11 @@ from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.scene import GaussianTimeStep, Scene
-from dyngs.models.renderable import clamped_time
-from dyngs.gaussians.visibility import VisibilityMasks, matched
-from dyngs.state import Role, State, StateTensor, part_of, prefixed
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
-from dyngs.gaussians.scene import stored_times, times_state
+from dyngs.gaussians.scene import GaussianTimeStep, Scene, stored_times, times_state
+from dyngs.gaussians.visibility import VisibilityMasks, matched
+from dyngs.models.renderable import clamped_time
+from dyngs.state import Role, State, StateTensor, part_of, prefixed
 from dyngs.tensor_checks import require_ascending, require_indices
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")

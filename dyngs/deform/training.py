@@ -28,14 +28,13 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianTimeStep
+from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, fields_moved_to, with_role
-from dyngs.gaussians.filters import FILTER_VARIANCE, filter_std
-from dyngs.gaussians.schedule import Rates
-from dyngs.gaussians.filters import FilterUpdate
 
 SURELY_MOVING = 1.5
 """Multiple of ``motion_threshold`` above which an error always counts as motion."""

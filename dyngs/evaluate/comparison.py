@@ -18,10 +18,10 @@ from dyngs.data.read import read_capture
 from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
 from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import psnr
+from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU, finish
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
-from dyngs.models.views import evaluation_background
 
 COMPARED_VIEWS = 20
 """Number of views compared per split; enough for before and after, not for a benchmark."""

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.models.renderable import Rendering
 from dyngs.metrics import psnr
+from dyngs.models.renderable import Rendering
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dyngs.data.images.silhouettes import silhouette_box
 from dyngs.data.loader import Image
-from dyngs.models.renderable import Rendering
 from dyngs.metrics import Lpips, psnr, ssim
+from dyngs.models.renderable import Rendering
 
 
 def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips: Lpips) -> dict[str, float | None]:

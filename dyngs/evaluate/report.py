@@ -12,7 +12,6 @@ from typing import Any, cast
 
 import torch
 
-from dyngs.config.kinds import field_of
 from dyngs.data.capture import Capture, Split, View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -28,10 +27,9 @@ from dyngs.gaussians.scene import Scene, render_options
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
+from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
-from dyngs.models.views import evaluation_background
-from dyngs.models.views import training_cameras
 
 REGION_METRICS: dict[str, RegionName] = {
     "psnr_foreground": "foreground",
@@ -141,6 +139,7 @@ def evaluate_run(
     threads: int = 0,
     refine_poses: bool = False,
     device: str = "cpu",
+    capture: Capture | None = None,
 ) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
@@ -152,6 +151,7 @@ def evaluate_run(
         refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
             images themselves; always done for a run that refined its cameras.
         device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
+        capture: of the run, if it was read already.
 
     Raises:
         DyngsError: no such run or split, unreadable images, a render or metric that is not finite, unwritable folder,
@@ -160,7 +160,7 @@ def evaluate_run(
     draws_on = device_for(device)
     _require_untrained(run_dir, split, refine_poses)
     run = load_run(run_dir)
-    capture = read_capture(run.config.data)
+    capture = capture or read_capture(run.config.data)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(draws_on)
@@ -337,7 +337,7 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
         )
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
-    if field_of(run.config) is not None and run.scene.is_static:
+    if run.config.model.may_move and run.scene.is_static:
         notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")

@@ -20,11 +20,11 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.people import person_scores
 from dyngs.evaluate.regions import Regions, RegionScores
-from dyngs.models.renderable import Rendering
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, flip, psnr, ssim
+from dyngs.models.renderable import Rendering
 from dyngs.ops.device import finish
 
 

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel
-from dyngs.config.kinds import person_of
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
@@ -65,8 +64,8 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
     Raises:
         DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
     """
-    scene, model = avatar_of(run.scene), person_of(run.config)
-    if scene is None or model is None:
+    scene, model = avatar_of(run.scene), run.config.model
+    if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
             f"--format avatar needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
         )

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.capture.first_points import AROUND_ORIGIN
 from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, Strategy
 from dyngs.conventions import SH_C0, num_sh_terms
-from dyngs.capture.first_points import AROUND_ORIGIN
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry.frusta import MIN_VIEWS, outside_of_cube, points_in_frusta
 from dyngs.gaussians import Gaussians

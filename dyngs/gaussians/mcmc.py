@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.ops.quaternions import rotate
 from dyngs.gaussians.densify import MAX_LOG_VARIANCE, Densifier, DensifySchedule
+from dyngs.ops.quaternions import rotate
 
 MAX_COPIES = 50
 NOISE_STEEPNESS = 100.0

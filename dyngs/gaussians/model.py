@@ -9,13 +9,13 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.config import Config, DefaultStrategy
+from dyngs.config import AutoColour, Config, DefaultStrategy, SceneModel
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
-from dyngs.gaussians.colour.training import ColourTraining, TrainingLooks
+from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, TrainingLooks
 from dyngs.gaussians.colour.view_dependence import MeasuredView
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import GaussianOptimizer
@@ -129,14 +129,19 @@ class GaussianModel(Model[Scene]):
         colours: ColourTraining,
     ) -> None:
         config = setting.config
-        self.config, self.training, self.densifier, self.colours = config, training, densifier, colours
+        self._config, self.densifier, self.colours = config, densifier, colours
         self._setting, self._generator = setting, setting.generator
         self.options = training_options(config)
-        self._optimizer = GaussianOptimizer(scene.gaussians, config.optim)
-        behind = evaluation_background(config.data.background, setting.capture.has_alpha)[1]
+        self.begin_with(scene, training)
+
+    def begin_with(self, scene: Scene, training: SceneTraining[Any]) -> None:
+        """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned yet."""
+        config = self._config
+        self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, config.optim)
+        behind = evaluation_background(config.data.background, self._setting.capture.has_alpha)[1]
         self._scene = replace(
             scene.with_gaussians(self._optimizer.parameters),
-            colour=colours.network,
+            colour=self.colours.network,
             options=render_options(config.model),
             background=behind,
         )
@@ -189,7 +194,7 @@ class GaussianModel(Model[Scene]):
             if probe is not None and probe.grad is not None:
                 size = (image.cameras.width, image.cameras.height)
                 # Fewer Gaussians suit small images: a gradient counts for less there.
-                signal = probe.grad / image_divisor(self.config.train, step)
+                signal = probe.grad / image_divisor(self._config.train, step)
                 densifier.after_backward(step, signal, rendering.radii, size)
 
         moved = now.gaussians.tensors() if scene.num_moving else {}
@@ -213,7 +218,7 @@ class GaussianModel(Model[Scene]):
 
     def update(self, step: int) -> Updated:
         before, generator = self._optimizer.parameters, self._generator
-        lr_means = means_rate(self.config.optim, rates_of(self.config).progress(step), self._setting.extent)
+        lr_means = means_rate(self._config.optim, rates_of(self._config).progress(step), self._setting.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
         bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
@@ -252,9 +257,15 @@ class GaussianModel(Model[Scene]):
         self._optimizer.drop_rest(base, dropped)
         self.exchange(self._scene)
 
-    def draw_as(self, config: Config) -> None:
-        """Go on with the settings of drawing of another configuration of the same model."""
-        self.config, options = config, render_options(config.model)
+    def keep_plain(self, plain: Tensor, colour: AutoColour) -> None:
+        """Leave the harmonics of the Gaussians ``plain`` (N,) zero from now on."""
+        colours = AutoTraining(colour, self._config.train.steps, len(self._setting.images))
+        colours.freeze(plain)
+        self.colours = colours
+
+    def draw_as(self, model: SceneModel) -> None:
+        """Draw with the settings of another section of the same kind from now on."""
+        options = render_options(model)
         self.options = replace(self.options, alpha_min=options.alpha_min)
         self._scene = replace(self._scene, options=options)
 
@@ -270,13 +281,11 @@ class GaussianModel(Model[Scene]):
         network_of(colour)  # raises where its tensors do not fit together
         self.colours.restore(colour, len(gaussians))
         scene = self.training.restored(optimizer.parameters, checkpoint.part("model"))
-        if checkpoint.info.step >= self.config.train.steps:
+        if checkpoint.info.step >= self._config.train.steps:
             self.stop_growing()
         self.densifier.load_state(checkpoint.part("strategy"))
         like, self._optimizer = self._scene, optimizer
-        self._scene = replace(
-            scene, colour=self.colours.network, options=like.options, background=like.background
-        )
+        self._scene = replace(scene, colour=self.colours.network, options=like.options, background=like.background)
 
     def place(self, device: torch.device) -> None:
         if self._scene.device == device:
@@ -284,12 +293,13 @@ class GaussianModel(Model[Scene]):
         self._optimizer = self._optimizer.to(device)
         self.colours.place(device)
         self.densifier.place(device)
-        scene = self._scene.to(device).with_gaussians(self._optimizer.parameters)
+        scene: Scene = self._scene.to(device)
+        scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene = replace(scene, colour=self.colours.network)
 
     def _options(self, step: int) -> RenderOptions:
         """Return how images are drawn in ``step``."""
-        degree = active_sh_degree(self.config.train, step, self._scene.gaussians.sh_degree)
+        degree = active_sh_degree(self._config.train, step, self._scene.gaussians.sh_degree)
         return replace(self.options, sh_degree=degree)
 
     def _apply(self, result: EditResult, edited: Scene | None = None) -> None:

@@ -19,10 +19,12 @@ from dyngs.camera import Cameras
 from dyngs.config import SceneModel
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import ColourNetwork, Frame
+from dyngs.gaussians.colour.network import ColourNetwork, Frame, network_of
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import Renderable, TimeStep
+from dyngs.models.views import background_colour
 from dyngs.state import Role, State, prefixed, with_role
 from dyngs.tensor_checks import require_moments
 
@@ -213,6 +215,16 @@ def require_gaussians(scene: Renderable, what: str) -> Scene:
 
 def _number(time: float | TimeStep | None) -> float | None:
     return time.time if isinstance(time, TimeStep) else time
+
+
+def drawn_as_trained(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
+    """Return a restored scene with the colours of the checkpoint, drawn as the model is.
+
+    Raises:
+        ValueError: the tensors of its colours do not fit together.
+    """
+    colour, background = network_of(checkpoint.part("model.colour")), background_colour(checkpoint.info.background)
+    return replace(scene, colour=colour, options=render_options(model), background=background)
 
 
 def render_options(model: SceneModel) -> RenderOptions:

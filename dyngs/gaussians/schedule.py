@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing_extensions import assert_never
 
 from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
-from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 from dyngs.gaussians.densify import DensifySchedule
+from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 
 MIN_START = 100
 """Densification never starts earlier: the first gradients say little."""
@@ -110,5 +110,3 @@ def filter_steps(strategy: Strategy, steps: int) -> range:
     """Return the steps after which Mip-Splatting's 3D filter is recomputed: each 100 after densification ends."""
     first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)
-
-

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.config import HumanModel
-from dyngs.config.kinds import person_of
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.clip import motion_clip
@@ -58,7 +57,7 @@ def in_rest_pose(run: LoadedRun) -> LoadedRun:
 
 
 def _avatar(run: LoadedRun, wanted: str) -> tuple[HumanScene, HumanModel]:
-    scene, model = avatar_of(run.scene), person_of(run.config)
-    if scene is None or model is None:
+    scene, model = avatar_of(run.scene), run.config.model
+    if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}")
     return scene, model

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dyngs.models.views import training_cameras
 from dyngs.camera import Cameras
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View
@@ -16,6 +15,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
 from dyngs.human.avatar.scene import avatar_of
+from dyngs.models.views import training_cameras
 from dyngs.output.along import path_along
 from dyngs.output.animation import in_rest_pose, with_motion
 from dyngs.output.camera_paths import CameraPath, read_path, static_path, with_times

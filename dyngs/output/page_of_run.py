@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.models.views import training_cameras
 from dyngs.camera import Cameras
 from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
@@ -17,6 +16,7 @@ from dyngs.export.html.page import Staging, WrittenPage, write_page
 from dyngs.human.avatar.light import LEFT_OUT
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction as up_of_clip
+from dyngs.models.views import training_cameras
 from dyngs.output.aim import look_at_point, up_direction
 from dyngs.output.animation import with_motion
 from dyngs.output.job_of_avatar import job_of_avatar

@@ -17,17 +17,16 @@ from typing import Any
 
 import torch
 
-from dyngs.kinds import restored_scene
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.config.kinds import network_of
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene
-from dyngs.storage.file import read_scene
+from dyngs.kinds import restored_scene
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.storage.file import read_scene
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
@@ -141,7 +140,7 @@ def load_run(run_dir: Path) -> LoadedRun:
         DyngsError: no run folder, no checkpoint, or a damaged one.
     """
     config = load_resolved(run_dir)
-    if network_of(config) is not None:
+    if config.model.is_network:
         raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")
     checkpoint = _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
     scene = restored_scene(checkpoint, config.model)

@@ -7,9 +7,14 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from dyngs.config import StaticModel
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
-from dyngs.gaussians.model import SceneTraining
+from dyngs.gaussians.model import GaussianModel, SceneTraining
+from dyngs.gaussians.scene import drawn_as_trained
+from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import Kind, Setting
 from dyngs.static.scene import StaticScene
 
 
@@ -30,3 +35,19 @@ class StaticTraining(SceneTraining[StaticScene]):
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
         return StaticScene.restored(gaussians, tensors)
+
+
+def start(setting: Setting) -> GaussianModel:
+    """Return the model of a static scene before its first step."""
+    gaussians = first_gaussians(setting)
+    colours, training = colours_of(setting, gaussians, sees_time=False), StaticTraining(filter_update(setting))
+    return GaussianModel(setting, training.first_scene(gaussians), training, densifier_of(setting), colours)
+
+
+def restore(model: StaticModel, checkpoint: Checkpoint) -> StaticScene:
+    """Return the scene of a checkpoint."""
+    scene = StaticScene.restored(Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
+    return drawn_as_trained(scene, model, checkpoint)
+
+
+KIND = Kind(StaticModel, start, restore)

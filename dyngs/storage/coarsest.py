@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from dyngs.kinds import restored_scene
 from dyngs.config import Config
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import restored_scene
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.storage.drawable import completed, drawable
 from dyngs.storage.file import SceneInfo, decoded, encoded
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.precision import rounded
 from dyngs.storage.quantize import step_below
 from dyngs.storage.tensors import COARSENESS
-from dyngs.models.checkpoint import Checkpoint
 
 FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))
 """Factors on the usual steps that are tried, by bisection."""

@@ -20,6 +20,7 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
 from dyngs.metrics import load_lpips
+from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
@@ -30,7 +31,6 @@ from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
 from dyngs.tradeoff.variants import Variant, Variation, single_changes
-from dyngs.models.views import evaluation_background
 
 TIMED_VIEWS = 8
 """Number of views for timing, evenly spread over the split; quality is measured on all."""

@@ -11,9 +11,9 @@ from torch import Tensor
 from dyngs.config import Config, HumanPredictorModel
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.prediction.network import AtlasNetwork
 from dyngs.human.prediction.predict import predict_gaussians
-from dyngs.gaussians.schedule import Rates
 from dyngs.models.views import evaluation_background
 from dyngs.training.prediction import MAX_GRADIENT, Filmed, human_options, image_loss, scene_of
 

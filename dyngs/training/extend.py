@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dyngs.config import AutoColour, Config, DynamicModel, HumanModel, TrainConfig
-from dyngs.config.kinds import harmonics_measured_after, network_of
+from dyngs.deform.schedule import deform_schedule, motion_begins_after
 from dyngs.deform.training import DeformSchedule
 from dyngs.errors import DyngsError
-from dyngs.gaussians.schedule import Rates
-from dyngs.training.corrections.exposure import WARM_UP
+from dyngs.gaussians.schedule import Rates, means_rate, rates_of
 from dyngs.models.schedule import PUBLISHED_STEPS, hold_out_until, scaled
-from dyngs.deform.schedule import deform_schedule, motion_begins_after
-from dyngs.gaussians.schedule import means_rate, rates_of
+from dyngs.training.corrections.exposure import WARM_UP
 
 MOST_FRACTION = 1 - 1e-9
 """Largest fraction of a run, for keys that must be below 1."""
@@ -100,7 +98,7 @@ def told(before: Config, after: Config, done: int) -> str:
     """Return the line that says how a run goes on after ``done`` steps."""
     was, steps = before.train.steps, after.train.steps
     line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {steps:,} steps"
-    if network_of(after) is not None:
+    if not after.model.made_of_gaussians:
         return line
     then, now = (means_rate(c.optim, rates_of(c).progress(done), 1.0) for c in (before, after))
     stop = scaled(after.strategy.stop, steps)
@@ -156,7 +154,7 @@ def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> fl
 def _fraction_of_measure(config: Config, length: Length) -> float:
     """Return the share after which harmonics are measured, likewise."""
     longer = config.model_copy(update={"train": config.train.model_copy(update={"steps": length.steps})})
-    old, new = harmonics_measured_after(config) or 0, harmonics_measured_after(longer) or 0
+    old, new = (c.colour.measured_after(c.train.steps) or 0 for c in (config, longer))
     if length.done >= old:
         return length.kept(old)
     return length.kept(length.done + 1) if new <= length.done else new / length.steps

@@ -149,8 +149,10 @@ class Trainer(Generic[M]):
         drawn = self.model.draw(image, step, background, depth=depth)
         rendering = drawn.rendering
         if self.robust is not None:
-            with_depth = partial(self._drawn_with_depth(background), time=image.time)
-            image = self.robust.masked(index, step, image, rendering.rgb[0], background, with_depth)
+            draw, time = self._drawn_with_depth(background), image.time
+            image = self.robust.masked(
+                index, step, image, rendering.rgb[0], background, lambda cameras: draw(cameras, time)
+            )
         rendered, truth = rendering.rgb[0], image.composite(background)
         if self.exposures is not None:
             self.exposures.begin(step, self._wanted(step), self._drawn_with_depth(background))

@@ -13,8 +13,8 @@ from torch.nn import functional
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.files.write import to_uint8
-from dyngs.models.renderable import Rendering
 from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.models.renderable import Rendering
 from dyngs.output.contact_sheet import color_map, depth_to_rgb
 from dyngs.output.render_job import resize_cameras
 from dyngs.view.viewed import Viewed

@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 
 from dyngs.config.io import RESOLVED_NAME, load_resolved
-from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
 from dyngs.files.wrong_place import command_for
 from dyngs.ops.device import CPU
@@ -88,7 +87,7 @@ def first_of(source: Source) -> Viewed:
 
 def is_network(path: Path) -> bool:
     """Return whether ``path`` is the run of a network that predicts people."""
-    return path.is_dir() and _is_run(path) and network_of(load_resolved(path)) is not None
+    return path.is_dir() and _is_run(path) and load_resolved(path).model.is_network
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -109,7 +108,7 @@ def _is_run(folder: Path) -> bool:
 def _has_scene(run: Path) -> bool:
     try:
         has_any = (run / SCENE_FILE).is_file() or bool(checkpoint_paths(run))
-        return has_any and network_of(load_resolved(run)) is None
+        return has_any and not load_resolved(run).model.is_network
     except (DyngsError, OSError):
         return False
 

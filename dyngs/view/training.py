@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import torch
 
 from dyngs.config import Config
-from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
 from dyngs.models.views import evaluation_background
@@ -87,7 +87,7 @@ class TrainingView:
     """
 
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
-        if network_of(config) is not None:
+        if config.model.is_network:
             raise DyngsError("--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts")
         require_viser()
         free_port(serving.host, serving.port)  # now, not after reading the capture
@@ -119,7 +119,7 @@ class TrainingView:
     def _draw(self, event: StepDone, drawn: DrawnBetweenSteps) -> float:
         match event.loop.trainer:
             case Trainer() as trainer:
-                return drawn.after_step(trainer.scene)
+                return drawn.after_step(trainer.model.scene)
             case _:
                 return 0.0
 
@@ -136,10 +136,10 @@ class TrainingView:
         return DrawnBetweenSteps(self._viewer.drawer)
 
 
-def _first(trainer: Trainer) -> Viewed:
+def _first(trainer: Trainer[Any]) -> Viewed:
     """Return the scene of a trainer with the views that it is trained on."""
     config = trainer.config
     choice = config.data.background if config.data.background != "auto" else trainer.background
     _, background = evaluation_background(choice, has_alpha=False)
     with torch.no_grad():
-        return viewed_training(config.run.name, config, replace(trainer.scene), trainer.images, background)
+        return viewed_training(config.run.name, config, replace(trainer.model.scene), trainer.images, background)

@@ -25,6 +25,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep, Scene, render_options
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction
+from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.output.aim import look_at_point
 from dyngs.output.aim import up_direction as mean_up
 from dyngs.output.orbit import frame_orbit_for_points
@@ -33,8 +34,6 @@ from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.splats.formats import known_format, read_splats
 from dyngs.splats.splat_file import splat_options
 from dyngs.static.scene import StaticScene
-from dyngs.models.views import evaluation_background
-from dyngs.models.views import training_cameras
 
 _STILL_SECONDS = 4.0
 """Seconds from time 0 to 1 where nobody knows."""

@@ -9,9 +9,9 @@ import pytest
 from tiny_fields import busy_config
 
 from dyngs.api.small_runs import SMALL_GAUSSIANS, SMALL_SIDE, hold_out_every, is_gain, small_run
-from dyngs.kinds import assemble
 from dyngs.config import BudgetConfig, DefaultStrategy, TrainConfig
 from dyngs.data.capture import View
+from dyngs.kinds import assemble
 
 
 @pytest.mark.parametrize(("gains", "pays"), [([1.0, 1.2, 0.8], True), ([0.5, -0.4, 0.3], False), ([-1.0, -1.1], False)])

@@ -9,12 +9,12 @@ import pytest
 import torch
 from tiny_fields import busy_config, tiny_options
 
-from dyngs.kinds import assemble
 from dyngs.config import Config
 from dyngs.deform.compared_views import ComparedViews
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.training import DynamicTraining
 from dyngs.gaussians import Gaussians
+from dyngs.kinds import assemble
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -34,9 +34,9 @@ def trained(config: Config, steps: int) -> Trainer:
 
 
 def scene_and_views(trainer: Trainer) -> tuple[DynamicScene, ComparedViews]:
-    views = cast(DynamicTraining, trainer.training).capture.matched
+    views = cast(DynamicTraining, trainer.model.training).capture.matched
     assert views is not None
-    return cast(DynamicScene, trainer.scene), views
+    return cast(DynamicScene, trainer.model.scene), views
 
 
 def test_errors_are_those_of_images_that_are_trained_on(moving: Path, tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_errors_are_those_of_images_that_are_trained_on(moving: Path, tmp_path: 
 def test_a_registration_never_raises_the_error(moving: Path, tmp_path: Path) -> None:
     trainer = trained(config_of(moving, tmp_path), 16)
     scene, views = scene_and_views(trainer)
-    training = cast(DynamicTraining, trainer.training)
+    training = cast(DynamicTraining, trainer.model.training)
     before = views.error(lambda time: scene.deformed_at(time)[0], (0.0, 1.0))
     after = training._registered(scene, 16)
     assert views.error(lambda time: after.deformed_at(time)[0], (0.0, 1.0)) <= before

@@ -26,12 +26,12 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors
 from dyngs.deform.training import DeformSchedule, DynamicTraining, TrainingViews
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.scene import GaussianTimeStep
-from dyngs.state import part_of, tensors_of
-from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.schedule import Rates
-from dyngs.gaussians.filters import FilterUpdate
+from dyngs.state import part_of, tensors_of
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 TIMES = tuple(i / 20 for i in range(21))

@@ -17,10 +17,10 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.evaluate.people import person_box, person_scores
 from dyngs.evaluate.report import scene_of_split
-from dyngs.models.renderable import Rendering
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, ssim
+from dyngs.models.renderable import Rendering
 from dyngs.runs.checkpoint import load_run
 
 NO_LPIPS = Lpips("alex", "no weights here")

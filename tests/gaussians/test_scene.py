@@ -14,17 +14,17 @@ from tiny_fields import KINDS as FIELDS
 from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
-from dyngs.kinds import assemble, restored_scene
 from dyngs.config import FixedStrategy, StaticModel
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
+from dyngs.kinds import assemble, restored_scene
 from dyngs.state import Role, part_of, tensors_of
-from dyngs.gaussians.schedule import Rates
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 
@@ -255,17 +255,19 @@ def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
     for _ in range(11):
         trainer.step()
     loaded = restored_scene(trainer.checkpoint(), config.model)
-    assert type(loaded) is type(trainer.scene)
-    assert loaded.moving_fraction == trainer.scene.moving_fraction
+    assert type(loaded) is type(trainer.model.scene)
+    assert loaded.moving_fraction == trainer.model.scene.moving_fraction
     assert (loaded.moving_fraction > 0) == (model != "static")
-    assert loaded.options == trainer.scene.options
+    assert loaded.options == trainer.model.scene.options
     view = trainer.images[0]
-    behind = trainer.scene.background
+    behind = trainer.model.scene.background
     for time in (0.0, 0.37):
         with torch.no_grad():
-            drawn = [scene.render(view.cameras, time, background=behind).rgb for scene in (loaded, trainer.scene)]
+            drawn = [scene.render(view.cameras, time, background=behind).rgb for scene in (loaded, trainer.model.scene)]
         assert torch.equal(*drawn)
-        in_training = trainer.training.time_step(trainer.scene, replace(view, time=time), config.train.steps)
+        in_training = trainer.model.training.time_step(
+            trainer.model.scene, replace(view, time=time), config.train.steps
+        )
         assert_alike(in_training.gaussians.detach(), loaded.at(time))
 
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from dyngs.api.train import train
-from dyngs.kinds import assemble
 from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.kinds import assemble
 from dyngs.output.job_of_run import job_of_run
 from dyngs.output.person_orbit import person_orbit
 from dyngs.output.render_job import RenderJobOptions

@@ -10,8 +10,8 @@ import pytest
 
 from dyngs.config import Config
 from dyngs.config.io import load_config
-from dyngs.runs.remaining import RemainingTime
 from dyngs.models.schedule import image_divisor
+from dyngs.runs.remaining import RemainingTime
 
 STEPS = 6000
 

@@ -7,10 +7,9 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
 from dyngs.state import part_of, tensors_of
-from dyngs.gaussians.filters import filter_std, fuse_filter
 from dyngs.static.scene import StaticScene
-from dyngs.gaussians.filters import FilterUpdate
 from dyngs.static.training import StaticTraining
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])

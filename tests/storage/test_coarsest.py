@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from moving_scene import write_moving_run
 
-from dyngs.kinds import restored_scene
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import restored_scene
 from dyngs.runs.checkpoint import latest_checkpoint
 from dyngs.storage.coarsest import FACTORS, coarsest_file
 from dyngs.storage.file import decoded

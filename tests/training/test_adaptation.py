@@ -8,8 +8,8 @@ import torch
 from tiny_people import NET, people, person
 
 from dyngs.config import Config
-from dyngs.human.prediction.predict import predict_gaussians
 from dyngs.gaussians.schedule import Rates
+from dyngs.human.prediction.predict import predict_gaussians
 from dyngs.training.adaptation import adapt_network
 from dyngs.training.prediction import Filmed, human_options, new_network, scene_of
 

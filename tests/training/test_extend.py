@@ -26,16 +26,14 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.config.kinds import harmonics_measured_after
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.errors import DyngsError
-from dyngs.human.synthetic.capture import write_human_capture
-from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.gaussians.schedule import Rates
-from dyngs.training.extend import told, with_length
-from dyngs.gaussians.schedule import active_sh_degree
 from dyngs.deform.schedule import deform_schedule
+from dyngs.errors import DyngsError
+from dyngs.gaussians.schedule import Rates, active_sh_degree
+from dyngs.human.synthetic.capture import write_human_capture
 from dyngs.models.schedule import image_divisor
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.training.extend import told, with_length
 from dyngs.training.trainer import StepReport, Trainer
 
 KINDS = ("default", "mcmc", "control_nodes", "human")
@@ -177,7 +175,7 @@ def test_what_has_begun_keeps_its_step() -> None:
             assert isinstance(new.model, DynamicModel)
             now = deform_schedule(new.model, Rates(steps))
             assert now.fine == (350 if steps < 9000 else 1000)
-            assert harmonics_measured_after(new) == 300
+            assert new.colour.measured_after(new.train.steps) == 300
             assert image_divisor(new.train, done) <= image_divisor(options, done)
             assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
             if done >= old.opens and steps < 9000:
@@ -200,4 +198,4 @@ def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
     new = with_length(config, 4000, 5000)
     assert isinstance(new.model, DynamicModel)
     assert deform_schedule(new.model, Rates(5000)).fine == 4001
-    assert harmonics_measured_after(new) == 4001
+    assert new.colour.measured_after(new.train.steps) == 4001

@@ -10,7 +10,6 @@ import pytest
 from pretend_gpu import GPU, pretend_gpu
 from tensor_bytes import TensorBytes
 
-from dyngs.kinds import assemble
 from dyngs.config import (
     Config,
     DataConfig,
@@ -25,6 +24,7 @@ from dyngs.config import (
 )
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.training import memory
 from dyngs.training.memory import (
     MemoryForecast,
@@ -200,8 +200,8 @@ def _peak(config: Config, steps: int) -> tuple[int, int]:
     """The most bytes of tensors in a run of ``steps``, in which all may move, and the number of Gaussians."""
     with TensorBytes() as found:
         trainer = assemble(config)
-        if not trainer.scene.is_static or trainer.scene.times:
-            trainer.scene = trainer.training.all_moving(trainer.scene, trainer.extent)
+        if not trainer.model.scene.is_static or trainer.model.scene.times:
+            trainer.model.scene = trainer.model.training.all_moving(trainer.model.scene, trainer.extent)
             trainer.done = 25  # past the step at which motion begins
         found.most = found.now
         for _ in range(steps):

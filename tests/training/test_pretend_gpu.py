@@ -11,16 +11,16 @@ from pretend_gpu import GPU, OnGpu, pretend_gpu
 from tiny_people import NET, people
 
 from dyngs.api.train import train
-from dyngs.kinds import assemble
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.evaluate.report import EvalReport, evaluate_run
+from dyngs.kinds import assemble
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.output.image_files import write_split_images
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.state import tensors_of
 from dyngs.training.prediction import assemble_network
-from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -67,9 +67,9 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     expected = tensors_of(trained(config, monkeypatch, torch.device("cpu")).state())
     with pretend_gpu():
         trainer = trained(config, monkeypatch, GPU)
-        assert all(isinstance(x, OnGpu) for x in trainer.scene.gaussians.tensors().values())
+        assert all(isinstance(x, OnGpu) for x in trainer.model.scene.gaussians.tensors().values())
         found = trainer.checkpoint().tensors
-        assert len(trainer.scene) != 100 or name not in ("growing", "mcmc", "mip"), "the set was to change"
+        assert len(trainer.model.scene) != 100 or name not in ("growing", "mcmc", "mip"), "the set was to change"
     assert found.keys() == expected.keys()
     assert [key for key, x in expected.items() if not torch.equal(found[key], x)] == []
 

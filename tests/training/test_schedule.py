@@ -9,9 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
-from dyngs.gaussians.schedule import Rates
-from dyngs.gaussians.schedule import MAX_GROWTH, MIN_RESET_GAP, active_sh_degree, densify_schedule, filter_steps, grad_threshold, growth_per_change, means_rate
 from dyngs.deform.schedule import deform_schedule
+from dyngs.gaussians.schedule import (
+    MAX_GROWTH,
+    MIN_RESET_GAP,
+    Rates,
+    active_sh_degree,
+    densify_schedule,
+    filter_steps,
+    grad_threshold,
+    growth_per_change,
+    means_rate,
+)
 from dyngs.models.schedule import image_divisor
 
 

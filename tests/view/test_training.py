@@ -32,7 +32,7 @@ class Onlooker:
                 trainer = event.loop.trainer
                 assert isinstance(trainer, Trainer)
                 if event.step == 2:
-                    first = viewed_training("run", trainer.config, trainer.scene, trainer.images, torch.ones(3))
+                    first = viewed_training("run", trainer.config, trainer.model.scene, trainer.images, torch.ones(3))
                     session = Session(first, lambda sent: self.seen.append(sent.image.tobytes()), clock=self.clock)
                     self.drawer.add(session)
                 for session in self.drawer.sessions:
@@ -41,7 +41,7 @@ class Onlooker:
                         other, _ = looking_at_balls()
                         assert other.eye is not None
                         session.move(other.eye)
-                self.drawn.after_step(trainer.scene)
+                self.drawn.after_step(trainer.model.scene)
 
 
 @pytest.mark.parametrize("preset", ["static", "dynamic"])

@@ -18,6 +18,14 @@ class ColourSection(Section):
         description="weight of the mean of -o ln o over opacities o, which removes faint Gaussians; MEGA: 5e-4",
     )
 
+    def stored_degree(self, sh_degree: int) -> int:
+        """Return the degree of the harmonics that training begins with, of ``model.sh_degree``."""
+        return sh_degree
+
+    def measured_after(self, steps: int) -> int | None:
+        """Return the step after which it is measured whose harmonics pay; None where it never is."""
+        return None
+
 
 class ShColour(ColourSection):
     """Spherical harmonics of degree ``model.sh_degree`` for every Gaussian."""
@@ -46,6 +54,10 @@ class NetworkColour(ColourSection):
     )
     warm_up: int = Field(default=100, ge=1, description="steps in which that rate is reached")
 
+    def stored_degree(self, sh_degree: int) -> int:
+        """Return 0: the network gives what depends on the view."""
+        return 0
+
 
 class AutoColour(ColourSection):
     """Harmonics only for the Gaussians whose dependence on the view pays on held-out training views."""
@@ -59,3 +71,6 @@ class AutoColour(ColourSection):
         description="fraction of the run after which that is measured; until then every 8th view is held out",
     )
     tolerance: float = Field(default=0.05, ge=0, description="PSNR that may be lost by it, dB")
+
+    def measured_after(self, steps: int) -> int:
+        return min(max(1, round(self.measure_at * steps)), steps)

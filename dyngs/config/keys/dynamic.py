@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -111,6 +111,9 @@ DeformField = HexplaneField | MlpField | TrajectoryField | ControlNodesField
 class DynamicModel(SceneModel):
     """Canonical Gaussians and a deformation field over time (docs/dynamic.md)."""
 
+    begins_with_points: ClassVar[bool] = True
+    may_move: ClassVar[bool] = True
+
     kind: Literal["dynamic"] = Field(
         default="dynamic", description="canonical Gaussians and a deformation field over time (docs/dynamic.md)"
     )
@@ -166,3 +169,7 @@ class DynamicModel(SceneModel):
         description="noise on the time of a training view, in intervals between times, falling to 0 over the run "
         "(Deformable-3DGS); 0.1 suits videos with inexact times",
     )
+
+    @property
+    def added_for_motion(self) -> int:
+        return self.num_random_moving

@@ -175,7 +175,7 @@ class AutoTraining(ColourTraining):
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)
         self.tolerance = options.tolerance
-        self.measured_after = min(max(1, round(options.measure_at * steps)), steps)
+        self.measured_after = options.measured_after(steps)
         self.held_out = tuple(range(_HELD_OUT, num_views, HELD_OUT_EVERY))
         self._frozen: Tensor | None = None
 

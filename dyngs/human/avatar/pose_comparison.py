@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dyngs.data.images.images import area_downscale
 from dyngs.data.loader import Image
-from dyngs.models.renderable import Rendering
 from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT
+from dyngs.models.renderable import Rendering
 from dyngs.ops.loss import l1_ssim_loss
 
 SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1

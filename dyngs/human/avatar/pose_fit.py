@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.models.renderable import Rendering
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
@@ -24,6 +23,7 @@ from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import adam_step_
 
 COARSE_PX = 40

@@ -13,7 +13,6 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianTimeStep, Scene
-from dyngs.models.renderable import clamped_time
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.corrections import (
     SharedCorrection,
@@ -35,6 +34,7 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.avatar.validation import require_avatar, require_shapes
 from dyngs.human.motion.clip import MotionClip
+from dyngs.models.renderable import clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed, with_role
 
 

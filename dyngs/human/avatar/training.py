@@ -17,6 +17,7 @@ from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianTimeStep
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
 from dyngs.human.avatar.light import difference_of_sides
 from dyngs.human.avatar.neighbours import linked_neighbours
@@ -26,7 +27,6 @@ from dyngs.human.avatar.subject import Subject
 from dyngs.human.avatar.unseen import HARDLY, filled, mirror_images, sightings, trust_in
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor
-from dyngs.gaussians.schedule import Rates
 
 NEIGHBOURS = 5
 CENTIMETRE = 0.01

@@ -24,8 +24,8 @@ from dyngs.config import TrainConfig
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import videos
 from dyngs.gaussians.colour.affine import SATURATED, recoloured
-from dyngs.models.renderable import Rendering
 from dyngs.models.model import Look, Loss
+from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
 from dyngs.state import tensors_of
 from dyngs.tensor_checks import require_tensor

@@ -9,8 +9,8 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.models.renderable import Rendering
 from dyngs.human.avatar.pose_comparison import difference_of_images, difference_of_silhouettes, shrunk
+from dyngs.models.renderable import Rendering
 
 WHITE = torch.ones(3)
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]]), 16, 12)

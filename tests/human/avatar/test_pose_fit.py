@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.kinds import assemble
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.loader import Image, ImageLoader
@@ -22,6 +21,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, joint_transforms
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.kinds import assemble
 from dyngs.metrics import psnr
 
 WHITE = torch.ones(3)
@@ -51,11 +51,11 @@ def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
         run=RunConfig(threads=1),
     )
     trainer = assemble(config)
-    assert isinstance(trainer.scene, HumanScene)
+    assert isinstance(trainer.model.scene, HumanScene)
     cameras = {tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.images)}
     grow = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None]
     larger = [Cameras(x.cam_from_world, grow * x.intrinsics, SIZE, SIZE) for x in cameras.values()]
-    return trainer.scene, larger
+    return trainer.model.scene, larger
 
 
 def images_of(scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None) -> list[Image]:

@@ -13,6 +13,7 @@ from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose, correction_penalties
 from dyngs.human.avatar.posing import Skeleton
@@ -25,7 +26,6 @@ from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.load import default_template
 from dyngs.state import part_of, tensors_of
-from dyngs.gaussians.schedule import Rates
 
 
 def random_clip(frames: int, seed: int = 0) -> MotionClip:

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.kinds import assemble
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.capture import View
 from dyngs.files.write import write_image
@@ -21,6 +20,7 @@ from dyngs.human.fit.inputs import KnownAvatar
 from dyngs.human.fit.known_avatar import AvatarPoses, posed_by_avatar
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.kinds import assemble
 from dyngs.training.trainer import Trainer
 
 SIZE = 64
