@@ -98,7 +98,9 @@ def assemble_any(
     """
     if capture is None:
         capture = read_capture(config.data) if restored else prepared(config)
-    asked, config = config, within_cap(config, len(set(training_times(capture))))
+    asked = config
+    if config.model.made_of_gaussians:
+        config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
     views = capture.splits["train"]
     if images is None:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from dyngs.build import restored_scene
 from motion_files import Clip, as_local, glb_of, random_motion, skeleton, tiny_body, write_bvh
 from moving_scene import camera, row_of_balls
 from synthetic_bodies import model, write_npz, write_obj, write_pickle
 from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
-from dyngs.build import restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config

@@ -15,7 +15,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.frame_selection import evenly_spaced
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
+from dyngs.evaluate.report import parameter_megabytes, scene_of_split, split_views
 from dyngs.evaluate.temporal import Drawing
 from dyngs.metrics import psnr
 from dyngs.models.views import evaluation_background
@@ -110,8 +110,6 @@ def _views(runs: Sequence[LoadedRun], capture: Capture, split: str, device: torc
     loader = ImageLoader(split_views(capture, split), config.data)
     loader.device = device
     background = evaluation_background(config.data.background, capture.has_alpha)[1].to(device)
-    drawings = [
-        Drawing(scene_of_split(run, capture, split).to(device), render_options(run.config.model), background)
-        for run in runs
-    ]
+    scenes = [scene_of_split(run, capture, split).to(device) for run in runs]
+    drawings = [Drawing(scene, scene.options, background) for scene in scenes]
     return [(loader[i], drawings) for i in evenly_spaced(len(loader), COMPARED_VIEWS)]

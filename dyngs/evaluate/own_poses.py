@@ -20,6 +20,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.temporal import Drawing
 from dyngs.evaluate.view_scores import PoseScores, means_of, score_views
+from dyngs.gaussians.scene import require_gaussians
 from dyngs.human.avatar.pose_comparison import IMAGES, SILHOUETTES, Comparison
 from dyngs.human.avatar.pose_fit import fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
@@ -66,7 +67,7 @@ def _person_scores(
     avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
 ) -> PoseScores:
     """Return the scores of a person in the poses that are most like the images."""
-    fitted = fitted_to_images(avatar, images, drawing.background, drawing.options, comparison)
+    fitted = fitted_to_images(avatar, images, drawing.background, avatar.options, comparison)
     each = (images[i] for i in range(len(images)))
     views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
     return PoseScores(**means_of(views), updates=fmean(fitted.updates), per_view=tuple(views))
@@ -80,7 +81,8 @@ def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> f
         images: of a split.
         size: of the scene, world units.
     """
-    scene, options, background = drawing.scene, drawing.options, drawing.background
+    scene, background = require_gaussians(drawing.scene, "what cameras are fitted to"), drawing.background
+    options = scene.options
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
         fitted = fitted_to_image(scene, image, background, size, options=options)

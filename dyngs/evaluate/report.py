@@ -23,10 +23,11 @@ from dyngs.evaluate.temporal import Drawing, TimeScore, flicker_error, flicker_o
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, mean_of, means_of, score_views
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene, render_options
+from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.captured import captured_motion, same_bodies
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
+from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
@@ -164,7 +165,7 @@ def evaluate_run(
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(draws_on)
-    drawing = Drawing(scene, render_options(run.config.model), colour.to(draws_on))
+    drawing = Drawing(scene, scene.options, colour.to(draws_on))
     with _num_threads(threads):
         loader = images_of_split(capture, views, run_dir, run)
         loader.device = draws_on
@@ -216,18 +217,24 @@ def _own_poses(fitted: PoseRefinement) -> dict[str, Any]:
     }
 
 
-def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
+def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
     """Return the fields of a report that no image is needed for."""
-    return {
+    facts = {
+        "seconds_train": run.seconds_train,
+        "step": run.step,
+        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
+    }
+    if not isinstance(scene, Scene):
+        values = sum(x.tensor.numel() for x in scene.drawing_state().values())
+        none = {"num_gaussians": 0, "num_moving": 0, "moving_fraction": 0.0, "field_mb": 0.0, "colour_floats": 0.0}
+        return facts | none | {"model_mb": 4e-6 * values}
+    return facts | {
         "num_gaussians": len(scene),
         "num_moving": 0 if scene.is_static else scene.num_moving,
         "moving_fraction": scene.moving_fraction,
         "model_mb": parameter_megabytes(scene),
         "field_mb": 4e-6 * scene.num_motion_values,
         "colour_floats": scene.num_colour_values / max(len(scene), 1),
-        "seconds_train": run.seconds_train,
-        "step": run.step,
-        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
     }
 
 
@@ -287,18 +294,18 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
     raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
 
 
-def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
+def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
     """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that split.
 
     The split pose, and splits with body parameters of their own, have the poses of their files. Others show the clip of
     training with its refined poses, interpolated at times between.
     """
-    avatar = avatar_of(run.scene)
+    avatar = avatar_of(run.renderable)
     if avatar is None or capture.body is None:
-        return run.scene
+        return run.renderable
     given, trained = capture.body[cast(Split, split)], capture.body["train"]
     if split != "pose" and same_bodies(given, trained):
-        return run.scene
+        return run.renderable
     shown = captured_motion(capture.root, given, split_views(capture, split), avatar.skeleton.joints)
     return avatar.playing(shown.clip)
 
@@ -311,10 +318,12 @@ def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> d
     }
 
 
-def _track_scores(run: LoadedRun, capture: Capture, scene: Scene, views: Sequence[View]) -> TrackScores:
+def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:
     """Return the errors of the scene's motion where the capture has true tracks."""
     tracks = read_true_tracks(capture.root, capture.world_offset)
     cameras = training_cameras(views, run.config.data)
+    if not isinstance(scene, Scene):
+        return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")
     return track_scores(scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits))
 
 
@@ -337,7 +346,7 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
         )
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
-    if run.config.model.may_move and run.scene.is_static:
+    if run.config.model.may_move and run.renderable.is_static:
         notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")

@@ -21,9 +21,8 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
 from dyngs.metrics import MetricValue
+from dyngs.models.renderable import DrawOptions, Renderable
 
 MAX_MOMENTS = 60
 """Number of training times up to which flicker is measured at all of them."""
@@ -51,8 +50,8 @@ class Drawing:
         background: (3,) colour.
     """
 
-    scene: Scene
-    options: RenderOptions
+    scene: Renderable
+    options: DrawOptions
     background: Tensor
 
     @torch.no_grad()

@@ -20,11 +20,9 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.half_fit import right_half_scores
 from dyngs.evaluate.people import person_scores
 from dyngs.evaluate.regions import Regions, RegionScores
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, flip, psnr, ssim
-from dyngs.models.renderable import Rendering
+from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.ops.device import finish
 
 
@@ -81,9 +79,9 @@ class PoseScores:
 
 
 def score_views(
-    scene: Scene,
+    scene: Renderable,
     images: Iterable[Image],
-    options: RenderOptions,
+    options: DrawOptions,
     background: Tensor,
     lpips: Lpips,
     regions: Regions | None = None,
@@ -154,11 +152,11 @@ def mean_of(values: Sequence[float | None]) -> float | None:
 
 
 def _timed_render(
-    scene: Scene, image: Image, options: RenderOptions, background: Tensor
+    scene: Renderable, image: Image, options: DrawOptions, background: Tensor
 ) -> tuple[Rendering, float, float]:
     """Return the rendering, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
-        device = scene.gaussians.means.device
+        device = scene.device
         finish(device)
         start = time.perf_counter()
         moment = scene.time_step(image.time)

@@ -345,11 +345,11 @@ def gaussian_model(model: Model[Any] | None, what: str) -> GaussianModel:
 
     Args:
         model: of any kind.
-        what: needs them, for the message.
+        what: is not made of them, for the message.
 
     Raises:
         DyngsError: it is made of something else.
     """
     if not isinstance(model, GaussianModel):
-        raise DyngsError(f"{what}: needs Gaussians, and this model is made of something else; leave it out")
+        raise DyngsError(f"{what}: is not made of Gaussians, which this needs")
     return model

@@ -203,13 +203,13 @@ def require_gaussians(scene: Renderable, what: str) -> Scene:
 
     Args:
         scene: of any kind.
-        what: needs them, for the message.
+        what: is not made of them, for the message.
 
     Raises:
         DyngsError: it is made of something else.
     """
     if not isinstance(scene, Scene):
-        raise DyngsError(f"{what}: needs Gaussians, and this scene is made of something else; leave it out")
+        raise DyngsError(f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed")
     return scene
 
 

@@ -42,7 +42,7 @@ def with_motion(run: LoadedRun, path: Path) -> AnimatedRun:
         clip = replace(clip, trans=clip.trans - clip.trans.new_tensor(run.info.world_offset))
     else:
         clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-    return AnimatedRun(replace(run, scene=scene.playing(clip)), motion.fps)
+    return AnimatedRun(replace(run, renderable=scene.playing(clip)), motion.fps)
 
 
 def in_rest_pose(run: LoadedRun) -> LoadedRun:
@@ -53,7 +53,7 @@ def in_rest_pose(run: LoadedRun) -> LoadedRun:
     """
     scene, _ = _avatar(run, "--pose rest")
     rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-    return replace(run, scene=scene.playing(rest))
+    return replace(run, renderable=scene.playing(rest))
 
 
 def _avatar(run: LoadedRun, wanted: str) -> tuple[HumanScene, HumanModel]:

@@ -16,10 +16,10 @@ from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
+from dyngs.evaluate.report import evaluation_background, scene_of_split, split_views
 from dyngs.files.write import to_uint8, write_image
-from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import psnr
+from dyngs.models.renderable import DrawOptions
 from dyngs.ops.device import CPU
 from dyngs.output.camera_paths import CameraPath
 from dyngs.output.contact_sheet import SheetRow, contact_sheet, depth_limits, depth_to_rgb
@@ -110,7 +110,7 @@ def write_split_images(
     views = split_views(capture, split)
     loader = ImageLoader(views, run.config.data)
     _, background = evaluation_background(run.config.data.background, capture.has_alpha)
-    options = _with_depth(render_options(run.config.model), output)
+    options = _with_depth(run.renderable.options, output)
     scene = scene_of_split(run, capture, split).to(device)
     shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
     rows: list[SheetRow] = []
@@ -215,7 +215,7 @@ class _FrameWriter:
         self.written.append(path)
 
 
-def _with_depth(options: RenderOptions, output: OutputOptions) -> RenderOptions:
+def _with_depth(options: DrawOptions, output: OutputOptions) -> DrawOptions:
     return replace(options, depth="expected" if output.depth else "none")
 
 

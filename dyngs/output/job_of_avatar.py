@@ -9,7 +9,7 @@ import numpy as np
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import evaluation_background, render_options
+from dyngs.evaluate.report import evaluation_background
 from dyngs.export.avatar import read_avatar
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.pose.skinning import axis_angle_to_matrix
@@ -53,7 +53,7 @@ def job_of_avatar(file: Path, options: RenderJobOptions) -> RenderJob:
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     _, background = evaluation_background(options.background or run.info.background, has_alpha=True)
-    return RenderJob(scene, path, render_options(run.config.model), background)
+    return RenderJob(scene, path, scene.options, background)
 
 
 def _path(scene: HumanScene, world_offset: tuple[float, float, float], options: RenderJobOptions) -> CameraPath:

@@ -13,7 +13,7 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import evaluation_background, render_options, scene_of_split, split_views
+from dyngs.evaluate.report import evaluation_background, scene_of_split, split_views
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.models.views import training_cameras
 from dyngs.output.along import path_along
@@ -40,22 +40,20 @@ def job_of_run(run_dir: Path, options: RenderJobOptions) -> RenderJob:
         run = in_rest_pose(run)
     capture = read_capture(run.config.data)
     if options.split is not None and options.motion is None and not options.at_rest:
-        run = replace(run, scene=scene_of_split(run, capture, options.split))
+        run = replace(run, renderable=scene_of_split(run, capture, options.split))
     _, background = evaluation_background(options.background or run.config.data.background, capture.has_alpha)
     path = _fixed_camera_path(run, capture, options) if options.path is None else _moving_path(run, capture, options)
     notes: tuple[str, ...] = ()
-    if run.scene.is_static and options.times is not None:
+    if run.renderable.is_static and options.times is not None:
         notes = ("nothing moves in this run: it looks the same at all times",)
-    elif not run.scene.is_static and path.times is None:
+    elif not run.renderable.is_static and path.times is None:
         path = with_times(path, np.linspace(0, 1, len(path)).tolist())
         notes = ("time runs from 0 to 1 along the path; --time or --times choose other times",)
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     if fps is not None:
         path = replace(path, fps=fps)
-    return RenderJob(
-        run.scene, path, render_options(run.config.model), background, path.notes + notes, files_of(capture)
-    )
+    return RenderJob(run.renderable, path, run.renderable.options, background, path.notes + notes, files_of(capture))
 
 
 def cameras_for_paths(capture: Capture, data: DataConfig) -> Cameras:
@@ -99,7 +97,7 @@ def _fixed_camera_path(run: LoadedRun, capture: Capture, options: RenderJobOptio
     """Return the path of one fixed camera of the capture at ``options.times``, or at the time of its view."""
     view = view_to_show(capture, options.view, options.split)
     (camera,) = training_cameras([view], run.config.data)
-    times = run.scene.times if options.motion is not None else (view.time or 0.0,)
+    times = run.renderable.times if options.motion is not None else (view.time or 0.0,)
     return static_path(camera, times if options.times is None else options.times)
 
 
@@ -117,11 +115,11 @@ def _moving_path(run: LoadedRun, capture: Capture, options: RenderJobOptions) ->
 def _placed_path(name: str, run: LoadedRun, capture: Capture, options: RenderJobOptions) -> CameraPath:
     """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras."""
     cameras = cameras_for_paths(capture, run.config.data)
-    frames = options.num_frames or (len(run.scene.times) if options.motion is not None else DEFAULT_FRAMES)
+    frames = options.num_frames or (len(run.renderable.times) if options.motion is not None else DEFAULT_FRAMES)
     up = None if options.up is None else np.asarray(axis(options.up))
     match name:
         case "orbit":
-            person = avatar_of(run.scene)
+            person = avatar_of(run.renderable)
             if person is None or orbit_of(cameras, up).width is None:
                 return CameraPath(orbit_path(cameras, frames, up), notes=orbit_of(cameras, up).notes)
             around = None if options.up is None else axis(options.up)
@@ -132,5 +130,5 @@ def _placed_path(name: str, run: LoadedRun, capture: Capture, options: RenderJob
         case _:
             views = capture.splits["train"]
             times = [view.time for view in views if view.time is not None]
-            clip = len(times) == len(views) and not run.scene.is_static and options.motion is None
+            clip = len(times) == len(views) and not run.renderable.is_static and options.motion is None
             return path_along(cameras, frames, times if clip else None, up)

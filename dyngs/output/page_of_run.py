@@ -11,8 +11,9 @@ from dyngs.camera import Cameras
 from dyngs.data.capture import Capture, View
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import evaluation_background, render_options
+from dyngs.evaluate.report import evaluation_background
 from dyngs.export.html.page import Staging, WrittenPage, write_page
+from dyngs.gaussians.scene import require_gaussians
 from dyngs.human.avatar.light import LEFT_OUT
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction as up_of_clip
@@ -68,7 +69,7 @@ def write_run_page(
         run = animated.run
         seconds = len(run.scene.times) / animated.fps
     staging, notes = _staging(run, title, seconds, options.up)
-    written = write_page(run.scene, render_options(run.config.model), replace(staging, time=options.time), path)
+    written = write_page(run.scene, run.scene.options, replace(staging, time=options.time), path)
     person = avatar_of(run.scene)
     if person is not None and person.light is not None:
         notes += (LEFT_OUT,)
@@ -144,7 +145,8 @@ def _avatar_page(source: Path, path: Path, options: PageOptions) -> WrittenPage:
         seconds=max(len(job.scene.times) / job.path.fps, SHORTEST),
         time=options.time,
     )
-    return write_page(job.scene, job.options, staging, path)
+    scene = require_gaussians(job.scene, str(source))
+    return write_page(scene, scene.options, staging, path)
 
 
 def _seconds(run: LoadedRun, known: float | None, of_motion: float | None) -> float:

@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.output.camera_paths import CameraPath
 
 DEFAULT_FRAMES = 120
@@ -50,9 +50,9 @@ class RenderJob:
         protected: files of the capture, which must not be overwritten.
     """
 
-    scene: Scene
+    scene: Renderable
     path: CameraPath
-    options: RenderOptions = DEFAULT_OPTIONS
+    options: DrawOptions = DEFAULT_OPTIONS
     background: Tensor | None = None
     notes: tuple[str, ...] = ()
     protected: frozenset[Path] = frozenset()
@@ -91,10 +91,10 @@ class RenderJobOptions:
 
 
 def render_frame(
-    scene: Scene,
-    moment: GaussianTimeStep,
+    scene: Renderable,
+    moment: TimeStep,
     camera: Cameras,
-    options: RenderOptions = DEFAULT_OPTIONS,
+    options: DrawOptions = DEFAULT_OPTIONS,
     background: Tensor | None = None,
 ) -> Frame:
     """Render one camera, without gradients.

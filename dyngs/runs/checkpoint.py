@@ -23,9 +23,10 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene
-from dyngs.kinds import restored_scene
+from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.kinds import restored_model
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.renderable import Renderable
 from dyngs.storage.file import read_scene
 
 KEEP_CHECKPOINTS = 2
@@ -43,16 +44,25 @@ class LoadedRun:
 
     Attributes:
         config: the resolved configuration.
-        scene: what is drawn at any time.
+        renderable: what is drawn at any time.
         step, seconds_train: how far and how long it was trained (0 s where ``timing.json`` is lost).
         info: of the checkpoint.
     """
 
     config: Config
-    scene: Scene
+    renderable: Renderable
     step: int
     seconds_train: float
     info: CheckpointInfo
+
+    @property
+    def scene(self) -> Scene:
+        """Its scene of Gaussians.
+
+        Raises:
+            DyngsError: it is made of something else.
+        """
+        return require_gaussians(self.renderable, f"a run of model.kind={self.config.model.kind}")
 
 
 def checkpoint_paths(run_dir: Path) -> list[Path]:
@@ -143,7 +153,7 @@ def load_run(run_dir: Path) -> LoadedRun:
     if config.model.is_network:
         raise DyngsError(f"{run_dir}: a network, not a scene; `dyngs predict {run_dir} CAPTURE --out RUN` makes one")
     checkpoint = _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
-    scene = restored_scene(checkpoint, config.model)
+    scene = restored_model(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
 

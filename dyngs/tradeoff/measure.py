@@ -16,9 +16,8 @@ from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import render_options
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import Scene, render_options
 from dyngs.metrics import Lpips, psnr, ssim
 from dyngs.ops.device import finish
 from dyngs.tradeoff.measurements import Quartiles, Speed

@@ -19,6 +19,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
+from dyngs.gaussians.scene import require_gaussians
 from dyngs.metrics import load_lpips
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
@@ -160,7 +161,8 @@ class _Session:
 
     def _renderer(self, variant: Variant) -> VariantRenderer:
         run = load_run(self._runs.folder(variant))
-        scene = scene_of_split(run, self._capture, self._plan.split).to(self._plan.device)
+        scene = require_gaussians(scene_of_split(run, self._capture, self._plan.split), variant.slug)
+        scene = scene.to(self._plan.device)
         return VariantRenderer(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
 
     def _images(self, count: int) -> list[Image]:

@@ -280,6 +280,8 @@ def require_room(config: Config) -> None:
     Raises:
         DyngsError: says how many can.
     """
+    if not config.model.made_of_gaussians:
+        return
     whole, each = whole_memory(), 4 * NEEDED_COPIES * stored_values(config)
     match config.init:
         case RandomInit() if whole is not None and config.init.num_random * each > whole:

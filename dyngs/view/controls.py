@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dyngs.gaussians.scene import Scene
 from dyngs.view.frusta import Frusta
 from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.path_controls import add_path_controls
@@ -90,6 +91,7 @@ class Controls:
     def _add_look(self, gui: viser.GuiApi, viewed: Viewed) -> None:
         session = self._browsing.session
         layers = [name for name in LAYERS if len(viewed.footage) or name != "error"]
+        layers = [name for name in layers if isinstance(viewed.scene, Scene) or name != "motion"]
         if session.look.layer not in layers:
             session.change(layer="colour")
         layer = gui.add_dropdown(
@@ -99,7 +101,9 @@ class Controls:
             hint="error: against the truth, at a camera of the capture",
         )
         layer.on_update(lambda _: self._change(layer=layer.value))
-        if 0 < viewed.scene.num_moving < len(viewed.scene) or (viewed.in_training and viewed.has_timeline):
+        scene = viewed.scene if isinstance(viewed.scene, Scene) else None
+        has_parts = scene is not None and 0 < scene.num_moving < len(scene)
+        if has_parts or (scene is not None and viewed.in_training and viewed.has_timeline):
             part = gui.add_dropdown("Parts", PARTS, initial_value=session.look.part)
             part.on_update(lambda _: session.change(part=part.value))
         else:

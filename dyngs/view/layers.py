@@ -13,8 +13,8 @@ from torch.nn import functional
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.files.write import to_uint8
-from dyngs.gaussians.scene import GaussianTimeStep, Scene
-from dyngs.models.renderable import Rendering
+from dyngs.gaussians.scene import GaussianTimeStep, Scene, require_gaussians
+from dyngs.models.renderable import Renderable, Rendering
 from dyngs.output.contact_sheet import color_map, depth_to_rgb
 from dyngs.output.render_job import resize_cameras
 from dyngs.view.viewed import Viewed
@@ -102,7 +102,7 @@ def motion_colours(viewed: Viewed) -> Tensor:
 
     Red begins where 99% of those that move are left behind. On the CPU.
     """
-    return viewed.once("motion", lambda: _motion_colours(viewed.scene))
+    return viewed.once("motion", lambda: _motion_colours(_gaussians(viewed)))
 
 
 def _layer(viewed: Viewed, shot: Shot, camera: Cameras, time: float | None) -> np.ndarray:
@@ -125,23 +125,27 @@ def _rendering(viewed: Viewed, part: Part, camera: Cameras, time: float | None, 
     """Return a rendering, on the CPU."""
     scene = _part(viewed, part)
     options = replace(viewed.options, depth="expected") if with_depth else viewed.options
-    background = viewed.background.to(scene.gaussians.means.device)
+    background = viewed.background.to(scene.device)
     made = scene.render(camera, viewed.time_step(part, scene, time), options=options, background=background)
     return made.to(device="cpu")
 
 
-def _part(viewed: Viewed, part: Part) -> Scene:
+def _part(viewed: Viewed, part: Part) -> Renderable:
     """Return the scene, or only what moves of it, or only what does not."""
     match part:
         case "all":
             return viewed.scene
         case "moving" | "still":
-            return viewed.once(part, lambda: viewed.scene.part(part))
+            return viewed.once(part, lambda: _gaussians(viewed).part(part))
+
+
+def _gaussians(viewed: Viewed) -> Scene:
+    return require_gaussians(viewed.scene, viewed.name)
 
 
 def _motion(viewed: Viewed, part: Part, camera: Cameras, time: float | None) -> np.ndarray:
     """Return the image of the motion (H, W, 3) uint8, on black."""
-    scene, colours = viewed.scene.unmasked(), motion_colours(viewed)
+    scene, colours = _gaussians(viewed).unmasked(), motion_colours(viewed)
     gaussians = scene.at(time)
     coloured = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None].to(gaussians.means))
     if part != "all":

@@ -68,7 +68,7 @@ def in_motion(viewed: Viewed, choice: str, files: Mapping[str, Path], angles: An
         return viewed
     if choice in files and viewed.run is not None:
         animated = with_motion(viewed.run, files[choice])
-        scene = animated.run.scene.to(viewed.scene.gaussians.means.device)
+        scene = animated.run.scene.to(viewed.scene.device)
         return _elsewhere(viewed).showing(scene, max(len(scene.times) - 1, 1) / animated.fps)
     return posed(viewed, angles if choice == BY_SLIDERS else {})
 

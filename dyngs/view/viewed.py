@@ -22,9 +22,10 @@ from dyngs.evaluate.report import scene_of_split
 from dyngs.export.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.export.avatar import read_avatar
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import GaussianTimeStep, Scene, render_options
+from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.human.motion.placement import up_direction
+from dyngs.models.renderable import Renderable, TimeStep
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.output.aim import look_at_point
 from dyngs.output.aim import up_direction as mean_up
@@ -101,8 +102,8 @@ class Viewed:
     """
 
     name: str
-    scene: Scene
-    options: RenderOptions
+    scene: Renderable
+    options: Any
     background: Tensor
     start: Cameras
     center: np.ndarray
@@ -117,7 +118,7 @@ class Viewed:
     in_training: bool = False
     derived: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
-    def showing(self, scene: Scene, seconds: float | None = None) -> Viewed:
+    def showing(self, scene: Renderable, seconds: float | None = None) -> Viewed:
         """Return the same with another scene, which takes ``seconds`` from time 0 to 1."""
         return replace(self, scene=scene, seconds=seconds or self.seconds, derived={})
 
@@ -135,7 +136,7 @@ class Viewed:
             self.derived[name] = compute()
         return self.derived[name]
 
-    def time_step(self, name: str, scene: Scene, time: float | None) -> GaussianTimeStep:
+    def time_step(self, name: str, scene: Renderable, time: float | None) -> TimeStep:
         """Return ``scene``, this one or the part ``name`` of it, at a time; that of the last time is kept."""
         kept = self.derived.get(f"moment {name}")
         if kept is None or kept[0] != time:
@@ -191,22 +192,22 @@ def viewed_run(name: str, run: LoadedRun, up: str | None = None) -> Viewed:
     except DyngsError as error:
         viewed = _without_capture(name, run, up)
         return replace(viewed, notes=(f"without the capture, so no cameras and no truth: {error}",))
-    placed = _placed(footage, run.scene, up)
+    placed = _placed(footage, run.renderable, up)
     _, background = evaluation_background(run.config.data.background, capture.has_alpha)
     return Viewed(
         name=name,
-        scene=run.scene,
-        options=render_options(run.config.model),
+        scene=run.renderable,
+        options=run.renderable.options,
         background=background,
         footage=footage,
         world_offset=np.asarray(capture.world_offset, np.float64),
-        seconds=_seconds(run.scene, capture.seconds),
+        seconds=_seconds(run.renderable, capture.seconds),
         run=run,
         **placed,
     )
 
 
-def viewed_scene(name: str, scene: Scene, up: str | None = None) -> Viewed:
+def viewed_scene(name: str, scene: Renderable, up: str | None = None) -> Viewed:
     """Return a scene without a capture, seen from a little above."""
     _, background = evaluation_background("black", has_alpha=False)
     return Viewed(
@@ -219,14 +220,14 @@ def viewed_scene(name: str, scene: Scene, up: str | None = None) -> Viewed:
     )
 
 
-def viewed_training(name: str, config: Config, scene: Scene, images: ImageLoader, background: Tensor) -> Viewed:
+def viewed_training(name: str, config: Config, scene: Renderable, images: ImageLoader, background: Tensor) -> Viewed:
     """Return a scene that is being trained, with the views that it is trained on."""
     cameras = training_cameras(images.views, config.data)
     footage = Footage(images.views, tuple(cameras), images, _thumbnails(images.views, config.data))
     return Viewed(
         name=name,
         scene=scene,
-        options=replace(render_options(config.model), nonfinite="skip"),
+        options=_forgiving(scene.options),
         background=background,
         footage=footage,
         seconds=_seconds(scene, None),
@@ -240,7 +241,7 @@ def _footage_of(capture: Capture, run: LoadedRun) -> Footage:
     views: list[View] = []
     for split in ("train", "val", "test"):
         found = capture.splits.get(split, ())
-        if found and scene_of_split(run, capture, split) is run.scene:
+        if found and scene_of_split(run, capture, split) is run.renderable:
             views += found
     chosen = tuple(dict.fromkeys(view.name for view in views))
     by_name = {view.name: view for view in views}
@@ -256,23 +257,23 @@ def _thumbnails(views: Sequence[View], data: DataConfig) -> ImageLoader:
 
 def _without_capture(name: str, run: LoadedRun, up: str | None) -> Viewed:
     """Return the scene of a run whose capture is not there."""
-    person = avatar_of(run.scene)
+    person = avatar_of(run.renderable)
     own_up = None if person is None else up_direction(person.clip).double().cpu().numpy()
-    placed = _around(run.scene, np.array(axis(up or "z")) if up or own_up is None else own_up)
+    placed = _around(run.renderable, np.array(axis(up or "z")) if up or own_up is None else own_up)
     _, background = evaluation_background(run.info.background, has_alpha=False)
     return Viewed(
         name=name,
-        scene=run.scene,
-        options=render_options(run.config.model),
+        scene=run.renderable,
+        options=run.renderable.options,
         background=background,
         world_offset=np.asarray(run.info.world_offset, np.float64),
-        seconds=_seconds(run.scene, None),
+        seconds=_seconds(run.renderable, None),
         run=run,
         **placed,
     )
 
 
-def _placed(footage: Footage, scene: Scene, up: str | None) -> dict[str, Any]:
+def _placed(footage: Footage, scene: Renderable, up: str | None) -> dict[str, Any]:
     """Return the start, centre, extent and up direction by the cameras of a capture."""
     poses = torch.from_numpy(footage.poses).float()
     first = footage.cameras[0]
@@ -286,18 +287,24 @@ def _placed(footage: Footage, scene: Scene, up: str | None) -> dict[str, Any]:
     return {"start": first, "center": center, "extent": float(np.median(distances)), "up": upwards}
 
 
-def _around(scene: Scene, up: np.ndarray) -> dict[str, Any]:
-    """Return the start, centre, extent and up direction by the Gaussians."""
-    means = scene.at(None).means.double().cpu().numpy()
+def _around(scene: Renderable, up: np.ndarray) -> dict[str, Any]:
+    """Return the start, centre, extent and up direction by the Gaussians, or by the box of what has none."""
+    points = scene.at(None).means if isinstance(scene, Scene) else scene.bounds
+    points = points.double().cpu().numpy()
     x, y, z = (float(value) for value in up)
-    start = frame_orbit_for_points(means, 1, _SIZE, (x, y, z))
-    finite = means[np.isfinite(means).all(1)]
+    start = frame_orbit_for_points(points, 1, _SIZE, (x, y, z))
+    finite = points[np.isfinite(points).all(1)]
     center = np.median(finite, axis=0)
     distance = float(np.linalg.norm(start.centers[0].double().cpu().numpy() - center))
     return {"start": start, "center": center, "extent": distance, "up": up}
 
 
-def _seconds(scene: Scene, known: float | None) -> float:
+def _forgiving(options: Any) -> Any:
+    """Return the options with which what is not finite is left out, where they know how to."""
+    return replace(options, nonfinite="skip") if isinstance(options, RenderOptions) else options
+
+
+def _seconds(scene: Renderable, known: float | None) -> float:
     """Return the seconds from time 0 to 1: as known, 30 frames per second for a person, or a few."""
     if known:
         return known

@@ -34,7 +34,7 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.avatar.validation import require_avatar, require_shapes
 from dyngs.human.motion.clip import MotionClip
-from dyngs.models.renderable import clamped_time
+from dyngs.models.renderable import Renderable, clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed, with_role
 
 
@@ -233,7 +233,7 @@ class HumanScene(Scene):
         return state | {name: StateTensor(x, Role.SHARED) for name, x in given.items()}
 
 
-def avatar_of(scene: Scene) -> HumanScene | None:
+def avatar_of(scene: Renderable) -> HumanScene | None:
     """Return ``scene`` if it is a person, who can be posed; None for any other scene."""
     return scene if isinstance(scene, HumanScene) else None
 
