@@ -82,9 +82,9 @@ def test_parts_follow_the_config(capture: Path) -> None:
     assert trainer.model.scene.gaussians.sh.shape == (40, 9, 3)
     assert (trainer.background, trainer.has_test_views, len(trainer.images)) == ("white", True, 5)
     mcmc = assemble(config.model_copy(update={"strategy": McmcStrategy(max_gaussians=30)}))
-    assert isinstance(mcmc.densifier, McmcDensifier)
-    assert len(mcmc.optimizer.parameters) == 30
-    assert not mcmc.options.absgrad
+    assert isinstance(mcmc.model.densifier, McmcDensifier)
+    assert len(mcmc.model.scene) == 30
+    assert not mcmc.model.options.absgrad
 
 
 def test_a_fixed_set_of_gaussians_stays(capture: Path) -> None:
@@ -141,7 +141,7 @@ def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     assert isinstance(trainer.model.training, DynamicTraining)
     assert trainer.model.scene.times == (0.0, 0.25, 0.5, 1.0)
     assert trainer.model.training.schedule.rates.steps == 12
-    assert isinstance(assemble(_dynamic(root, model=StaticModel())).scene, StaticScene)
+    assert isinstance(assemble(_dynamic(root, model=StaticModel())).model.scene, StaticScene)
 
 
 def test_silhouettes_are_weighed_by_measurement_only_where_things_may_move(capture: Path, tmp_path: Path) -> None:
@@ -204,9 +204,9 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     config = _dynamic(root, init=PointsInit(num_random=7))
     found = with_points(read_capture(config.data), config).points
     assert found is not None
-    assert len(assemble(config).scene) == len(found.xyz) > 7
+    assert len(assemble(config).model.scene) == len(found.xyz) > 7
     without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
-    assert len(assemble(without).scene) == 7
+    assert len(assemble(without).model.scene) == 7
 
 
 def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,5 +252,5 @@ def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> N
     static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0)))
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss
-    mine, others = (tensors_of(trainer.optimizer.state()) for trainer in (static, dynamic))
+    mine, others = (tensors_of(trainer.model.optimizer_state) for trainer in (static, dynamic))
     assert all(torch.equal(x, others[name]) for name, x in mine.items())

@@ -80,6 +80,6 @@ def test_state_goes_round() -> None:
     training = StaticTraining(FilterUpdate([_camera()]))
     first = training.first_scene(_gaussians(2.0))
     stored = part_of(tensors_of(first.state()), "model")
-    second = training.restored(_gaussians(4.0), stored, first)
+    second = training.restored(_gaussians(4.0), stored)
     drawn = (training.time_step(scene, _image(), 1).gaussians.log_scales for scene in (first, second))
     assert torch.equal(*drawn)
