@@ -81,9 +81,9 @@ def sweep(
         DyngsError: no such run or split, or the folder holds measurements of another run.
     """
     with MemoryMeter() as meter:
+        own = run_settings(runs.run_dir)  # refuses what cannot be varied before anything is written
         session = _Session(runs, plan, meter, log)
         _require_same_source(runs, plan, is_first=group.is_first)
-        own = run_settings(runs.run_dir)
         idle = [v.setting.name for v in plan.variations if not any(own.allows(v.setting, value) for value in v.values)]
         if idle and group.is_first:
             log(f"nothing to vary in this run: {', '.join(idle)}")
