@@ -8,11 +8,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import random_scene
 from torch import Tensor
 
 from dyngs.config import DefaultStrategy
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.densify import DefaultDensifier, DensifySchedule, plan_edit, rotate
+from dyngs.gaussians.densify import DefaultDensifier, Densifier, DensifySchedule, plan_edit, rotate
 
 EXTENT = 10.0
 SMALL, LARGE = 0.05, 0.5  # either side of dense_fraction * extent = 0.1
