@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import Config, PointsInit, RandomInit, StaticModel, TrajectoryField
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
@@ -46,16 +45,18 @@ from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import score_views
 from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
+from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.schedule import Rates
+from dyngs.kinds import assemble
 from dyngs.metrics import Lpips
+from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.static.init import StartValues, initial_gaussians
-from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.static.rates import Rates
-from dyngs.static.training import FilterUpdate, StaticTraining
+from dyngs.static.training import StaticTraining
 from dyngs.training.trainer import Trainer
-from dyngs.training.views import surroundings, training_cameras, training_times
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
 REST = 1.0
@@ -183,14 +184,14 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> Trainer:
     moving = torch.nonzero(labels >= scene_at(name, REST).movers.start)[:, 0]
     times = tuple(sorted(set(training_times(capture))))
     setup = FieldSetup(*box_of(gaussians, trainer.extent), len(times), len(moving), trainer.extent)
-    trainer.training = OracleTraining(config.train.steps)
-    trainer.scene = DynamicScene(
+    trainer.model.training = OracleTraining(config.train.steps)
+    trainer.model.scene = DynamicScene(
         gaussians=trainer.optimizer.parameters,
         seen_at=times,
         field=TrueMotion(name, labels[moving], setup),
         moving=moving,
-        options=trainer.scene.options,
-        background=trainer.scene.background,
+        options=trainer.model.scene.options,
+        background=trainer.model.scene.background,
     )
     return trainer
 
@@ -289,7 +290,7 @@ def oracle_row(name: SceneName, config: Config) -> Row:
     with kernel_threads(config.run.threads or torch.get_num_threads()):
         for _ in range(config.train.steps):
             trainer.step()
-        return measured(trainer.scene, config)
+        return measured(trainer.model.scene, config)
 
 
 def main(words: Sequence[str] | None = None) -> None:

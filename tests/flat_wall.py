@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 
 SIZE = (80, 60)
 """Width and height of the images."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 from torch import Tensor
 
+from dyngs.api.before_training import with_capture
 from dyngs.api.choose import choose, write_choices
 from dyngs.api.following import Leader
 from dyngs.budget.cost import CostMeter
@@ -20,11 +22,14 @@ from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, first_fit, refitted
-from dyngs.build import build
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.data.capture import Capture
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, as_word
 from dyngs.evaluate.report import evaluate_run
+from dyngs.kinds import GaussianTrainer, build
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
@@ -70,6 +75,11 @@ _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
 """Names of the limits' states in a checkpoint."""
 
 
+@contextmanager
+def _no_progress() -> Iterator[ReportProgress]:
+    yield report_nothing
+
+
 class Limit(Protocol):
     """A listener whose state belongs into checkpoints."""
 
@@ -90,8 +100,12 @@ def train(
     resume_from: Path | None = None,
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
+    progress: Callable[[], AbstractContextManager[ReportProgress]] = _no_progress,
 ) -> Path:
     """Train and return the run folder.
+
+    Photos and videos without poses go through structure from motion first, and a body is fitted to a person where that
+    is needed, as by the command.
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
@@ -100,6 +114,7 @@ def train(
             before its first: the result has the same bytes as if the run had never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
+        progress: shows how far what comes before training is.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
@@ -116,6 +131,9 @@ def train(
     if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
         latest_checkpoint(folder)
         return folder
+    if resume_from is None:
+        with progress() as report:
+            config = with_capture(config, report=report)
     keep_freed_memory()
     threads = config.run.threads or max(1, num_cores() // processes.local_size)
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
@@ -131,10 +149,10 @@ def train(
             print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
             return folder
         asked = asked_for(folder) if resume_from is not None else config
-        choices = []
-        if resumed is None:
-            config, choices = choose(config)
-        run = _Run(config, folder, resumed, asked, processes=processes, threads=threads)
+        choices, capture = [], None if config.model.is_network else read_capture(config.data)
+        if resumed is None and capture is not None:
+            config, choices, capture = choose(config, capture)
+        run = _Run(config, folder, resumed, asked, capture=capture, processes=processes, threads=threads)
         if choices:
             write_choices(folder, choices)
         run.run(listeners)
@@ -159,6 +177,7 @@ class _Run:
         folder: of the run.
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen.
+        capture: with its first points where the run begins; None: of a network.
         processes: that this one leads.
         threads: of the kernels in each of them.
     """
@@ -170,22 +189,25 @@ class _Run:
         resumed: Checkpoint | None,
         asked: Config,
         *,
+        capture: Capture | None,
         processes: Processes,
         threads: int,
     ) -> None:
         watch = Stopwatch()
         if resumed is None:
             require_room(config)
-        built = build(config, restored=resumed is not None)
-        self.folder, self.limits = folder, dict[str, Limit]()
-        self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(folder))
+        trainer = build(config, capture, restored=resumed is not None)
+        self.folder, self.limits, self._capture = folder, dict[str, Limit](), capture
+        self.loop = Loop(trainer, config.total_steps, watch, lambda: last_good(folder))
         self._leader = Leader(processes, config, threads)
         self.loop.before_step = self._leader.before_step
         if resumed is not None:
-            built.trainer.restore(resumed)
+            trainer.restore(resumed)
             watch.pause(-seconds_at(folder, resumed.info.step))
         self.limited = (
-            None if built.scene_trainer is None else LimitedRun(folder, config, self.loop, built.scene_trainer)
+            LimitedRun(folder, config, self.loop, cast(GaussianTrainer, trainer))
+            if config.model.made_of_gaussians
+            else None
         )
         self._config, self._saved = config, self.loop.trainer.done
         if self.limited is not None:
@@ -222,8 +244,8 @@ class _Run:
             try:
                 loop.run(lambda: interrupts.requested)
             finally:
-                if limited is not None:
-                    limited.trainer.images.rest()
+                if isinstance(loop.trainer, Trainer):
+                    loop.trainer.images.rest()
             if loop.trainer.done < loop.total:
                 if loop.trainer.done > self._saved:
                     self._save()
@@ -291,7 +313,7 @@ class _Run:
     def _evaluate(self, step: int) -> None:
         """Tell the scores of the test split."""
         start = time.perf_counter()
-        report = evaluate_run(self.folder, "test")
+        report = evaluate_run(self.folder, "test", capture=self._capture)
         seconds = time.perf_counter() - start
         self.loop.watch.pause(seconds)
         self.loop.tell(Evaluated(step, "test", report.psnr, report.ssim, seconds))
@@ -319,7 +341,7 @@ class _Run:
             yield self.limits[_SPEED].reached()
 
 
-def _tell_memory(trainer: Trainer, processes: int) -> None:
+def _tell_memory(trainer: GaussianTrainer, processes: int) -> None:
     """Print how much memory a run will take, and a warning where that is likely to be more than is there.
 
     Raises:

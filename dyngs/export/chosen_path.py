@@ -15,9 +15,9 @@ from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.export.images import file_stems
 from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views
 from dyngs.splats.rotation import AXES, with_scene
-from dyngs.training.views import training_cameras
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
@@ -138,11 +138,11 @@ def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
     """Return the path of one fixed camera at the times that are requested, or at the time of its view."""
     if opened.captured is None:
         ring = orbit_around(opened, _RING, options.size or DEFAULT_SIZE)
-        camera, times = ring.select(front_of(opened, ring)), opened.scene.times
+        camera, times = ring.select(front_of(opened, ring)), opened.renderable.times
     else:
         view = view_to_show(opened.capture, options.view, options.split)
         (camera,) = training_cameras([view], opened.config.data)
-        times = (view.time or 0.0,) if opened.fps is None else opened.scene.times
+        times = (view.time or 0.0,) if opened.fps is None else opened.renderable.times
     return static_path(camera, times if options.times is None else options.times)
 
 
@@ -162,7 +162,7 @@ def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
 
 def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by the scene."""
-    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(opened.scene.times))
+    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(opened.renderable.times))
     up = None if opened.stated_up is None else np.array(AXES[opened.stated_up])
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
@@ -185,5 +185,5 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
             return CameraPath(spiral_path(cameras, frames, up))
         case _:
             times = [view.time for view in views if view.time is not None]
-            clip = len(times) == len(views) and not opened.scene.is_static and opened.fps is None
+            clip = len(times) == len(views) and not opened.renderable.is_static and opened.fps is None
             return path_along(cameras, frames, times if clip else None, up)

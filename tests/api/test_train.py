@@ -15,7 +15,6 @@ from tiny_fields import KINDS, busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import (
     Config,
     DataConfig,
@@ -30,6 +29,7 @@ from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
 from dyngs.training.trainer import StepReport, Trainer
 
@@ -320,7 +320,7 @@ def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path
     assert scene.is_static == (steps == 2)
     for time in (0.0, 0.37, 1.0):
         image = replace(trainer.images[0], time=time)
-        drawn = trainer.training.moment(trainer.scene, image, steps + 1).gaussians
+        drawn = trainer.model.training.time_step(trainer.model.scene, image, steps + 1).gaussians
         for name, x in scene.at(time).tensors().items():
             torch.testing.assert_close(x, drawn.tensors()[name].detach(), rtol=1e-6, atol=1e-7)
 
@@ -395,7 +395,7 @@ def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> 
     real = Trainer.step
 
     def stepping(trainer: Trainer) -> StepReport:
-        scene = trainer.scene
+        scene = trainer.model.scene
         if trainer.done + 1 == step and isinstance(scene, DynamicScene) and scene.field is not None:
             for x in scene.field.parameters.values().values():
                 x.fill_(value)

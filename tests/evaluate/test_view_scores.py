@@ -22,10 +22,11 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split
 from dyngs.evaluate.view_scores import mean_of, person_box, person_scores, right_half_scores, score_views
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import Rendering, RenderOptions, render
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, psnr, ssim
+from dyngs.models.renderable import Rendering
 from dyngs.runs.checkpoint import load_run
 from dyngs.static.scene import StaticScene
 

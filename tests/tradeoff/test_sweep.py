@@ -104,7 +104,7 @@ def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: Va
 def test_on_a_gpu_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     briefly = replace(PLAN, variations=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
     expected = sweep(VariantRuns(runs.run_dir, tmp_path / "here", 1), briefly, lambda line: None)
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
         there = VariantRuns(runs.run_dir, tmp_path / "there", 1)
         found = sweep(there, replace(briefly, device=GPU), lambda line: None)

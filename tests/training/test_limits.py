@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from tiny_fields import busy_config, tiny_options, write_tiny_capture
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -28,6 +27,7 @@ from dyngs.config import (
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.limits import most_gaussians, require_possible, room, within_cap
 from dyngs.training.trainer import Trainer
@@ -68,7 +68,7 @@ def largest_count(trainer: Trainer) -> int:
     counts = []
     while trainer.done < trainer.config.train.steps:
         trainer.step()
-        counts.append(len(trainer.scene.gaussians))
+        counts.append(len(trainer.model.scene.gaussians))
     return max(counts)
 
 

@@ -16,7 +16,6 @@ import torch
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
-from dyngs.build import assemble, restored_scene
 from dyngs.config import (
     AutoColour,
     Config,
@@ -36,8 +35,10 @@ from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import write_tensors
 from dyngs.files.write import write_image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.gaussians.scene import Moment, Scene, SceneTraining
+from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.kinds import assemble, restored_scene
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
 from dyngs.state import Role, State, with_role
 from dyngs.training.trainer import Trainer
@@ -78,8 +79,10 @@ class _LiftedScene(Scene):
     def rows(self) -> Tensor:
         return torch.arange(len(self))
 
-    def moment(self, time: float | None) -> Moment:
-        return Moment(self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time)
+    def time_step(self, time: float | None) -> GaussianTimeStep:
+        return GaussianTimeStep(
+            self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time
+        )
 
     def edited(self, edit: TopologyEdit) -> _LiftedScene:
         return replace(self, gaussians=self.gaussians.edited(edit))
@@ -100,9 +103,9 @@ class _Lifted:
     def trains_on(self, time: float | None, step: int) -> bool:
         return True
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         penalties = {"height": self.penalty * scene.gaussians.means[:, 2].abs().sum()} if self.penalty else {}
-        return replace(scene.moment(image.time), penalties=penalties)
+        return replace(scene.time_step(image.time), penalties=penalties)
 
     def optimize(self, scene: _LiftedScene, step: int) -> int:
         self.steps.append(step)
@@ -135,19 +138,19 @@ class _Lifted:
 
 def _trained_by(trainer: Trainer, training: SceneTraining[Any]) -> Trainer:
     """``trainer`` with its Gaussians in a scene of another kind."""
-    trainer.scene = _LiftedScene(gaussians=trainer.optimizer.parameters)
-    trainer.training = training
+    trainer.model.scene = _LiftedScene(gaussians=trainer.optimizer.parameters)
+    trainer.model.training = training
     return trainer
 
 
 def test_a_scene_of_another_kind_is_trained(capture: Path) -> None:
     training = _Lifted()
     trainer = _trained_by(_trainer(capture), training)
-    before = trainer.scene.gaussians.means.detach().clone()
+    before = trainer.model.scene.gaussians.means.detach().clone()
     losses = [trainer.step().loss for _ in range(30)]
     assert training.steps == list(range(1, 31))
     assert sum(losses[-4:]) < sum(losses[:4])
-    assert not torch.equal(trainer.scene.gaussians.means, before)
+    assert not torch.equal(trainer.model.scene.gaussians.means, before)
     other = _trained_by(_trainer(capture), _Lifted())
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
@@ -183,7 +186,7 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
     counts = []
     for _ in range(4):
         trainer.step()
-        counts.append(len(trainer.scene.gaussians))
+        counts.append(len(trainer.model.scene.gaussians))
         if trainer.done == 2:
             moments = trainer.optimizer.state()["exp_avg_sq.means"].tensor
             assert moments[:50].any()
@@ -193,7 +196,7 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
     assert counts == [50, 100, 100, 100]
     for _ in range(2):
         other.step()
-    assert torch.equal(other.optimizer.parameters.means, trainer.scene.gaussians.means)
+    assert torch.equal(other.optimizer.parameters.means, trainer.model.scene.gaussians.means)
 
 
 # --- kinds of colour --------------------------------------------------------------------------------------------------
@@ -253,16 +256,16 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
     seen, findings, counts = set(), {}, set()
     for step in range(1, 41):
         report = trainer.step()
-        counts.add(len(trainer.scene.gaussians))
+        counts.add(len(trainer.model.scene.gaussians))
         if report.finding is not None:
             findings[step] = report.finding
-            dropped = trainer.colours.frozen_rest()
+            dropped = trainer.model.colours.frozen_rest()
         if step <= MEASURED_AFTER:
             seen.add(report.image.name)
     assert len(seen) == 6
     assert list(findings) == [MEASURED_AFTER]
     assert len(counts) > 4
-    sh, frozen = trainer.scene.gaussians.sh, trainer.colours.frozen_rest()
+    sh, frozen = trainer.model.scene.gaussians.sh, trainer.model.colours.frozen_rest()
     if name == "none pays":
         assert "does not pay" in findings[MEASURED_AFTER]
         assert sh.shape[1] == 1
@@ -278,11 +281,11 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
     trainer = _coloured(seven_views, COLOURS["network"])
     for _ in range(30):
         trainer.step()
-    assert trainer.scene.gaussians.sh_degree == 0
-    scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.colours.network
+    assert trainer.model.scene.gaussians.sh_degree == 0
+    scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.model.colours.network
     assert network is not None
     camera = trainer.images[0].cameras
-    gaussians, shader = trainer.scene.gaussians.detach(), network.shader(None, None)
+    gaussians, shader = trainer.model.scene.gaussians.detach(), network.shader(None, None)
     drawn = scene.render(camera, options=RenderOptions(), background=torch.zeros(3)).rgb
     assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
     assert not torch.equal(drawn, render(gaussians, camera).rgb)
@@ -293,30 +296,30 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
 class _Exploding(_Lifted):
     """From step 3 on it draws positions and rotations that are not finite."""
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         if step < 3:
-            return super().moment(scene, image, step)
+            return super().time_step(scene, image, step)
         now, factor = scene.gaussians, float("nan")
-        return Moment(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
+        return GaussianTimeStep(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
 
 
 class _Overweight(_Lifted):
     """From step 3 on it has an infinite penalty."""
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         self.penalty = 0.0 if step < 3 else float("inf")
-        return super().moment(scene, image, step)
+        return super().time_step(scene, image, step)
 
 
 def _stops_in_step_3(trainer: Trainer) -> str:
     """The error's message; the trainer is left as after step 2."""
     trainer.step()
     trainer.step()
-    before = {name: x.detach().clone() for name, x in trainer.scene.gaussians.tensors().items()}
+    before = {name: x.detach().clone() for name, x in trainer.model.scene.gaussians.tensors().items()}
     with pytest.raises(DyngsError) as caught:
         trainer.step()
     assert trainer.done == 2
-    assert all(torch.equal(x, before[name]) for name, x in trainer.scene.gaussians.tensors().items())
+    assert all(torch.equal(x, before[name]) for name, x in trainer.model.scene.gaussians.tensors().items())
     return str(caught.value)
 
 
@@ -427,7 +430,7 @@ def trained_state(root: Path) -> dict[str, Tensor]:
     trainer = _trainer(root)
     for _ in range(4):
         trainer.step()
-    return trainer.scene.gaussians.tensors()
+    return trainer.model.scene.gaussians.tensors()
 
 
 def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> None:
@@ -477,7 +480,7 @@ def test_two_equal_views_in_a_step_are_one_seen_twice(tmp_path: Path) -> None:
         trainer = _trainer(tmp_path)
         trainer.config = trainer.config.model_copy(update={"train": TrainConfig(steps=100, batch_size=batch)})
         losses = [trainer.step().loss for _ in range(4)]
-        states.append((trainer.scene.gaussians.detach().tensors(), trainer.densifier.state(), losses))
+        states.append((trainer.model.scene.gaussians.detach().tensors(), trainer.model.densifier.state(), losses))
     (one, seen, losses), (two, twice, others) = states
     assert all(torch.equal(x, two[name]) for name, x in one.items())
     assert torch.equal(2 * seen["seen"], twice["seen"])

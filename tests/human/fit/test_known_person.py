@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.capture import View
 from dyngs.errors import DyngsError
@@ -22,6 +21,7 @@ from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avat
 from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.kinds import assemble
 from dyngs.training.trainer import Trainer
 
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import CameraConfig, Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.capture import View
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.training.corrections.camera_refinement import (
     MIN_POSES,
     STARTS,

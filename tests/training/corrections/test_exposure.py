@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.kinds import assemble
+from dyngs.models.renderable import Rendering
 from dyngs.training.corrections.exposure import WARM_UP, ViewExposures
 from dyngs.training.trainer import Trainer
 
