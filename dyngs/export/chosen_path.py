@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.along import path_along
@@ -14,7 +15,9 @@ from dyngs.camera_paths.path import CameraPath, path_file, read_path, resize_cam
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.export.images import file_stems
+from dyngs.gaussians.scene import Scene
 from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views
 from dyngs.splats.rotation import AXES, with_scene
@@ -56,7 +59,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
         DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what a
             file cannot have.
     """
-    scene, times = opened.scene, options.times
+    scene, times = opened.renderable, options.times
     if opened.captured is None:
         _require_fitting(opened, options)
     path = _fixed_camera(opened, options) if options.path is None else _moving(opened, options.path, options)
@@ -105,12 +108,17 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
 
     z is up where nothing says what is.
     """
-    scene = opened.scene
+    scene = opened.renderable
     moves = opened.person is not None and not scene.is_static
     times = np.linspace(0, 1, _SAMPLED_TIMES).tolist() if moves else [None]
-    means = torch.cat([scene.at(time).means for time in times]).cpu().numpy()
+    means = torch.cat([points_at(scene, time) for time in times]).cpu().numpy()
     x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
     return frame_orbit_for_points(means, count, size, (x, y, z))
+
+
+def points_at(scene: Renderable, time: float | None = None) -> Tensor:
+    """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box of all else."""
+    return scene.at(time).means if isinstance(scene, Scene) else scene.bounds
 
 
 def front_of(opened: Opened, ring: Cameras) -> int:

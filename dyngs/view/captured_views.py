@@ -13,7 +13,7 @@ from dyngs.camera_paths.aim import look_at_point
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader
-from dyngs.export.chosen_path import orbit_around
+from dyngs.export.chosen_path import orbit_around, points_at
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, scene_of_split
 
@@ -120,7 +120,7 @@ def _viewpoint(opened: Opened) -> Viewpoint:
         if opened.person is not None:
             center = opened.person.at(None).means.double().cpu().numpy().mean(0)
     else:
-        means = opened.scene.at(None).means.double().cpu().numpy()
+        means = points_at(opened.renderable).double().cpu().numpy()
         start = orbit_around(opened, 1)
         center, eyes = np.median(means[np.isfinite(means).all(1)], axis=0), start.centers.double().cpu().numpy()
     extent = float(np.median(np.linalg.norm(eyes - center, axis=1)))

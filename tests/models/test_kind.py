@@ -7,10 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from dyngs.output.image_files import write_job_images
-from dyngs.output.job_of_run import job_of_run
-from dyngs.output.render_job import RenderJobOptions
-from dyngs.view.viewed import load_viewed
 from toy_kind import ToyScene, registered
 
 import dyngs
@@ -20,8 +16,11 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.images import OutputOptions
+from dyngs.export.chosen_path import PathOptions, choose_path
+from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.opened import open_run
+from dyngs.view.captured_views import viewpoint_of
 from dyngs.view.layers import Shot, draw
 
 
@@ -65,18 +64,20 @@ def test_it_is_evaluated(run: Path) -> None:
 
 
 def test_it_is_drawn_to_images_and_a_video(run: Path, tmp_path: Path) -> None:
-    job = job_of_run(run, RenderJobOptions(num_frames=3))
-    written = write_job_images(job, tmp_path, OutputOptions(depth=True, video=tmp_path / "orbit.mp4"))
+    opened, output = open_run(run), OutputOptions(depth=True, video=tmp_path / "orbit.mp4")
+    written = write_path_images(opened, choose_path(opened, PathOptions(num_frames=3)), tmp_path, output)
     assert len(written) == 3 * 3 + 1
     assert (tmp_path / "orbit.mp4").stat().st_size > 0
+    assert len(write_split_images(opened, "test", tmp_path / "views")) > 0
 
 
 def test_it_is_viewed(run: Path) -> None:
-    viewed = load_viewed(run)
-    for shot in (Shot(viewed.start), Shot(viewed.start, layer="depth"), Shot(viewed.start, layer="error", view=0)):
-        assert draw(viewed, shot).std() > 0
+    opened = open_run(run)
+    start = viewpoint_of(opened).start
+    for shot in (Shot(start), Shot(start, layer="depth"), Shot(start, layer="error", view=0)):
+        assert draw(opened, shot).std() > 0
     with pytest.raises(DyngsError, match="not made of Gaussians"):
-        draw(viewed, Shot(viewed.start, layer="motion"))
+        draw(opened, Shot(start, layer="motion"))
 
 
 def test_it_is_loaded(run: Path, capture: Path) -> None:
