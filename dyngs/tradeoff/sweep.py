@@ -188,7 +188,7 @@ class _Session:
             psnr=quality.psnr,
             ssim=quality.ssim,
             lpips=quality.lpips,
-            num_gaussians=len(drawing.scene),
+            num_gaussians=len(require_gaussians(drawing.scene, variant.slug)),
             mb=megabytes_on_disk(folder),
             memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background)
             if self._plan.device == CPU

@@ -180,13 +180,13 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     assert scene.field is not None
     field = scene.field.edited(two)
     field.regroup()
-    trainer.model.scene = replace(scene, moving=two.source, field=field)
+    trainer.model.exchange(replace(scene, moving=two.source, field=field))
     trainer.step()
     keep = torch.ones(len(trainer.model.scene), dtype=torch.bool)
     keep[trainer.model.scene.rows] = False
     assert not keep.all()
-    trainer.model.densifier = assemble(trainer.config).densifier
-    trainer.keep(keep)
+    trainer.model.densifier = assemble(trainer.config).model.densifier
+    trainer.model.keep(keep, trainer.done)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert trainer.num_moving == 0

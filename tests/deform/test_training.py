@@ -489,14 +489,14 @@ def test_state_goes_round(kind: str, phase: str) -> None:
         run.after_step(SPLIT)
     other = new_run(gaussians, deform=deform)
     stored = {name: x.clone() for name, x in run.model_state.items()}
-    other.scene = other.training.restored(gaussians, stored, other.scene)
+    other.scene = other.training.restored(gaussians, stored)
     assert other.model_state.keys() == run.model_state.keys()
     assert all(torch.equal(x, other.model_state[name]) for name, x in run.model_state.items())
     assert other.scene.num_moving == run.scene.num_moving
     for time in (0.0, 0.4):
         for name, x in run.drawn_at(time).tensors().items():
             assert torch.equal(x, other.drawn_at(time).tensors()[name]), name
-    assert other.training.restored(gaussians, {}, other.scene).field is None
+    assert other.training.restored(gaussians, {}).field is None
 
 
 # --- the box ----------------------------------------------------------------------------------------------------------
@@ -541,7 +541,7 @@ def test_motion_begins_with_what_travels() -> None:
         assert (middle - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.05
     stored = run.model_state | tensors_of(run.training.state())
     other = begin()
-    scene = other.training.restored(run.scene.gaussians, stored, run.scene)
+    scene = other.training.restored(run.scene.gaussians, stored)
     assert other.training.trains_on(0.0, FINE + 1)
     assert scene.field is not None
     assert run.scene.field is not None

@@ -34,7 +34,7 @@ def trainer(still: Path) -> Trainer:
     gaussians = trainer.model.scene.gaussians.detach()
     tensors = {name: torch.cat([x, x[:1]]) for name, x in gaussians.tensors().items()}
     tensors["means"][-1], tensors["log_scales"][-1], tensors["logit_opacities"][-1] = before, -4.0, 1.0
-    trainer.model.scene = trainer.model.scene.with_gaussians(Gaussians(**tensors))
+    trainer.model.begin_with(trainer.model.scene.with_gaussians(Gaussians(**tensors)), trainer.model.training)
     return trainer
 
 

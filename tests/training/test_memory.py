@@ -201,7 +201,7 @@ def _peak(config: Config, steps: int) -> tuple[int, int]:
     with TensorBytes() as found:
         trainer = assemble(config)
         if not trainer.model.scene.is_static or trainer.model.scene.times:
-            trainer.model.scene = trainer.model.training.all_moving(trainer.model.scene, trainer.extent)
+            trainer.model.exchange(trainer.model.training.all_moving(trainer.model.scene, trainer.extent))
             trainer.done = 25  # past the step at which motion begins
         found.most = found.now
         for _ in range(steps):

@@ -38,10 +38,9 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianTimeStep, Scene
-from dyngs.kinds import assemble, restored_scene
+from dyngs.kinds import GaussianTrainer, assemble, restored_scene
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
 from dyngs.state import Role, State, with_role
-from dyngs.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +50,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _trainer(capture: Path, **data: object) -> Trainer:
+def _trainer(capture: Path, **data: object) -> GaussianTrainer:
     return assemble(
         Config(
             data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
@@ -91,7 +90,7 @@ class _LiftedScene(Scene):
         return {}
 
 
-class _Lifted:
+class _Lifted(SceneTraining[_LiftedScene]):
     """How it is trained; what it has done is part of its state."""
 
     moves_by = ("field", "model.deform")
@@ -128,18 +127,18 @@ class _Lifted:
 
     def follow(self, edit: TopologyEdit) -> None: ...
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> _LiftedScene:
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
         self.steps = tensors["steps"].tolist()
-        return _LiftedScene(gaussians=gaussians, options=like.options, background=like.background)
+        return _LiftedScene(gaussians=gaussians)
 
     def state(self) -> State:
         return with_role({"steps": torch.tensor(self.steps)}, Role.TRAINING)
 
 
-def _trained_by(trainer: Trainer, training: SceneTraining[Any]) -> Trainer:
+def _trained_by(trainer: GaussianTrainer, training: SceneTraining[Any]) -> GaussianTrainer:
     """``trainer`` with its Gaussians in a scene of another kind."""
-    trainer.model.scene = _LiftedScene(gaussians=trainer.optimizer.parameters)
     trainer.model.training = training
+    trainer.model.exchange(_LiftedScene(gaussians=trainer.model.scene.gaussians))
     return trainer
 
 
@@ -161,11 +160,11 @@ def test_penalties_of_the_training_are_part_of_the_loss(capture: Path) -> None:
     penalizing = _Lifted()
     penalizing.penalty = 0.01
     plain, penalized = _trained_by(_trainer(capture), _Lifted()), _trained_by(_trainer(capture), penalizing)
-    heights = plain.optimizer.parameters.means.detach()[:, 2].abs()
+    heights = plain.model.scene.gaussians.means.detach()[:, 2].abs()
     assert penalized.step().loss == pytest.approx(plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5)
     for _ in range(20):
         penalized.step()
-    assert penalized.optimizer.parameters.means.detach()[:, 2].abs().mean() < heights.mean()
+    assert penalized.model.scene.gaussians.means.detach()[:, 2].abs().mean() < heights.mean()
 
 
 class _Growing(_Lifted):
@@ -188,7 +187,7 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
         trainer.step()
         counts.append(len(trainer.model.scene.gaussians))
         if trainer.done == 2:
-            moments = trainer.optimizer.state()["exp_avg_sq.means"].tensor
+            moments = trainer.model.optimizer_state["exp_avg_sq.means"].tensor
             assert moments[:50].any()
             assert not moments[50:].any()
             other = _trained_by(_trainer(capture), _Growing())
@@ -196,7 +195,7 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
     assert counts == [50, 100, 100, 100]
     for _ in range(2):
         other.step()
-    assert torch.equal(other.optimizer.parameters.means, trainer.model.scene.gaussians.means)
+    assert torch.equal(other.model.scene.gaussians.means, trainer.model.scene.gaussians.means)
 
 
 # --- kinds of colour --------------------------------------------------------------------------------------------------
@@ -216,7 +215,9 @@ def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _coloured(capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None) -> Trainer:
+def _coloured(
+    capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None
+) -> GaussianTrainer:
     return assemble(
         Config(
             data=DataConfig(root=capture),
@@ -311,7 +312,7 @@ class _Overweight(_Lifted):
         return super().time_step(scene, image, step)
 
 
-def _stops_in_step_3(trainer: Trainer) -> str:
+def _stops_in_step_3(trainer: GaussianTrainer) -> str:
     """The error's message; the trainer is left as after step 2."""
     trainer.step()
     trainer.step()

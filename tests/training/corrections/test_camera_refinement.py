@@ -243,7 +243,7 @@ def test_without_refinement_nothing_is_kept_for_it(refine: str, still: Path) -> 
     """Auto is decided before a run begins."""
     trainer = trainer_of(still, refine)
     assert trainer.refinement is None
-    assert not any(name.startswith("cameras") for name in trainer.state())
+    assert not any(name.startswith("cameras") for name in trainer.checkpoint().tensors)
 
 
 def test_a_view_that_was_not_trained_on_has_what_is_known_of_its_camera() -> None:

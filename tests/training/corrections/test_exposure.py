@@ -135,7 +135,7 @@ def test_without_them_nothing_is_kept_for_them(still: Path, choice: str) -> None
     """Auto is decided before a run begins."""
     trainer = trainer_of(still, choice, StaticModel(sh_degree=0))
     assert trainer.exposures is None
-    assert not any(name.startswith("exposures") for name in trainer.state())
+    assert not any(name.startswith("exposures") for name in trainer.checkpoint().tensors)
 
 
 def test_other_configs_checkpoints_are_refused(still: Path) -> None:
