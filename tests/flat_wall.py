@@ -60,7 +60,7 @@ def with_depth(cameras: Cameras) -> Rendering:
     """Return an opaque rendering at the depth of the wall."""
     depth = torch.full((1, cameras.height, cameras.width), DISTANCE)
     rgb = torch.zeros(1, cameras.height, cameras.width, 3)
-    return Rendering(rgb, torch.zeros_like(depth), depth, torch.zeros(1, 0, 2, dtype=torch.int32))
+    return Rendering(rgb, torch.zeros_like(depth), depth)
 
 
 def learned(camera: Cameras, error: float = 0.004) -> Tensor:

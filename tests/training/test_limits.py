@@ -140,12 +140,12 @@ def test_a_size_without_room_is_refused_and_the_one_named_is_not(model: StaticMo
 
 def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     require_possible(NOTHING)
-    with pytest.raises(DyngsError, match=r"budget.max_mb: a network"):
+    with pytest.raises(DyngsError, match=r"budget.max_mb: model.kind=human_predictor has no Gaussians"):
         require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
     both = NOTHING.model_copy(update={"prune": PruneConfig(fraction=0.5), "run": RunConfig(dir=tmp_path / "run")})
     with pytest.raises(DyngsError, match=r"train.minutes: .*dyngs prune"):
         train(timed(both, 5.0))
-    with pytest.raises(DyngsError, match=r"train.minutes: a network"):
+    with pytest.raises(DyngsError, match=r"train.minutes: model.kind=human_predictor is trained for"):
         require_possible(timed(NOTHING.model_copy(update={"model": HumanPredictorModel()}), 5.0))
     assert not (tmp_path / "run").exists()
 

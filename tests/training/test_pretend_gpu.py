@@ -20,7 +20,6 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import open_run
-from dyngs.state import tensors_of
 from dyngs.training.prediction import assemble_network
 from dyngs.training.trainer import Trainer
 
@@ -65,7 +64,7 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     """The same kernels compute, so that not a bit may differ; an operator given tensors of both devices raises."""
     kind, capture, more = CASES[name]
     config = config_of(kind, request.getfixturevalue(capture), *more)
-    expected = tensors_of(trained(config, monkeypatch, torch.device("cpu")).state())
+    expected = trained(config, monkeypatch, torch.device("cpu")).checkpoint().tensors
     with pretend_gpu():
         trainer = trained(config, monkeypatch, GPU)
         assert all(isinstance(x, OnGpu) for x in trainer.model.scene.gaussians.tensors().values())
@@ -85,7 +84,7 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
         """After the last step but one and the last, which is done on what was stored."""
         monkeypatch.setattr("dyngs.training.prediction.device_for", lambda _: device)
         config = Config.model_validate({"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}})
-        trainer, resumed = assemble_network(config, NET), assemble_network(config, NET)
+        trainer, resumed = assemble_network(config), assemble_network(config)
         for _ in range(steps - 1):
             trainer.step()
         found = [trainer.checkpoint()]
@@ -102,12 +101,12 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
 
 def test_a_network_too_large_for_the_kernel_is_computed_by_torch(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_of("static", still, *STATIC, "colour.kind=network")
-    expected = trained(config, monkeypatch, torch.device("cpu")).colours.network
+    expected = trained(config, monkeypatch, torch.device("cpu")).model.colours.network
     assert expected is not None
     monkeypatch.setattr("dyngs.ops.perceptron.GPU_WIDTH", 31)
     monkeypatch.setattr("dyngs.ops.perceptron.perceptron_op", None)  # the CPU has had it
     with pretend_gpu():
-        network = trained(config, monkeypatch, GPU).colours.network
+        network = trained(config, monkeypatch, GPU).model.colours.network
         assert network is not None
         found = network.layers[0].weight.detach().cpu()
     torch.testing.assert_close(found, expected.layers[0].weight, rtol=1e-3, atol=1e-4)
@@ -129,7 +128,7 @@ def test_a_run_goes_on_there_from_a_checkpoint(still: Path, monkeypatch: pytest.
             expected.step()
             resumed.step()
         found = resumed.checkpoint().tensors
-    assert [key for key, x in tensors_of(expected.state()).items() if not torch.equal(found[key], x)] == []
+    assert [key for key, x in expected.checkpoint().tensors.items() if not torch.equal(found[key], x)] == []
 
 
 @pytest.mark.parametrize("name", ["static", "nodes", "hexplane", "human"])

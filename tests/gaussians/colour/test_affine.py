@@ -10,18 +10,18 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.gaussians.rendering import GaussianRendering
+from dyngs.models.renderable import Rendering
 
 WARM = torch.tensor([[1.2, 0.05, 0.0, 0.02], [0.0, 1.0, -0.03, -0.01], [0.02, 0.0, 0.8, 0.03]])
 WHITE = torch.ones(3)
 
 
-def shown_as(rgb: Tensor, transmittance: Tensor | None = None) -> GaussianRendering:
+def shown_as(rgb: Tensor, transmittance: Tensor | None = None) -> Rendering:
     through = torch.zeros_like(rgb[..., 0]) if transmittance is None else transmittance
-    return GaussianRendering(rgb[None], through[None], None, torch.zeros(1, 0, 2, dtype=torch.int32))
+    return Rendering(rgb[None], through[None], None)
 
 
-def image_and_rendering() -> tuple[Image, GaussianRendering]:
+def image_and_rendering() -> tuple[Image, Rendering]:
     """Return colourful noise as the scene has it, and as a camera with WARM shows it."""
     image = seen_from(cameras_before_wall(1))[0]
     rgb = 0.1 + 0.6 * torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(0))

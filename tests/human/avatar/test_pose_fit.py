@@ -44,7 +44,7 @@ def of_squares(shift: int = 0) -> tuple[Rendering, Image]:
     drawn[4:8, 4 + shift : 8 + shift] = 1
     image = Image("a", CAMERA, 0.5 * truth[..., None].expand(-1, -1, 3).contiguous(), truth, None, None)
     rgb = (0.5 * drawn + 1 - drawn)[..., None].expand(-1, -1, 3).contiguous()
-    return Rendering(rgb[None], (1 - drawn)[None], None, torch.zeros(1, 1, 2)), image
+    return Rendering(rgb[None], (1 - drawn)[None], None), image
 
 
 def test_both_are_zero_for_the_image_itself() -> None:

@@ -21,7 +21,7 @@ STEPS, GAINS = 200, (0.7, 1.0, 1.3, 1.5)
 
 
 def shown(rgb: Tensor) -> Rendering:
-    return Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None, torch.zeros(1, 0, 2, dtype=torch.int32))
+    return Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None)
 
 
 def trained_on(gains: tuple[float, ...], beside: list[list[int]] | None = None, hidden: int = -1) -> ViewExposures:
