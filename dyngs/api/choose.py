@@ -182,7 +182,9 @@ def _choice(text: str, pairs: Sequence[tuple[float, float]], steps: int, seconds
 
 
 def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
-    """Write what small runs said into a run folder."""
+    """Write what small runs said into a run folder; nothing where there were none."""
+    if not choices:
+        return
     write_text(folder / CHOICES_NAME, json.dumps([asdict(choice) for choice in choices], indent=2) + "\n")
 
 

@@ -14,7 +14,7 @@ from typing import Protocol, cast
 from torch import Tensor
 
 from dyngs.api.before_training import with_capture
-from dyngs.api.choose import choose, write_choices
+from dyngs.api.choose import Choice, choose, write_choices
 from dyngs.api.following import Leader
 from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
@@ -104,8 +104,7 @@ def train(
 ) -> Path:
     """Train and return the run folder.
 
-    Photos and videos without poses go through structure from motion first, and a body is fitted to a person where that
-    is needed, as by the command.
+    Poses of photos and videos are found first, and a body is fitted to a person where that is needed.
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
@@ -149,15 +148,20 @@ def train(
             print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
             return folder
         asked = asked_for(folder) if resume_from is not None else config
-        choices, capture = [], None if config.model.is_network else read_capture(config.data)
-        if resumed is None and capture is not None:
-            config, choices, capture = choose(config, capture)
+        config, choices, capture = _chosen(config, begins=resumed is None)
         run = _Run(config, folder, resumed, asked, capture=capture, processes=processes, threads=threads)
-        if choices:
-            write_choices(folder, choices)
+        write_choices(folder, choices)
         run.run(listeners)
         note_asked(folder, asked)
     return folder
+
+
+def _chosen(config: Config, *, begins: bool) -> tuple[Config, list[Choice], Capture | None]:
+    """Return the configuration with all decided, what was said, and the capture, which nothing reads again."""
+    if config.model.is_network:
+        return config, [], None  # it has several captures
+    capture = read_capture(config.data)
+    return choose(config, capture) if begins else (config, [], capture)
 
 
 def _told_again(config: Config, folder: Path) -> str:

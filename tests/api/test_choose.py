@@ -21,6 +21,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.kinds import with_points
 from dyngs.runs.folder import CHOICES_NAME
 
 LONG = "train.steps=100_000"
@@ -197,6 +198,7 @@ def test_never_worse_than_static(moves: bool, tmp_path: Path) -> None:
     capture = read_capture(config.data)
     plan = replace(_Plan.of(config, capture, 1), steps=500, runs=2)
     moving = config.model_copy(update={"model": config.model.model_copy(update={"choose": False})})
-    best, (choice,) = module._decided(module._at_rest(config), [Setting("model.kind=dynamic", lambda _: moving)], plan)
+    settings, base = [Setting("model.kind=dynamic", lambda _: moving)], module._at_rest(config)
+    best, (choice,) = module._decided(base, settings, plan, with_points(capture, base))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
