@@ -20,7 +20,8 @@ from dyngs.api.train import num_cores, train
 from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import evaluate_run, render_options
+from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians.scene import render_options
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
 from dyngs.tradeoff.measure import render_options_of
 from dyngs.tradeoff.measurements import Measurement, read_measurement
