@@ -80,7 +80,7 @@ def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path) -> N
     resumed = assemble(config)
     resumed.restore(first.checkpoint())
     assert same(straight, tensors_after(resumed, 4))
-    counts = {len(assemble(config).optimizer.parameters), len(straight["gaussians.means"])}
+    counts = {len(assemble(config).model.scene), len(straight["gaussians.means"])}
     assert len(counts) == 2, "some must be pruned, or this test shows little"
     learned = [straight[f"model.learned.{name}"] for name in ("poses", "trans", "turns", "joints", "weights")]
     assert all(bool((x != 0).any()) for x in learned)

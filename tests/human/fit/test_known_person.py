@@ -65,7 +65,7 @@ AWAY = torch.tensor([0.03, 0.0, 0.02])
 @pytest.fixture(scope="module")
 def avatar(person: Path) -> HumanScene:
     """A person of a few hundred Gaussians, which was not trained."""
-    scene = new_trainer(person).scene
+    scene = new_trainer(person).model.scene
     assert isinstance(scene, HumanScene)
     return scene
 
