@@ -29,8 +29,8 @@ from dyngs.files.write import write_image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
 from dyngs.gaussians.scene import render_options
 from dyngs.metrics import psnr
+from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import load_run
-from dyngs.training.background import evaluation_background
 
 GAINS, WHITE_BALANCE = (0.6, 1.6), (0.85, 1.18)
 

@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import Config, PointsInit, RandomInit, StaticModel, TrajectoryField
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
@@ -46,16 +45,16 @@ from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import score_views
 from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.schedule import Rates
+from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.metrics import Lpips
+from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.static.init import StartValues, initial_gaussians
-from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.static.rates import Rates
-from dyngs.static.training import FilterUpdate, StaticTraining
-from dyngs.training.trainer import Trainer
-from dyngs.training.views import surroundings, training_cameras, training_times
+from dyngs.static.training import StaticTraining
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
 REST = 1.0
@@ -168,7 +167,7 @@ class OracleTraining(StaticTraining):
         return scene.field.parameters.step(step, self._rates.progress(step))
 
 
-def oracle(name: SceneName, config: Config, seed: int = 0) -> Trainer:
+def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     """Return the trainer of the oracle of a scene; its capture must be that of ``config``."""
     model = StaticModel(sh_degree=config.model.sh_degree)
     init, sizes = RandomInit(num_random=100), config.train.model_copy(update={"initial_downscale": 1})
@@ -179,19 +178,13 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> Trainer:
     generator = torch.Generator().manual_seed(seed)
     values = StartValues.for_strategy(config.strategy)
     gaussians = initial_gaussians(start, PointsInit(), values, model.sh_degree, generator)
-    trainer.optimizer = GaussianOptimizer(gaussians, config.optim)
     moving = torch.nonzero(labels >= scene_at(name, REST).movers.start)[:, 0]
     times = tuple(sorted(set(training_times(capture))))
     setup = FieldSetup(*box_of(gaussians, trainer.extent), len(times), len(moving), trainer.extent)
-    trainer.training = OracleTraining(config.train.steps)
-    trainer.scene = DynamicScene(
-        gaussians=trainer.optimizer.parameters,
-        seen_at=times,
-        field=TrueMotion(name, labels[moving], setup),
-        moving=moving,
-        options=trainer.scene.options,
-        background=trainer.scene.background,
+    scene = DynamicScene(
+        gaussians=gaussians, seen_at=times, field=TrueMotion(name, labels[moving], setup), moving=moving
     )
+    trainer.model.begin_with(scene, OracleTraining(config.train.steps))
     return trainer
 
 
@@ -289,7 +282,7 @@ def oracle_row(name: SceneName, config: Config) -> Row:
     with kernel_threads(config.run.threads or torch.get_num_threads()):
         for _ in range(config.train.steps):
             trainer.step()
-        return measured(trainer.scene, config)
+        return measured(trainer.model.scene, config)
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -92,8 +92,8 @@ def where(given: argparse.Namespace) -> None:
     print("\n| | ms |\n|---|---|")
     with torch.no_grad(), kernel_threads(1):
         for name, scene in (("all", whole), ("one Gaussian: calls", one)):
-            moments = [scene.moment(p.time) for p in images]
-            moved = milliseconds([lambda p=p, s=scene: s.moment(p.time) for p in images])
+            moments = [scene.time_step(p.time) for p in images]
+            moved = milliseconds([lambda p=p, s=scene: s.time_step(p.time) for p in images])
             drawn = milliseconds(
                 [lambda p=p, m=m, s=scene: s.render(p.cameras, m) for p, m in zip(images, moments, strict=True)]
             )

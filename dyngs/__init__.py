@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
     from dyngs.gaussians import Gaussians
-    from dyngs.gaussians.rendering import Rendering, RenderOptions, contributions, render
+    from dyngs.gaussians.rendering import RenderOptions, contributions, render
     from dyngs.gaussians.scene import Scene
+    from dyngs.models.renderable import Rendering
 
 __version__ = "0.1.0"
 __all__ = [

@@ -14,7 +14,6 @@ from synthetic_bodies import model, write_npz, write_obj, write_pickle
 from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
-from dyngs.build import restored_scene
 from dyngs.camera import Cameras
 from dyngs.camera_paths.path import CameraPath, write_path
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
@@ -25,6 +24,7 @@ from dyngs.files.tensor_file import write_tensors
 from dyngs.gaussians.scene import Scene
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.kinds import restored_scene
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.splats import formats

@@ -90,4 +90,4 @@ def playing(run: LoadedRun, clip: MotionClip) -> LoadedRun:
     """The run with its person in another clip."""
     scene = run.scene
     assert isinstance(scene, HumanScene)
-    return replace(run, scene=scene.playing(clip))
+    return replace(run, renderable=scene.playing(clip))

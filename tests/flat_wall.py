@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 
 SIZE = (80, 60)
 """Width and height of the images."""
@@ -60,7 +60,7 @@ def with_depth(cameras: Cameras) -> Rendering:
     """Return an opaque rendering at the depth of the wall."""
     depth = torch.full((1, cameras.height, cameras.width), DISTANCE)
     rgb = torch.zeros(1, cameras.height, cameras.width, 3)
-    return Rendering(rgb, torch.zeros_like(depth), depth, torch.zeros(1, 0, 2, dtype=torch.int32))
+    return Rendering(rgb, torch.zeros_like(depth), depth)
 
 
 def learned(camera: Cameras, error: float = 0.004) -> Tensor:

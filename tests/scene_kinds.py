@@ -13,6 +13,7 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.schedule import Rates
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
@@ -25,7 +26,6 @@ from dyngs.human.template.body_reader import default_template
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 from dyngs.state import State, part_of, tensors_of
-from dyngs.static.rates import Rates
 from dyngs.static.scene import StaticScene
 
 KINDS = ("static", *FIELDS, "masked", "human")

@@ -17,12 +17,12 @@ from typing import Any
 import torch
 from pretend_gpu import GPU, pretend_gpu
 
-from dyngs import build
 from dyngs.api.following import together
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config
 from dyngs.errors import DyngsError
+from dyngs.kinds import build
 from dyngs.training import processes as module
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import StepReport, Trainer
@@ -150,4 +150,4 @@ def _refuse(trainer: Trainer) -> None:
 
 def _nudge(trainer: Trainer) -> None:
     with torch.no_grad():
-        trainer.scene.gaussians.means[0, 0] += 1e-6
+        trainer.model.scene.gaussians.means[0, 0] += 1e-6

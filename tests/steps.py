@@ -9,10 +9,10 @@ from moving_scene import camera
 
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import StepDone, StepReport
 from dyngs.training.loop import Loop
-from dyngs.training.state import Checkpoint, CheckpointInfo
 
 IMAGE = Image("view", camera(2, 2), torch.zeros(2, 2, 3), None, None, None)
 

@@ -22,7 +22,8 @@ from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.scene_space import recenter
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import Rendering, RenderOptions, render
+from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.models.renderable import Rendering
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, rasterize
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from statistics import fmean, stdev
 
 from dyngs.api.view_scores import PairScore, after_colour_fit, after_pose_fit, explained, plain
-from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -34,16 +33,15 @@ from dyngs.config.keys.section import Section
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.images import target_size
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_text
+from dyngs.kinds import GaussianTrainer, assemble, with_points
+from dyngs.models.schedule import image_divisor
+from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.training.background import evaluation_background
 from dyngs.training.interrupt import Interrupts
-from dyngs.training.schedule import image_divisor
-from dyngs.training.trainer import Trainer
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
 """Of small runs: longest side of the images, px, and most Gaussians."""
@@ -109,18 +107,23 @@ class Choice:
         )
 
 
-def choose(config: Config) -> tuple[Config, list[Choice]]:
+def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
     """Return ``config`` with all decided that was not requested, and what small runs said; lines say so, too.
 
+    The capture is returned with the points that the scene begins with.
+
+    Args:
+        config: as requested.
+        capture: as it was read.
+
     Raises:
-        DyngsError: a capture that cannot be read, or one without times for a scene that is to move.
+        DyngsError: images that cannot be read, or a capture without times for a scene that is to move.
         KeyboardInterrupt: during small runs; nothing has been written.
     """
     settings, plain_config = _settings(config), _without_auto(config)
     base = best = plain_config
     match plain_config.model:
         case DynamicModel() as model:
-            capture = read_capture(config.data)
             _require_times(config, capture.splits["train"])
             moves = _motion_of_fixed_cameras(capture, config) if model.choose else True
             best = _with(best, "model", choose=False)
@@ -130,32 +133,35 @@ def choose(config: Config) -> tuple[Config, list[Choice]]:
             else:
                 base = best = best if moves else as_static(plain_config)
         case _ if settings:
-            capture = read_capture(config.data)
+            pass
         case _:
-            return best, []
+            return best, [], with_points(capture, best)
     settings = [x for x in settings if x.applied(best) is not None or x.applied(base) is not None]
     plan = _Plan.of(best, capture, len(settings))
     if len(plan.folds) * plan.runs < 2:
         if settings:
             keys = ", ".join(x.text for x in settings)
             print(f"{keys}: too short a run, or too few views, to find out whether it pays", flush=True)
-        return best, []
-    found, choices = _decided(base, settings[: plan.runs - 1], plan)
+        return best, [], with_points(capture, best)
+    prepared = with_points(capture, base)
+    found, choices = _decided(base, settings[: plan.runs - 1], plan, prepared)
     if isinstance(found.model, StaticModel) and isinstance(plain_config.model, DynamicModel):
         best = _with(as_static(plain_config), "train", exposure=found.train.exposure, robust=found.train.robust)
         found = best.model_copy(update={"camera": found.camera})
-    return found, choices
+    if found.init != base.init:
+        prepared = with_points(capture, found, quiet=True)
+    return found, choices, prepared
 
 
-def _decided(config: Config, settings: Sequence[Setting], plan: _Plan) -> tuple[Config, list[Choice]]:
+def _decided(config: Config, settings: Sequence[Setting], plan: _Plan, capture: Capture) -> tuple[Config, list[Choice]]:
     """Return ``config`` with the settings that win, each tried on top of those before it, and all figures."""
     print(f"small runs of {plan.steps:,} steps, compared on training views that are held out:", flush=True)
-    runs, found = plan.trained(config), list[Choice]()
+    runs, found = plan.trained(config, capture), list[Choice]()
     for setting in settings:
         changed, begun = setting.applied(config), time.monotonic()
         if changed is None:
             continue
-        others = plan.trained(changed)
+        others = plan.trained(changed, capture)
         pairs = [
             setting.score(one, other, index)
             for one, other in zip(runs, others, strict=True)
@@ -176,7 +182,9 @@ def _choice(text: str, pairs: Sequence[tuple[float, float]], steps: int, seconds
 
 
 def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
-    """Write what small runs said into a run folder."""
+    """Write what small runs said into a run folder; nothing where there were none."""
+    if not choices:
+        return
     write_text(folder / CHOICES_NAME, json.dumps([asdict(choice) for choice in choices], indent=2) + "\n")
 
 
@@ -239,13 +247,13 @@ class _Plan:
                 return _Plan(folds, steps, runs, first)
         return _Plan(folds, 0, 0, first)
 
-    def trained(self, config: Config) -> list[Trainer]:
+    def trained(self, config: Config, capture: Capture) -> list[GaussianTrainer]:
         """Return the trainers of ``config`` after a small run for each fold."""
-        return [_trained(_small(config, self.steps, self.first_side), held_out) for held_out in self.folds]
+        return [_trained(_small(config, self.steps, self.first_side), capture, held_out) for held_out in self.folds]
 
 
-def _trained(config: Config, held_out: frozenset[int]) -> Trainer:
-    trainer = assemble(config, held_out=held_out)
+def _trained(config: Config, capture: Capture, held_out: frozenset[int]) -> GaussianTrainer:
+    trainer = assemble(config, capture, held_out=held_out)
     with Interrupts() as interrupts:
         while trainer.done < config.train.steps:
             if interrupts.requested:

@@ -17,16 +17,16 @@ from enum import IntEnum
 import torch
 from safetensors.torch import load, save
 
-from dyngs.build import build
 from dyngs.config import Config
 from dyngs.errors import DyngsError
+from dyngs.kinds import build
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.interrupt import Interrupts
 from dyngs.training.loop import Trainable
 from dyngs.training.processes import Processes
-from dyngs.training.state import Checkpoint, CheckpointInfo
 from dyngs.training.trainer import Trainer
 
 
@@ -116,8 +116,8 @@ def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
     """Follow a run to its end, and return what is to be done after it."""
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
-        trainer = build(config, restored=True).scene_trainer
-        if trainer is None:
+        trainer = build(config, restored=True)
+        if not isinstance(trainer, Trainer):
             raise DyngsError("a network is trained by one process; start it without torchrun")
         trainer.processes = processes
         while True:

@@ -9,21 +9,19 @@ from pathlib import Path
 
 import torch
 
-from dyngs.build import assemble
-from dyngs.config import Config, DataConfig, HumanPredictorModel
+from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
 from dyngs.config.io import load_config, load_resolved, packaged_preset
-from dyngs.config.kinds import network_of, person_of
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.human.prediction.network import PredictedAvatar, predict_gaussians
 from dyngs.human.prediction.person import CapturedPerson, named_views, spread_views
 from dyngs.human.template.body_reader import load_template
+from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import new_folder, require_empty
-from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.static.rates import Rates
 from dyngs.training.adaptation import adapt_network
 from dyngs.training.prediction import filmed, human_options, load_network, new_network, scene_of
 
@@ -109,8 +107,8 @@ def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
         DyngsError: the run is of something else.
     """
     config = load_resolved(run_dir)
-    model = network_of(config)
-    if model is None:
+    model = config.model
+    if not isinstance(model, HumanPredictorModel):
         raise DyngsError(
             f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs one of human_predictor"
         )
@@ -120,8 +118,8 @@ def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
 def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: HumanPredictorModel, seconds: float) -> None:
     """Write ``avatar`` as a run of the preset for one person after no step; ``seconds`` is the time taken so far."""
     preset = load_config(packaged_preset("human"), ["data.root=."])
-    person = person_of(preset)
-    if person is None:
+    person = preset.model
+    if not isinstance(person, HumanModel):
         raise ValueError(f"the preset of one person is of model.kind={preset.model.kind}")
     same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
     given = human_options(model)
@@ -135,9 +133,7 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
     )
     trainer = assemble(config)
     scene, training = scene_of(human, avatar, Rates(config.train.steps))
-    optimizer = GaussianOptimizer(avatar.gaussians, config.optim)
-    scene = replace(scene.with_gaussians(optimizer.parameters), colour=trainer.scene.colour)
-    trainer = replace(trainer, scene=scene, training=training, optimizer=optimizer)
+    trainer.model.begin_with(scene, training)
     with new_folder(out) as started:
         write_config(config, started)
         save_checkpoint(started, trainer.checkpoint(), seconds)

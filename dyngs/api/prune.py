@@ -11,15 +11,15 @@ from pathlib import Path
 import torch
 
 from dyngs.api.train import num_cores, train
-from dyngs.build import assemble
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
-from dyngs.config.kinds import network_of, person_of
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture, require_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
+from dyngs.kinds import assemble
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Limit, Search, Stored
@@ -28,7 +28,6 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, new_folder, require_empty
 from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
-from dyngs.training.state import Checkpoint
 
 SEARCH_STEPS = 1000
 """Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise."""
@@ -154,8 +153,8 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
     done = [f"train.steps={start.info.step}", "train.minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
-    if network_of(config) is not None:
-        raise DyngsError(f"{run_dir}: a network, not a scene; prune what it predicts")
+    if not config.model.made_of_gaussians:
+        raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to prune")
     return config
 
 
@@ -165,7 +164,7 @@ def _unseen(config: Config, device: torch.device) -> list[Image]:
     They play other motions there, in which poses are not refined.
     """
     views = read_capture(config.data).splits.get("val", ())
-    if not views or person_of(config) is not None:
+    if not views or config.model.is_posed:
         return []
     loader = ImageLoader(views, config.data)
     loader.device = device

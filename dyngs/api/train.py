@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from itertools import count as counted_from
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 from torch import Tensor
 
-from dyngs.api.choose import choose, write_choices
+from dyngs.api.before_training import with_capture
+from dyngs.api.choose import Choice, choose, write_choices
 from dyngs.api.following import Leader
 from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
@@ -21,12 +23,14 @@ from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, first_fit, refitted
-from dyngs.build import build
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.data.read import require_folder
+from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.data.capture import Capture
+from dyngs.data.read import read_capture, require_folder
 from dyngs.errors import DyngsError, as_word
 from dyngs.evaluate.report import evaluate_run
+from dyngs.kinds import GaussianTrainer, build
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
@@ -74,6 +78,11 @@ _COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
 """Names of the limits' states in a checkpoint."""
 
 
+@contextmanager
+def _no_progress() -> Iterator[ReportProgress]:
+    yield report_nothing
+
+
 class Limit(Protocol):
     """A listener whose state belongs into checkpoints."""
 
@@ -94,8 +103,11 @@ def train(
     resume_from: Path | None = None,
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
+    progress: Callable[[], AbstractContextManager[ReportProgress]] = _no_progress,
 ) -> Path:
     """Train and return the run folder.
+
+    Poses of photos and videos are found first, and a body is fitted to a person where that is needed.
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
@@ -104,6 +116,7 @@ def train(
             before its first: the result has the same bytes as if the run had never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
+        progress: shows how far what comes before training is.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes into, a budget that
@@ -120,6 +133,9 @@ def train(
     if resume_from is not None and (not folder.is_dir() or _is_done_and_read_only(config, folder)):
         latest_checkpoint(folder)
         return folder
+    if resume_from is None:
+        with progress() as report:
+            config = with_capture(config, report=report)
     keep_freed_memory()
     threads = config.run.threads or max(1, num_cores() // processes.local_size)
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
@@ -137,16 +153,21 @@ def train(
             print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
             return folder
         asked = asked_for(folder) if resume_from is not None else config
-        choices = []
-        if resumed is None:
-            config, choices = choose(config)
-        run = _Run(config, folder, resumed, asked, held=held, processes=processes, threads=threads)
-        if choices:
-            write_choices(run.folder, choices)
+        config, choices, capture = _chosen(config, begins=resumed is None)
+        run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, threads=threads)
+        write_choices(run.folder, choices)
         run.run(listeners)
         folder = run.folder
         note_asked(folder, asked)
     return folder
+
+
+def _chosen(config: Config, *, begins: bool) -> tuple[Config, list[Choice], Capture | None]:
+    """Return the configuration with all decided, what was said, and the capture, which nothing reads again."""
+    if config.model.is_network:
+        return config, [], None  # it has several captures
+    capture = read_capture(config.data)
+    return choose(config, capture) if begins else (config, [], capture)
 
 
 def _told_again(config: Config, folder: Path) -> str:
@@ -166,6 +187,7 @@ class _Run:
         folder: of the run.
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen.
+        capture: with its first points where the run begins; None: of a network.
         held: the lock of the folder, which knows where that is if it is renamed.
         processes: that this one leads.
         threads: of the kernels in each of them.
@@ -178,6 +200,7 @@ class _Run:
         resumed: Checkpoint | None,
         asked: Config,
         *,
+        capture: Capture | None,
         held: Held,
         processes: Processes,
         threads: int,
@@ -185,17 +208,19 @@ class _Run:
         watch = Stopwatch()
         if resumed is None:
             require_room(config)
-        built = build(config, restored=resumed is not None)
-        self._held = held
+        trainer = build(config, capture, restored=resumed is not None)
+        self._held, self._capture = held, capture
         self.folder, self.limits = folder, dict[str, Limit]()
-        self.loop = Loop(built.trainer, config.total_steps, watch, lambda: last_good(self.folder))
+        self.loop = Loop(trainer, config.total_steps, watch, lambda: last_good(self.folder))
         self._leader = Leader(processes, config, threads)
         self.loop.before_step = self._leader.before_step
         if resumed is not None:
-            built.trainer.restore(resumed)
+            trainer.restore(resumed)
             watch.pause(-seconds_at(folder, resumed.info.step))
         self.limited = (
-            None if built.scene_trainer is None else LimitedRun(folder, config, self.loop, built.scene_trainer)
+            LimitedRun(folder, config, self.loop, cast(GaussianTrainer, trainer))
+            if config.model.made_of_gaussians
+            else None
         )
         self._config, self._saved = config, self.loop.trainer.done
         if self.limited is not None:
@@ -233,8 +258,8 @@ class _Run:
             try:
                 loop.run(lambda: interrupts.requested)
             finally:
-                if limited is not None:
-                    limited.trainer.images.rest()
+                if isinstance(loop.trainer, Trainer):
+                    loop.trainer.images.rest()
             if loop.trainer.done < loop.total:
                 self._follow(self._held.folder() or self.folder)
                 if loop.trainer.done > self._saved:
@@ -319,7 +344,7 @@ class _Run:
     def _evaluate(self, step: int) -> None:
         """Tell the scores of the test split."""
         start = time.perf_counter()
-        report = evaluate_run(self.folder, "test")
+        report = evaluate_run(self.folder, "test", capture=self._capture)
         seconds = time.perf_counter() - start
         self.loop.watch.pause(seconds)
         self.loop.tell(Evaluated(step, "test", report.psnr, report.ssim, seconds))
@@ -347,7 +372,7 @@ class _Run:
             yield self.limits[_SPEED].reached()
 
 
-def _tell_memory(trainer: Trainer, processes: int) -> None:
+def _tell_memory(trainer: GaussianTrainer, processes: int) -> None:
     """Print how much memory a run will take, and a warning where that is likely to be more than is there.
 
     Raises:

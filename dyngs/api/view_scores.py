@@ -9,21 +9,21 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
-from dyngs.training.background import background_colour
+from dyngs.models.views import background_colour
 from dyngs.training.corrections.camera_fit import fitted_to_image
-from dyngs.training.trainer import Trainer
 
 EXPLAINED = 0.8
 """Fraction of the pixels of a view that count: those where the smaller of two models' errors is smallest."""
 SQUARES = 8
 """The halves of an image are the two colours of a chess board of so many squares a side."""
 
-PairScore = Callable[[Trainer, Trainer, int], tuple[float, float]]
+PairScore = Callable[[GaussianTrainer, GaussianTrainer, int], tuple[float, float]]
 """PSNR, dB, of the training view at an index by two models."""
 
 
-def plain(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+def plain(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
     """Return the PSNR of the view; where either has exposures, after an affine colour fitted to it."""
     image, background = one.images[index], background_colour(one.background)
     truth, fitted = image.composite(background), _have_exposures(one, other)
@@ -31,7 +31,7 @@ def plain(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
     return first, second
 
 
-def explained(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+def explained(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
     """Return the PSNR over the pixels that at least one of the two explains best, the same ones for both.
 
     Views held out show people who walk through, too, whom no model can foresee.
@@ -61,7 +61,7 @@ def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | N
     return weight * (error <= known.sort().values[rank - 1])
 
 
-def after_pose_fit(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+def after_pose_fit(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
     """Return the PSNR of the right half of the view from the pose in which its left half fits each model best.
 
     Views held out have no refined cameras.
@@ -70,20 +70,20 @@ def after_pose_fit(one: Trainer, other: Trainer, index: int) -> tuple[float, flo
     return first, second
 
 
-def _score_after_pose_fit(trainer: Trainer, index: int) -> float:
+def _score_after_pose_fit(trainer: GaussianTrainer, index: int) -> float:
     image, background = trainer.images[index], background_colour(trainer.background)
     left = torch.zeros_like(image.rgb_premultiplied[..., 0])
     left[:, : left.shape[1] // 2] = 1
     right = 1 - left if image.mask is None else (1 - left) * image.mask
-    options = trainer.options
-    fitted = fitted_to_image(trainer.scene, image, background, trainer.extent, options=options, weights=left)
+    options = trainer.model.options
+    fitted = fitted_to_image(trainer.model.scene, image, background, trainer.extent, options=options, weights=left)
     with torch.no_grad():
-        shown = trainer.scene.render(fitted.cameras, fitted.time, options=options, background=background).rgb[0]
+        shown = trainer.model.scene.render(fitted.cameras, fitted.time, options=options, background=background).rgb[0]
     return psnr(shown, image.composite(background), right)
 
 
 @torch.no_grad()
-def after_colour_fit(one: Trainer, other: Trainer, index: int) -> tuple[float, float]:
+def after_colour_fit(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
     """Return the mean PSNR of the view as it is, and with each half recoloured by a fit on the other half.
 
     Views held out have no exposures of their own. Where exposure goes with the viewpoint, as in a slow walk, colours
@@ -93,9 +93,11 @@ def after_colour_fit(one: Trainer, other: Trainer, index: int) -> tuple[float, f
     return first, second
 
 
-def _score_after_colour_fit(trainer: Trainer, index: int) -> float:
+def _score_after_colour_fit(trainer: GaussianTrainer, index: int) -> float:
     image, background = trainer.images[index], background_colour(trainer.background)
-    rendering = trainer.scene.render(image.cameras, image.time, options=trainer.options, background=background)
+    rendering = trainer.model.scene.render(
+        image.cameras, image.time, options=trainer.model.options, background=background
+    )
     truth, rgb = image.composite(background), rendering.rgb[0]
     fitted, light = rgb.clone(), _chess_board(*rgb.shape[:2])
     for half in (light, ~light):
@@ -111,15 +113,17 @@ def _chess_board(height: int, width: int) -> Tensor:
 
 
 @torch.no_grad()
-def _drawn(trainer: Trainer, index: int, fitted: bool) -> Tensor:
+def _drawn(trainer: GaussianTrainer, index: int, fitted: bool) -> Tensor:
     """Return the view (H, W, 3) as the scene shows it; ``fitted``: after an affine colour that is fitted to it."""
     image, background = trainer.images[index], background_colour(trainer.background)
-    rendering = trainer.scene.render(image.cameras, image.time, options=trainer.options, background=background)
+    rendering = trainer.model.scene.render(
+        image.cameras, image.time, options=trainer.model.options, background=background
+    )
     if not fitted:
         return rendering.rgb[0]
     affine = fitted_affine([(image, rendering)], background)
     return recoloured(affine, image, rendering, background)
 
 
-def _have_exposures(*trainers: Trainer) -> bool:
+def _have_exposures(*trainers: GaussianTrainer) -> bool:
     return any(x.exposures is not None for x in trainers)

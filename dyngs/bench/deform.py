@@ -11,19 +11,17 @@ from pathlib import Path
 
 import torch
 
-from dyngs.build import assemble
-from dyngs.config import Config, DeformField
+from dyngs.config import Config, DeformField, DynamicModel
 from dyngs.config.io import load_config
-from dyngs.config.kinds import field_of
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_text
+from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
-from dyngs.training.trainer import Trainer
 
 VARIANTS = ("no field", "moving Gaussians", "all Gaussians")
 """What the field deforms: nothing, the moving Gaussians, or all of them (no static split)."""
@@ -72,7 +70,7 @@ class DeformReport:
 def load_of_run(run_dir: Path) -> DeformLoad:
     """Return the load of a trained dynamic run. Raises DyngsError if it has no field."""
     run = load_run(run_dir)
-    if field_of(run.config) is None or run.scene.is_static:
+    if not run.config.model.may_move or run.scene.is_static:
         raise DyngsError(f"{run_dir}: nothing moves in this run; give one of a dynamic model, or none")
     return DeformLoad(run.config, run_dir)
 
@@ -138,13 +136,12 @@ def write_report(report: DeformReport, path: Path) -> None:
 
 
 def _field(config: Config) -> DeformField:
-    field = field_of(config)
-    if field is None:
+    if not isinstance(config.model, DynamicModel):
         raise DyngsError("bench deform needs model.kind=dynamic")
-    return field
+    return config.model.deform
 
 
-def _trainer(load: DeformLoad, variant: str) -> Trainer:
+def _trainer(load: DeformLoad, variant: str) -> GaussianTrainer:
     """Return a trainer after the last step of its schedules, in which the Gaussians of the variant move."""
     trainer = assemble(load.config)
     if load.run_dir is not None:
@@ -153,26 +150,26 @@ def _trainer(load: DeformLoad, variant: str) -> Trainer:
     scene = _dynamic(trainer)
     device = scene.gaussians.means.device
     if variant == VARIANTS[0]:
-        trainer.scene = replace(scene, field=None, moving=scene.moving[:0])
+        trainer.model.exchange(replace(scene, field=None, moving=scene.moving[:0]))
     elif variant == VARIANTS[2] or load.run_dir is None:
         fraction = 1.0 if variant == VARIANTS[2] else load.moving_fraction
         rows = torch.arange(round(fraction * len(scene)), device=device)
         low, high = torch.zeros(3, device=device), torch.ones(3, device=device)
         setup = FieldSetup(low, high, len(scene.times), len(rows), trainer.extent)
         field = new_field(_field(load.config), setup, torch.Generator("cpu").manual_seed(0))
-        trainer.scene = replace(scene, field=field, moving=rows)
+        trainer.model.exchange(replace(scene, field=field, moving=rows))
     return trainer
 
 
-def _dynamic(trainer: Trainer) -> DynamicScene:
-    match trainer.scene:
+def _dynamic(trainer: GaussianTrainer) -> DynamicScene:
+    match trainer.model.scene:
         case DynamicScene():
-            return trainer.scene
+            return trainer.model.scene
         case _:
             raise DyngsError(f"{trainer.config.data.root}: a capture without times; nothing can move in it")
 
 
-def _field_stages(trainer: Trainer, rounds: int) -> dict[str, float]:
+def _field_stages(trainer: GaussianTrainer, rounds: int) -> dict[str, float]:
     """Measure the stages of the field, in milliseconds."""
     scene = _dynamic(trainer)
     field = scene.field

@@ -14,11 +14,12 @@ from statistics import fmean, median
 
 from dyngs.budget.run import LimitedRun
 from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy
+from dyngs.gaussians.schedule import growth_per_change
+from dyngs.models.schedule import scaled
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.clock import cost_between, full_pixels, step_cost, with_steps
 from dyngs.training.events import Event, StepDone
 from dyngs.training.memory import gaussian_bytes, num_changes, peak_memory
-from dyngs.training.schedule import growth_per_change, scaled
 
 SLOWER = 0.1
 """Power of the number of changes with which each adds fewer Gaussians."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from torch import Tensor
 
 from dyngs.config import Config
+from dyngs.kinds import GaussianTrainer
 from dyngs.prune.stage import training_quality
 from dyngs.training.events import Message, TopologyChanged
 from dyngs.training.loop import Loop
-from dyngs.training.trainer import Trainer
 
 STAGES = (0.7, 0.9)
 """Fractions of a run after which Gaussians are removed where that is needed, with steps left for the others to
@@ -33,7 +33,7 @@ class LimitedRun:
     folder: Path
     config: Config
     loop: Loop
-    trainer: Trainer
+    trainer: GaussianTrainer
     given: float = math.inf
     reserve: float = 0.0
 
@@ -47,17 +47,17 @@ class LimitedRun:
         """Return the number of removal stages that the run has reached; the last is its end."""
         return stage(self.config, self.trainer.done, self.used / self.given)
 
-    def exchange(self, trainer: Trainer) -> None:
+    def exchange(self, trainer: GaussianTrainer) -> None:
         """Go on with another trainer."""
         self.trainer = self.loop.trainer = trainer
 
     def remove(self, kept: Tensor) -> tuple[float, float]:
         """Leave only the Gaussians ``kept`` (N,); return the quality of training images before and after, dB."""
         trainer = self.trainer
-        before, count = training_quality(trainer, trainer.scene), trainer.num_gaussians
-        trainer.keep(kept)
+        before, count = training_quality(trainer, trainer.model.scene), trainer.num_gaussians
+        trainer.model.keep(kept, trainer.done)
         self.loop.tell(TopologyChanged(trainer.done, count, trainer.num_gaussians))
-        return before, training_quality(trainer, trainer.scene)
+        return before, training_quality(trainer, trainer.model.scene)
 
     def say(self, text: str) -> None:
         """Tell people."""

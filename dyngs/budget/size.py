@@ -9,10 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.build import restored_scene
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import GaussianTrainer, restored_scene
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import CPU
 from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores, probe_images, quality_of
@@ -23,8 +24,6 @@ from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.quantize import step_below
 from dyngs.storage.tensors import drawable
-from dyngs.training.state import Checkpoint
-from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
 """Fraction of the Gaussians that each trial keeps of those of the trial before."""
@@ -80,7 +79,7 @@ def has_file(run_dir: Path) -> bool:
 
 
 @torch.no_grad()
-def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeReport:
+def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> SizeReport:
     """Write ``scene.dyngs``, at most ``megabytes`` large, into a folder of ``run_dir``, and return a report.
 
     Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
@@ -91,7 +90,11 @@ def write_within(trainer: Trainer, run_dir: Path, megabytes: float) -> SizeRepor
         run_dir: of the run.
         megabytes: 1e6 bytes.
     """
-    whole, scene, config = trainer.checkpoint(), trainer.scene.to(CPU), trainer.config  # files are made on the CPU
+    whole, scene, config = (
+        trainer.checkpoint(),
+        trainer.model.scene.to(CPU),
+        trainer.config,
+    )  # files are made on the CPU
     images = probe_images(trainer)
     before = quality_of(trainer, scene, images)
     plan = storage_plan(config, whole, scene, None)

@@ -22,15 +22,15 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.evaluate.drawing import Drawing
 from dyngs.gaussians.scene import Scene, render_options
+from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import flip, ssim
+from dyngs.models.schedule import scaled
+from dyngs.models.views import training_cameras
 from dyngs.ops.device import finish
 from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores, training_quality
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE
-from dyngs.training.schedule import scaled
-from dyngs.training.trainer import Trainer
-from dyngs.training.views import training_cameras
 
 FEW = 300
 """Number of Gaussians with which the fixed cost of drawing is measured."""
@@ -126,7 +126,7 @@ class SpeedLimit:
     def hold(self) -> None:
         """Let the trainer add no more Gaussians than measured before."""
         if self.found.cap:
-            self.run.trainer.densifier.limit(self.found.cap)
+            self.run.trainer.model.densifier.limit(self.found.cap)
         self.run.reserve = self._reserve()
 
     def __call__(self, event: Event) -> None:
@@ -141,7 +141,7 @@ class SpeedLimit:
                         self._remove()
                 elif self._is_growing(event.step):
                     trainer = self.run.trainer
-                    self.found.seconds = drawing_seconds(trainer, trainer.scene, GROWTH_VIEWS)
+                    self.found.seconds = drawing_seconds(trainer, trainer.model.scene, GROWTH_VIEWS)
                     self.found.cap = self._allowed(trainer.num_gaussians)
                     self.hold()
 
@@ -160,7 +160,7 @@ class SpeedLimit:
             )
         cost = "it cost nothing"
         if found.before:
-            now = training_quality(trainer, trainer.scene)
+            now = training_quality(trainer, trainer.model.scene)
             cost = (
                 f"{found.before:,} -> {count:,} Gaussians; {-found.lost:+.2f} dB on training views when that was done "
                 f"({found.quality:.2f} before, {now:.2f} at the end)"
@@ -188,7 +188,7 @@ class SpeedLimit:
         """Remove Gaussians if drawing is too slow."""
         found, trainer, start = self.found, self.run.trainer, time.perf_counter()
         count = trainer.num_gaussians
-        found.seconds = least_seconds(trainer, trainer.scene, ACCEPTED / self.fps)
+        found.seconds = least_seconds(trainer, trainer.model.scene, ACCEPTED / self.fps)
         self.run.reserve = self._reserve()
         if found.seconds <= ACCEPTED / self.fps:
             return
@@ -226,7 +226,7 @@ class SpeedLimit:
             if count <= fine:
                 break
             kept = highest(scores, 1 - count / len(scores))
-            seconds = least_seconds(trainer, trainer.scene.select(kept), goal)
+            seconds = least_seconds(trainer, trainer.model.scene.select(kept), goal)
             if seconds > goal:
                 slow, slow_seconds = count, seconds
                 continue
@@ -250,7 +250,7 @@ def allowed(found: Measured, fps: float, count: int, config: Config) -> int:
 
 
 @torch.no_grad()
-def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float:
+def drawing_seconds(trainer: GaussianTrainer, scene: Scene, views: int = VIEWS) -> float:
     """Return the median over training views of the least time to draw one at full size, deformation included.
 
     In between each image is judged, as evaluation does: drawing is faster where caches still hold all it needs.
@@ -273,7 +273,7 @@ def drawing_seconds(trainer: Trainer, scene: Scene, views: int = VIEWS) -> float
     return median(least)
 
 
-def least_seconds(trainer: Trainer, scene: Scene, limit: float) -> float:
+def least_seconds(trainer: GaussianTrainer, scene: Scene, limit: float) -> float:
     """Return ``drawing_seconds``, or the least of several measurements if more than ``limit``."""
     least = math.inf
     for _ in range(ATTEMPTS):
@@ -283,7 +283,7 @@ def least_seconds(trainer: Trainer, scene: Scene, limit: float) -> float:
     return least
 
 
-def _few(trainer: Trainer) -> Scene:
+def _few(trainer: GaussianTrainer) -> Scene:
     """Return ``FEW`` of the Gaussians of ``trainer``, all of them moving if any will move."""
     kept = torch.tensor(evenly_spaced(trainer.num_gaussians, FEW), device="cpu")
-    return trainer.training.all_moving(trainer.scene.select(kept), trainer.extent)
+    return trainer.model.training.all_moving(trainer.model.scene.select(kept), trainer.extent)

@@ -13,15 +13,13 @@ from collections.abc import Callable, Mapping
 from torch import Tensor
 
 from dyngs.budget.run import LimitedRun, two_digits
-from dyngs.build import assemble
 from dyngs.config import Config
-from dyngs.config.kinds import harmonics_measured_after
+from dyngs.deform.schedule import motion_begins_after
 from dyngs.errors import DyngsError
+from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.runs.config_file import write_config
 from dyngs.training.clock import Forecast, with_steps
 from dyngs.training.events import Event, StepDone
-from dyngs.training.schedule import motion_begins_after
-from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200
 """Fewest steps that must fit; otherwise the run is refused."""
@@ -140,7 +138,7 @@ class Deadline:
         run.loop.expect(run.config.total_steps)
 
 
-def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
+def first_fit(config: Config, trainer: GaussianTrainer, used: float) -> Config:
     """Return ``config`` with as many steps as fit, at most its own, by the measured rate of a copy of ``trainer``.
 
     Args:
@@ -177,13 +175,13 @@ def first_fit(config: Config, trainer: Trainer, used: float) -> Config:
     return with_steps(config, found)
 
 
-def refitted(trainer: Trainer, config: Config) -> Trainer:
+def refitted(trainer: GaussianTrainer, config: Config) -> GaussianTrainer:
     """Return a trainer that is where ``trainer`` is, but on the schedules of ``config``."""
-    fitted = assemble(config, restored=True)
-    fitted.images, fitted.bad_gradients = trainer.images, trainer.bad_gradients
+    fitted = assemble(config, trainer.capture, restored=True, images=trainer.images)
+    fitted.bad_gradients = trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
     step = trainer.done + 1
-    fitted.training.extend(fitted.scene, trainer.training.window(step), step)
+    fitted.model.training.extend(fitted.model.scene, trainer.model.training.window(step), step)
     return fitted
 
 
@@ -204,5 +202,5 @@ def same_phase(old: Config, new: Config, done: int) -> bool:
 
 def _happened(config: Config, done: int) -> tuple[bool, ...]:
     """Return, for each one-time event of a run, whether it has happened after ``done`` steps."""
-    once = motion_begins_after(config, config.train.steps), harmonics_measured_after(config)
+    once = motion_begins_after(config, config.train.steps), config.colour.measured_after(config.train.steps)
     return tuple(done >= step for step in once if step is not None)

@@ -94,9 +94,9 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
 
     with ExitStack() as stack:
         listeners = [stack.enter_context(_view(arguments, config))] if arguments.view else []
-        if arguments.resume is None:
-            config = _with_poses(config)
-        folder = train(config, resume_from=arguments.resume, listeners=listeners, processes=processes)
+        folder = train(
+            config, resume_from=arguments.resume, listeners=listeners, processes=processes, progress=ProgressBar
+        )
     for line in _about_motion(folder, config):
         print(line)
     print(f"trained: {folder}\n{_next(folder, config)}")
@@ -114,42 +114,9 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     return TrainingView(config, Serving(arguments.host, arguments.port), lambda line: print(line, flush=True))
 
 
-def _with_poses(config: Config) -> Config:
-    """Return the configuration with poses for photos or a video; people need a capture with body parameters."""
-    from dyngs.capture.unposed import is_unposed, with_poses
-    from dyngs.config.kinds import field_of, network_of, person_of
-
-    if network_of(config) is not None:
-        return config  # its folder holds a capture per person
-    if person_of(config) is not None:
-        if is_unposed(config.data):
-            raise DyngsError(
-                f"{config.data.root}: a person needs a capture with body parameters (docs/human.md); of photos or "
-                "videos alone a scene can be made: "
-                f"`dyngs train static data.root={as_word(config.data.root)}`, or dynamic"
-            )
-        return _with_fitted_body(config)
-    with ProgressBar() as report:
-        data = with_poses(config.data, needs_times=field_of(config) is not None, report=report)
-    return config.model_copy(update={"data": data})
-
-
-def _with_fitted_body(config: Config) -> Config:
-    """Return the configuration with the free template fitted to the person, where asked for or needed."""
-    from dyngs.config.kinds import person_of
-    from dyngs.human.fit.fitted_capture import with_fitted_body
-
-    model = person_of(config)
-    if model is None or model.body is not None:
-        return config
-    with ProgressBar() as report:
-        data = with_fitted_body(config.data, only_if_needed=not model.fit, report=report)
-    return config.model_copy(update={"data": data})
-
-
 def _next(folder: Path, config: Config) -> str:
     """Return the next commands for a run."""
-    if config.model.kind == "human_predictor":
+    if config.model.is_network:
         return f"next:    dyngs predict {as_word(folder)} CAPTURE --out RUN"
     return (
         f"next:    dyngs eval {as_word(folder)}\n"
@@ -159,15 +126,14 @@ def _next(folder: Path, config: Config) -> str:
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
     """Return lines about the moving part of a dynamic model."""
-    from dyngs.config.kinds import freezes_below_px
+    from dyngs.config import DynamicModel
     from dyngs.runs.checkpoint import load_run
 
-    limit = freezes_below_px(config)
-    if limit is None:
+    if not isinstance(config.model, DynamicModel):
         return []
     run = load_run(folder)
-    scene = run.scene
-    if freezes_below_px(run.config) is None:
+    scene, limit = run.scene, config.model.freeze_below_px
+    if not run.config.model.may_move:
         return ["motion:  none, so this is a static model, like those of configs/static.yaml"]
     if not scene.times:
         return ["motion:  the capture has no times (or only one), so this is a static model"]

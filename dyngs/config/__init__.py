@@ -15,7 +15,7 @@ from dyngs.config.keys.dynamic import (
     TrajectoryField,
 )
 from dyngs.config.keys.human import HumanModel, HumanPredictorModel
-from dyngs.config.keys.model import SceneModel, StaticModel
+from dyngs.config.keys.model import ModelSection, SceneModel, StaticModel
 from dyngs.config.keys.prune import PruneConfig
 from dyngs.config.keys.run import RunConfig
 from dyngs.config.keys.section import CutOff, Fraction, Positive, Section
@@ -43,6 +43,7 @@ __all__ = [
     "HumanPredictorModel",
     "McmcStrategy",
     "MlpField",
+    "ModelSection",
     "NetworkColour",
     "OptimConfig",
     "PointsInit",

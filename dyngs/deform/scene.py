@@ -12,10 +12,11 @@ from dyngs.config import DynamicModel
 from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.scene import Moment, Scene, clamped_time
+from dyngs.gaussians.filters import filter_state, filtered, stored_filter
+from dyngs.gaussians.scene import GaussianTimeStep, Scene, stored_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, matched
+from dyngs.models.renderable import clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed
-from dyngs.static.scene import filter_state, filtered, stored_filter, stored_times, times_state
 from dyngs.tensor_checks import require_ascending, require_indices
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
@@ -76,15 +77,15 @@ class DynamicScene(Scene):
     def num_motion_values(self) -> int:
         return 0 if self.field is None or self.is_static else self.field.num_values
 
-    def moment(self, time: float | None) -> Moment:
+    def time_step(self, time: float | None) -> GaussianTimeStep:
         """Return all N Gaussians at ``time``, or with masks only those that are seen around then, in their order.
 
         What does not move is not computed anew.
         """
         now = clamped_time(time)
         if self.field is None or self.is_static:
-            return Moment(filtered(self.gaussians, self.filter_std), now)
-        return Moment(self.deformed_at(now)[0], now)
+            return GaussianTimeStep(filtered(self.gaussians, self.filter_std), now)
+        return GaussianTimeStep(self.deformed_at(now)[0], now)
 
     def deformed_at(self, time: float, *, detach: bool = False) -> tuple[Gaussians, Offsets]:
         """Return the Gaussians drawn at ``time``, and the offsets of those of them that move.

@@ -26,13 +26,13 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
+from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.parameters import Parameters
-from dyngs.gaussians.scene import Moment, Scene
+from dyngs.gaussians.scene import GaussianTimeStep
+from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, fields_moved_to, with_role
-from dyngs.static.filters import FILTER_VARIANCE, filter_std
-from dyngs.static.rates import Rates
-from dyngs.static.training import FilterUpdate
 
 SURELY_MOVING = 1.5
 """Multiple of ``motion_threshold`` above which an error always counts as motion."""
@@ -83,7 +83,7 @@ class TrainingViews:
     standing: Callable[[], Sequence[Footage]] = tuple
 
 
-class DynamicTraining:
+class DynamicTraining(SceneTraining[DynamicScene]):
     """See ``SceneTraining``.
 
     Attributes:
@@ -120,16 +120,16 @@ class DynamicTraining:
         if scene.field is not None:
             scene.field.extend(seen, self._window.bounds(step))
 
-    def moment(self, scene: DynamicScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: DynamicScene, image: Image, step: int) -> GaussianTimeStep:
         """Return the moment drawn for ``image`` at its time, and the regularizers of motion."""
         if scene.field is None:
-            return scene.moment(image.time)
+            return scene.time_step(image.time)
         time = image.time or 0.0
         gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
         penalties = scene.field.penalties(time) | self._sparsity(offsets)
         if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the images
             penalties.pop("node acceleration", None)
-        return Moment(gaussians, image.time, None, penalties)
+        return GaussianTimeStep(gaussians, image.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         """Update the field."""
@@ -193,13 +193,9 @@ class DynamicTraining:
         field = new_field(self.options.deform, setup, torch.Generator()).to(means.device)
         return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
-    def follow(self, edit: TopologyEdit) -> None:
-        """Do nothing: nothing is kept per Gaussian."""
-
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> DynamicScene:
-        scene = DynamicScene.restored(self.options, gaussians, tensors)
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
         self._on_its_way("tracked" in tensors)
-        return replace(scene, colour=like.colour, options=like.options, background=like.background)
+        return DynamicScene.restored(self.options, gaussians, tensors)
 
     def state(self) -> State:
         """Return whether tracks are known, so that all times are trained on."""

@@ -15,12 +15,12 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.drawing import Drawing, seconds_in_turn
-from dyngs.evaluate.report import parameter_megabytes, render_options, scene_of_split, split_views
+from dyngs.evaluate.report import parameter_megabytes, scene_of_split, split_views
 from dyngs.metrics import psnr
+from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
-from dyngs.training.background import evaluation_background
 
 COMPARED_VIEWS = 20
 """Number of views compared per split; enough for before and after, not for a benchmark."""
@@ -92,8 +92,6 @@ def _views(
     loader = ImageLoader(split_views(capture, split), config.data)
     loader.device = device
     background = evaluation_background(config.data.background, capture.has_alpha)[1].to(device)
-    drawings = [
-        Drawing(scene_of_split(run, capture, split).to(device), render_options(run.config.model), background)
-        for run in runs
-    ]
+    scenes = [scene_of_split(run, capture, split).to(device) for run in runs]
+    drawings = [Drawing(scene, scene.options, background) for scene in scenes]
     return drawings, [loader[i] for i in evenly_spaced(len(loader), COMPARED_VIEWS)]

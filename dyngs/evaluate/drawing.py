@@ -12,8 +12,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.models.renderable import DrawOptions, Renderable
 from dyngs.ops.device import finish
 
 
@@ -27,8 +26,8 @@ class Drawing:
         scale: width and height drawn, relative to those of the image.
     """
 
-    scene: Scene
-    options: RenderOptions
+    scene: Renderable
+    options: DrawOptions
     background: Tensor
     scale: float = 1.0
 

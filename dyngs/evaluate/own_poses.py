@@ -20,6 +20,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.view_scores import PoseScores, means_of, score_views
+from dyngs.gaussians.scene import require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.metrics import Lpips, psnr
@@ -58,7 +59,7 @@ def _person_scores(
     avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
 ) -> PoseScores:
     """Return the scores of a person in the poses that are most like the images."""
-    fitted = fitted_to_images(avatar, images, drawing.background, drawing.options, comparison)
+    fitted = fitted_to_images(avatar, images, drawing.background, avatar.options, comparison)
     each = (images[i] for i in range(len(images)))
     views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
     return PoseScores(**means_of(views), updates=fmean(fitted.updates), per_view=tuple(views))
@@ -66,7 +67,8 @@ def _person_scores(
 
 def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
     """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in world units."""
-    scene, options, background = drawing.scene, drawing.options, drawing.background
+    scene, background = require_gaussians(drawing.scene, "what cameras are fitted to"), drawing.background
+    options = scene.options
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
         fitted = fitted_to_image(scene, image, background, size, options=options)

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from dyngs.config.kinds import field_of
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -25,14 +24,14 @@ from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, 
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene, render_options
+from dyngs.gaussians.scene import Scene
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
+from dyngs.models.renderable import Renderable
+from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
-from dyngs.training.background import evaluation_background
-from dyngs.training.views import training_cameras
 
 
 @dataclass(frozen=True)
@@ -117,6 +116,7 @@ def evaluate_run(
     refine_poses: bool = False,
     device: str = "cpu",
     data_root: Path | None = None,
+    capture: Capture | None = None,
 ) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
@@ -129,15 +129,16 @@ def evaluate_run(
             images themselves; always done for a run that refined its cameras.
         device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
         data_root: where the capture lies by now, if it was moved.
+        capture: of the run, if it was read already.
     """
     draws_on = device_for(device)
     _require_possible(run_dir, split, refine_poses)
     run = load_run(run_dir, data_root)
-    capture = read_capture(run.config.data)
+    capture = capture or read_capture(run.config.data)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(draws_on)
-    drawing = Drawing(scene, render_options(run.config.model), colour.to(draws_on))
+    drawing = Drawing(scene, scene.options, colour.to(draws_on))
     with _num_threads(threads):
         loader = images_of_split(capture, views, run_dir, run)
         loader.device = draws_on
@@ -178,18 +179,24 @@ def _require_possible(run_dir: Path, split: str, refine_poses: bool) -> None:
         )
 
 
-def _facts(run_dir: Path, run: LoadedRun, scene: Scene) -> dict[str, Any]:
+def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
     """Return the fields of a report that no image is needed for."""
-    return {
+    facts = {
+        "seconds_train": run.seconds_train,
+        "step": run.step,
+        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
+    }
+    if not isinstance(scene, Scene):
+        values = sum(x.tensor.numel() for x in scene.drawing_state().values())
+        none = {"num_gaussians": 0, "num_moving": 0, "moving_fraction": 0.0, "field_mb": 0.0, "colour_floats": 0.0}
+        return facts | none | {"model_mb": 4e-6 * values}
+    return facts | {
         "num_gaussians": len(scene),
         "num_moving": 0 if scene.is_static else scene.num_moving,
         "moving_fraction": scene.moving_fraction,
         "model_mb": parameter_megabytes(scene),
         "field_mb": 4e-6 * scene.num_motion_values,
         "colour_floats": scene.num_colour_values / max(len(scene), 1),
-        "seconds_train": run.seconds_train,
-        "step": run.step,
-        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
     }
 
 
@@ -232,10 +239,12 @@ def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> d
     }
 
 
-def _track_scores(run: LoadedRun, capture: Capture, scene: Scene, views: Sequence[View]) -> TrackScores:
+def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:
     """Return the errors of the scene's motion where the capture has true tracks."""
     tracks = read_true_tracks(capture.root, capture.world_offset)
     cameras = training_cameras(views, run.config.data)
+    if not isinstance(scene, Scene):
+        return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")
     return track_scores(scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits))
 
 
@@ -258,7 +267,7 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
         )
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
-    if field_of(run.config) is not None and run.scene.is_static:
+    if run.config.model.may_move and run.renderable.is_static:
         notes.append("the model is dynamic, but nothing moves in it: it is drawn as fast as a static one")
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")

@@ -25,10 +25,9 @@ from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.evaluate.regions import Regions
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.gaussians.rendering import Rendering, RenderOptions
-from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, flip, psnr, ssim
+from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.ops.device import finish
 
 
@@ -84,9 +83,9 @@ class PoseScores:
 
 
 def score_views(
-    scene: Scene,
+    scene: Renderable,
     images: Iterable[Image],
-    options: RenderOptions,
+    options: DrawOptions,
     background: Tensor,
     lpips: Lpips,
     regions: Regions | None = None,
@@ -193,14 +192,14 @@ def mean_of(values: Sequence[float | None]) -> float | None:
 
 
 def _timed_render(
-    scene: Scene, image: Image, options: RenderOptions, background: Tensor
+    scene: Renderable, image: Image, options: DrawOptions, background: Tensor
 ) -> tuple[Rendering, float, float]:
     """Return the rendering, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
-        device = scene.gaussians.means.device
+        device = scene.device
         finish(device)
         start = time.perf_counter()
-        moment = scene.moment(image.time)
+        moment = scene.time_step(image.time)
         finish(device)
         deformed = time.perf_counter()
         rendering = scene.render(image.cameras, moment, options=options, background=background)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.along import path_along
@@ -14,10 +15,12 @@ from dyngs.camera_paths.path import CameraPath, path_file, read_path, resize_cam
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.export.images import file_stems
+from dyngs.gaussians.scene import Scene
 from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.models.renderable import Renderable
+from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views
 from dyngs.splats.rotation import AXES, with_scene
-from dyngs.training.views import training_cameras
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
@@ -56,7 +59,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
         DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what a
             file cannot have.
     """
-    scene, times = opened.scene, options.times
+    scene, times = opened.renderable, options.times
     if opened.captured is None:
         _require_fitting(opened, options)
     path = _fixed_camera(opened, options) if options.path is None else _moving(opened, options.path, options)
@@ -105,12 +108,17 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
 
     z is up where nothing says what is.
     """
-    scene = opened.scene
+    scene = opened.renderable
     moves = opened.person is not None and not scene.is_static
     times = np.linspace(0, 1, _SAMPLED_TIMES).tolist() if moves else [None]
-    means = torch.cat([scene.at(time).means for time in times]).cpu().numpy()
+    means = torch.cat([points_at(scene, time) for time in times]).cpu().numpy()
     x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
     return frame_orbit_for_points(means, count, size, (x, y, z))
+
+
+def points_at(scene: Renderable, time: float | None = None) -> Tensor:
+    """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box of all else."""
+    return scene.at(time).means if isinstance(scene, Scene) else scene.bounds
 
 
 def front_of(opened: Opened, ring: Cameras) -> int:
@@ -138,11 +146,11 @@ def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
     """Return the path of one fixed camera at the times that are requested, or at the time of its view."""
     if opened.captured is None:
         ring = orbit_around(opened, _RING, options.size or DEFAULT_SIZE)
-        camera, times = ring.select(front_of(opened, ring)), opened.scene.times
+        camera, times = ring.select(front_of(opened, ring)), opened.renderable.times
     else:
         view = view_to_show(opened.capture, options.view, options.split)
         (camera,) = training_cameras([view], opened.config.data)
-        times = (view.time or 0.0,) if opened.fps is None else opened.scene.times
+        times = (view.time or 0.0,) if opened.fps is None else opened.renderable.times
     return static_path(camera, times if options.times is None else options.times)
 
 
@@ -162,7 +170,7 @@ def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
 
 def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by the scene."""
-    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(opened.scene.times))
+    frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(opened.renderable.times))
     up = None if opened.stated_up is None else np.array(AXES[opened.stated_up])
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
@@ -185,5 +193,5 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
             return CameraPath(spiral_path(cameras, frames, up))
         case _:
             times = [view.time for view in views if view.time is not None]
-            clip = len(times) == len(views) and not opened.scene.is_static and opened.fps is None
+            clip = len(times) == len(views) and not opened.renderable.is_static and opened.fps is None
             return path_along(cameras, frames, times if clip else None, up)

@@ -20,9 +20,8 @@ from dyngs.export.contact_sheet import SheetRow, contact_sheet, depth_limits, de
 from dyngs.export.video import VideoWriter
 from dyngs.files.outputs import Inputs
 from dyngs.files.write import to_uint8, write_image
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Moment, Scene
 from dyngs.metrics import psnr
+from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.ops.device import CPU
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened, split_views
@@ -64,7 +63,7 @@ class OutputOptions:
 
 
 def render_frame(
-    scene: Scene, camera: Cameras, time: float | Moment | None = None, options: RenderOptions | None = None
+    scene: Renderable, camera: Cameras, time: float | TimeStep | None = None, options: DrawOptions | None = None
 ) -> Frame:
     """Render one camera, without gradients.
 
@@ -80,7 +79,7 @@ def render_frame(
     return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
 
 
-def path_frames(scene: Scene, path: CameraPath, options: RenderOptions | None = None) -> Iterator[Frame]:
+def path_frames(scene: Renderable, path: CameraPath, options: DrawOptions | None = None) -> Iterator[Frame]:
     """Yield the frames along a path one by one, so that memory does not grow with their number.
 
     The scene is deformed only where the time differs from that of the frame before. A path without times shows time 0.
@@ -90,7 +89,7 @@ def path_frames(scene: Scene, path: CameraPath, options: RenderOptions | None = 
         time = None if path.times is None or scene.is_static else path.times[i]
         if moment is None or time != moment_time:
             with torch.no_grad():
-                moment, moment_time = scene.moment(time), time
+                moment, moment_time = scene.time_step(time), time
         yield render_frame(scene, path.cameras.select(i), moment, options)
 
 
@@ -117,12 +116,12 @@ def write_path_images(
         raise DyngsError("the camera path has no cameras")
     if out_dir is None and output.video is None:
         raise DyngsError("nothing to write: give a folder for the images or a video file")
-    options, limits = _with_depth(opened.scene, output), None
+    options, limits = _with_depth(opened.renderable, output), None
     if output.depth and out_dir is not None:
-        limits = _shared_depth_limits(path_frames(opened.scene, _sample(path), options))
+        limits = _shared_depth_limits(path_frames(opened.renderable, _sample(path), options))
     digits = max(4, len(str(len(path) - 1)))
     with _FrameWriter(out_dir, output, inputs_of(opened), limits) as writer:
-        for i, frame in enumerate(path_frames(opened.scene, path, options)):
+        for i, frame in enumerate(path_frames(opened.renderable, path, options)):
             writer.write(f"frame_{i:0{digits}d}", frame)
             report("frames", i + 1, len(path))
     return writer.written
@@ -156,7 +155,7 @@ def write_split_images(
     inputs.require_output(out_dir)
     views = split_views(opened.capture, split)
     loader, background = ImageLoader(views, opened.config.data), opened.background
-    scene = opened.of_split(split).scene.to(device)
+    scene = opened.of_split(split).renderable.to(device)
     options = _with_depth(scene, output)
     shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
     rows: list[SheetRow] = []
@@ -255,7 +254,7 @@ class _FrameWriter:
         self.written.append(path)
 
 
-def _with_depth(scene: Scene, output: OutputOptions) -> RenderOptions:
+def _with_depth(scene: Renderable, output: OutputOptions) -> DrawOptions:
     return replace(scene.options, depth="expected" if output.depth else "none")
 
 

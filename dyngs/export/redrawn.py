@@ -66,7 +66,7 @@ def compare_run(opened: Opened, scene: Scene, time: float, meant: SplatFile, rea
         DyngsError: no camera sees anything.
     """
     with torch.no_grad():
-        moment = scene.moment(time)
+        moment = scene.time_step(time)
         for cameras in (capture_cameras(opened), with_scene(around(meant), inverse(meant.turned))):
             if cameras is None:
                 continue

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from torch import Tensor
 
-from dyngs.build import restored_scene
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import restored_scene
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
@@ -21,7 +22,6 @@ from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
 from dyngs.storage.tensors import FIELD, drawable
-from dyngs.training.state import Checkpoint
 
 MISSED = 1.05
 """A file whose images change by so many times what is allowed is not written; less is rounding of the drawing."""

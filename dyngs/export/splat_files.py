@@ -172,7 +172,7 @@ def splats_at(opened: Opened, scene: Scene, time: float, how: Writing = AS_THEY_
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked for."""
     model = opened.config.model
     with torch.no_grad():
-        moment = scene.moment(time)
+        moment = scene.time_step(time)
     gaussians, shader = moment.gaussians, scene.shader(moment)
     comments = [f"step: {opened.step}"] if scene.is_static else [f"step: {opened.step}", f"dyngs time {time!r}"]
     if shader is not None:

@@ -13,6 +13,7 @@ from dyngs.camera import Cameras
 from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.ops.checks import check_choice, check_count, check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
@@ -29,16 +30,15 @@ harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but
 
 
 @dataclass(frozen=True)
-class RenderOptions:
-    """Settings of a render.
+class RenderOptions(DrawOptions):
+    """Settings of a render, beside those of ``DrawOptions``.
 
     Attributes:
-        near, far: centres outside are culled, world units (3DGS: 0.2).
+        far: centres beyond are culled, as those nearer than ``near`` are, world units.
         eps2d: 2D low-pass variance, px^2 (3DGS: 0.3; Mip-Splatting: 0.1).
         mode: classic, or antialiased (opacity compensated for the low-pass).
         sh_degree: highest degree used; None = that of the Gaussians.
         alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
-        depth: none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha).
         absgrad: fill the absolute part of the probe's gradient.
         nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``), or it is not looked
             for (``trust``; the trainer does this, because its optimizer never writes such values).
@@ -47,7 +47,6 @@ class RenderOptions:
         DyngsError: a number that is negative, NaN or beyond its range, or a choice that does not exist.
     """
 
-    near: float = 0.2
     far: float = 1e10
     eps2d: float = 0.3
     mode: RasterizeMode = RasterizeMode.CLASSIC
@@ -55,7 +54,6 @@ class RenderOptions:
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
-    depth: Literal["none", "accumulated", "expected"] = "none"
     absgrad: bool = False
     nonfinite: Literal["error", "skip", "trust"] = "error"
 
@@ -80,31 +78,14 @@ class RenderOptions:
 
 
 @dataclass(frozen=True)
-class Rendering:
-    """V rendered images.
+class GaussianRendering(Rendering):
+    """V rendered images of N Gaussians.
 
     Attributes:
-        rgb: (V, H, W, 3), background composited; not clamped above 1.
-        transmittance: (V, H, W) in [0, 1], the fraction of the background that is seen.
-        depth: (V, H, W) view-space z in world units, or None; 0 where nothing is drawn.
         radii: (V, N, 2) int32 half extents in px, 0 = not drawn.
     """
 
-    rgb: Tensor
-    transmittance: Tensor
-    depth: Tensor | None
     radii: Tensor
-
-    @property
-    def alpha(self) -> Tensor:
-        """Return (V, H, W) opacities of the images, in [0, 1]."""
-        return 1 - self.transmittance
-
-    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rendering:
-        """Return the same images on another device or in another precision; radii stay integers."""
-        rgb, transmittance = (x.to(device=device, dtype=dtype) for x in (self.rgb, self.transmittance))
-        depth = None if self.depth is None else self.depth.to(device=device, dtype=dtype)
-        return Rendering(rgb, transmittance, depth, self.radii.to(device=device))
 
 
 def render(
@@ -115,7 +96,7 @@ def render(
     background: Tensor | None = None,
     probe: Tensor | None = None,
     shader: Shader | None = None,
-) -> Rendering:
+) -> GaussianRendering:
     """Return images of the Gaussians from every camera (Kerbl et al. 2023).
 
     Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the probe and what the
@@ -155,7 +136,7 @@ def render(
         if options.depth == "expected":
             alpha = blended.color[..., 4] if _needs_weights(options) else 1 - blended.transmittance
             depth = depth / torch.where(alpha > 0, alpha, 1.0)
-    return Rendering(blended.color[..., :3], blended.transmittance, depth, projection.radii)
+    return GaussianRendering(blended.color[..., :3], blended.transmittance, depth, projection.radii)
 
 
 def _needs_weights(options: RenderOptions) -> bool:

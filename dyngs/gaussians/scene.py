@@ -1,39 +1,39 @@
 """Scenes that can be trained and drawn: N Gaussians with their motion and colours.
 
 There is one class per kind of model: ``static.scene.StaticScene``, ``deform.scene.DynamicScene`` and
-``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the same class. How a kind
-of scene is trained is the business of a ``SceneTraining``.
+``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the same class. How it is
+trained is the business of ``gaussians.model``.
 """
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import SceneModel
-from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import ColourNetwork, Frame
-from dyngs.gaussians.parameters import Parameters
-from dyngs.gaussians.rendering import Rendering, RenderOptions, Shader, render
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import ColourNetwork, Frame, network_of
+from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.ops.adam import Count
-from dyngs.state import Role, State, fields_moved_to, prefixed, with_role
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.renderable import Renderable, TimeStep
+from dyngs.models.views import background_colour
+from dyngs.state import Role, State, prefixed, with_role
+from dyngs.tensor_checks import require_moments
 
 S = TypeVar("S", bound="Scene")
 
 
 @dataclass(frozen=True)
-class Moment:
-    """A scene at one time.
+class GaussianTimeStep(TimeStep):
+    """Gaussians at one time.
 
     Attributes:
         gaussians: as they are drawn; differentiable where gradients are enabled.
@@ -49,7 +49,7 @@ class Moment:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene(ABC):
+class Scene(Renderable):
     """N Gaussians at any time.
 
     Attributes:
@@ -71,14 +71,15 @@ class Scene(ABC):
         return len(self.gaussians)
 
     @property
-    @abstractmethod
-    def times(self) -> tuple[float, ...]:
-        """Distinct times of training, or of the motion that is played, in [0, 1], ascending; empty without times."""
+    def device(self) -> torch.device:
+        return self.gaussians.means.device
 
     @property
-    @abstractmethod
-    def is_static(self) -> bool:
-        """Return whether ``at`` returns the same at every time."""
+    def bounds(self) -> Tensor:
+        """(2, 3) box of the finite centres at the first time; of a point at the origin where there are none."""
+        means = self.at(None).means
+        means = means[means.isfinite().all(1)]
+        return torch.stack([means.amin(0), means.amax(0)]) if len(means) else means.new_zeros(2, 3)
 
     @property
     @abstractmethod
@@ -119,49 +120,45 @@ class Scene(ABC):
         return 0 if self.masks is None else self.masks.bits.numel()
 
     @abstractmethod
-    def moment(self, time: float | None) -> Moment:
-        """Return the scene at ``time``, clamped to [0, 1]; None is the first moment.
-
-        Raises:
-            DyngsError: the time is NaN.
-        """
+    def time_step(self, time: float | None) -> GaussianTimeStep:
+        """Return the Gaussians at ``time``, clamped to [0, 1]; None is the first."""
 
     def at(self, time: float | None) -> Gaussians:
-        """Return the Gaussians at ``time``, as ``moment`` has them, without gradients."""
+        """Return the Gaussians at ``time``, as ``time_step`` has them, without gradients."""
         with torch.no_grad():
-            return self.moment(time).gaussians
+            return self.time_step(time).gaussians
 
-    def shader(self, moment: Moment) -> Shader | None:
-        """Return the shader of the Gaussians of ``moment``; None where harmonics give the colours."""
-        return None if self.colour is None else self.colour.shader(moment.time, moment.frame)
+    def shader(self, now: GaussianTimeStep) -> Shader | None:
+        """Return the shader of the Gaussians of a time; None where harmonics give the colours."""
+        return None if self.colour is None else self.colour.shader(now.time, now.frame)
 
     def render(
         self,
         cameras: Cameras,
-        time: float | Moment | None = None,
+        time: float | TimeStep | None = None,
         *,
         options: RenderOptions | None = None,
         background: Tensor | None = None,
         probe: Tensor | None = None,
-    ) -> Rendering:
+    ) -> GaussianRendering:
         """Return images of the scene; differentiable where gradients are enabled.
 
         Args:
             cameras: V cameras, on any device.
-            time: in [0, 1], or the moment itself, so that it is not computed again.
-            options: how to draw; None: as the scene wants to be drawn.
+            time: in [0, 1], or the Gaussians at a time, so that they are not computed again.
+            options: how to draw; None: as the scene is to be drawn.
             background: (3,) or (V, 3) colour; None: that of the scene.
             probe: (V, N, 4) zeros whose gradient is the densification signal.
 
         Raises:
             DyngsError: as ``dyngs.gaussians.rendering.render``.
         """
-        moment = time if isinstance(time, Moment) else self.moment(time)
+        now = time if isinstance(time, GaussianTimeStep) else self.time_step(_number(time))
         behind = self.background if background is None else background
-        how, device = self.options if options is None else options, moment.gaussians.means.device
+        how, device = self.options if options is None else options, now.gaussians.means.device
         if cameras.cam_from_world.device != device:
             cameras = cameras.to(device=device)
-        return render(moment.gaussians, cameras, how, background=behind, probe=probe, shader=self.shader(moment))
+        return render(now.gaussians, cameras, how, background=behind, probe=probe, shader=self.shader(now))
 
     @abstractmethod
     def edited(self: S, edit: TopologyEdit) -> S:
@@ -186,6 +183,9 @@ class Scene(ABC):
         """Return the scene with other values, or other leaf tensors, for the same Gaussians."""
         return replace(self, gaussians=gaussians)
 
+    def on_background(self: S, colour: Tensor) -> S:
+        return replace(self, background=colour)
+
     def changed(self) -> None:
         """Drop caches derived from tensors that have been changed in place."""
         self._derived.clear()
@@ -196,24 +196,38 @@ class Scene(ABC):
             "model", self._model_state() | ({} if self.colour is None else prefixed("colour", self.colour.state()))
         )
 
-    def drawing_state(self) -> State:
-        """Return the part of ``state`` that drawing needs, in an equivalent form where that is smaller."""
-        return {name: x for name, x in self.state().items() if x.role is not Role.TRAINING}
-
-    def to(self: S, device: torch.device | str) -> S:
-        """Return the scene with its tensors on ``device``."""
-        return fields_moved_to(self, device)
-
     @abstractmethod
     def _model_state(self) -> State:
         """Return the state of this kind of scene beside its Gaussians and colours."""
 
 
-def clamped_time(time: float | None) -> float:
-    """Return ``time`` within [0, 1]; None is 0. Raises DyngsError for NaN."""
-    if time is not None and math.isnan(time):
-        raise DyngsError("the time to draw is not a number; give one from 0 to 1")
-    return min(max(0.0 if time is None else time, 0.0), 1.0)
+def require_gaussians(scene: Renderable, what: str) -> Scene:
+    """Return ``scene`` if it is made of Gaussians.
+
+    Args:
+        scene: of any kind.
+        what: is not made of them, for the message.
+
+    Raises:
+        DyngsError: it is made of something else.
+    """
+    if not isinstance(scene, Scene):
+        raise DyngsError(f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed")
+    return scene
+
+
+def _number(time: float | TimeStep | None) -> float | None:
+    return time.time if isinstance(time, TimeStep) else time
+
+
+def drawn_as_trained(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
+    """Return a restored scene with the colours of the checkpoint, drawn as the model is.
+
+    Raises:
+        ValueError: the tensors of its colours do not fit together.
+    """
+    colour, background = network_of(checkpoint.part("model.colour")), background_colour(checkpoint.info.background)
+    return replace(scene, colour=colour, options=render_options(model), background=background)
 
 
 def render_options(model: SceneModel) -> RenderOptions:
@@ -227,78 +241,11 @@ def render_options(model: SceneModel) -> RenderOptions:
     )
 
 
-class SceneTraining(Protocol[S]):
-    """Training of a kind of scene: its images, what it learns beside the Gaussians, and when motion is frozen."""
+def times_state(times: tuple[float, ...]) -> State:
+    """Return the state of the training times, empty without any."""
+    return with_role({"times": torch.tensor(times, dtype=torch.float64, device="cpu")} if times else {}, Role.SHARED)
 
-    @property
-    def moves_by(self) -> tuple[str, str]:
-        """Name of what moves the Gaussians and the configuration section of its learning rates, for messages."""
-        ...
 
-    def trains_on(self, time: float | None, step: int) -> bool:
-        """Return whether an image of ``time`` may be trained on in ``step``; at each step some may."""
-        ...
-
-    def moment(self, scene: S, image: Image, step: int) -> Moment:
-        """Return the moment drawn for ``image`` in ``step``, with the penalties."""
-        ...
-
-    def optimize(self, scene: S, step: int) -> Count:
-        """Update, in place, what the scene learns beside its Gaussians and colours.
-
-        Returns:
-            the number of rows left out because their gradient was not finite.
-        """
-        ...
-
-    def learned(self, scene: S) -> Parameters | None:
-        """Return what the scene learns beside its Gaussians and colours; None: nothing."""
-        ...
-
-    def after_step(self, scene: S, step: int, edited: bool) -> S:
-        """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen.
-
-        Args:
-            scene: after the optimizers and the strategy.
-            step: that was done.
-            edited: the set of Gaussians has just changed.
-        """
-        ...
-
-    def revised(self, scene: S, step: int) -> tuple[S, EditResult] | None:
-        """Return the scene as its kind changes it after ``step``, and the edit of its Gaussians; None: it does not."""
-        ...
-
-    def window(self, step: int) -> tuple[float, float]:
-        """Return the first and last time that are trained on at ``step``."""
-        ...
-
-    def extend(self, scene: S, seen: tuple[float, float], step: int) -> None:
-        """Continue motion learned for the times in ``seen`` to those that are trained on at ``step``."""
-        ...
-
-    def all_moving(self, scene: S, extent: float) -> S:
-        """Return ``scene`` as expensive to draw as it may become: all Gaussians move, by an untrained field if need be.
-
-        Args:
-            scene: N Gaussians.
-            extent: of the scene, world units.
-        """
-        ...
-
-    def follow(self, edit: TopologyEdit) -> None:
-        """Let what the training itself keeps per Gaussian follow a change of the set."""
-        ...
-
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> S:
-        """Return the scene of a checkpoint, with colours and options of ``like``, and take over the training's state.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: the tensors do not fit together.
-        """
-        ...
-
-    def state(self) -> State:
-        """Return the tensors that a checkpoint must hold beside the scene."""
-        ...
+def stored_times(tensors: Mapping[str, Tensor]) -> tuple[float, ...]:
+    """Return the training times of a state. Raises ValueError for times that do not ascend within [0, 1]."""
+    return tuple(require_moments("times", tensors["times"]).tolist()) if "times" in tensors else ()

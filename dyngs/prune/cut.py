@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 
 from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
-from dyngs.conventions import SH_C0
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.scene import DynamicScene
-from dyngs.gaussians.colour.training import HELD_OUT_EVERY, AutoTraining
+from dyngs.gaussians.colour.training import HELD_OUT_EVERY
 from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
-from dyngs.gaussians.scene import Scene, render_options
+from dyngs.gaussians.scene import Scene
+from dyngs.kinds import GaussianTrainer
+from dyngs.models.views import background_colour
 from dyngs.ops.transfer import sent
 from dyngs.prune.stage import remove_
-from dyngs.training.background import background_colour
-from dyngs.training.trainer import Trainer
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def cut_config(config: Config, cut: Cut) -> Config:
     return config.model_copy(update={"model": model, "colour": colour, "prune": prune})
 
 
-def apply_cut(trainer: Trainer, cut: Cut, scores: Tensor) -> None:
+def apply_cut(trainer: GaussianTrainer, cut: Cut, scores: Tensor) -> None:
     """Take away what ``cut`` says from the scene of ``trainer``, which is at the end of its run.
 
     Args:
@@ -99,40 +98,29 @@ def apply_cut(trainer: Trainer, cut: Cut, scores: Tensor) -> None:
         scores: (N,) importance of its Gaussians.
     """
     trainer.config = cut_config(trainer.config, cut)
-    options = render_options(trainer.config.model)
-    trainer.options = replace(trainer.options, alpha_min=options.alpha_min)
-    trainer.scene = replace(trainer.scene, options=options)
+    trainer.model.draw_as(trainer.config.model)
     remove_(trainer, scores if cut.fraction else None)
     if cut.field is not None:
-        trainer.scene = with_field(trainer.scene, cut.field)
+        trainer.model.exchange(with_field(trainer.model.scene, cut.field))
     if cut.harmonics:
         _drop_harmonics(trainer, cut.harmonics)
-    trainer.scene.changed()
 
 
-def _drop_harmonics(trainer: Trainer, tolerance: float) -> None:
+def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     """Drop the harmonics of the Gaussians that need none, and keep them zero."""
     usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
     background = sent(background_colour(trainer.background), trainer.device)
     looks = list(_looks(trainer, judged, background))
-    found = find_view_dependent(_looks(trainer, seen, background), looks, trainer.options, background, tolerance)
-    base = trainer.scene.gaussians.sh.detach()[:, 0] + found.offsets / SH_C0
-    trainer.optimizer.drop_rest(base, ~found.keeps)
-    trainer.scene = trainer.scene.with_gaussians(trainer.optimizer.parameters)
-    colours = AutoTraining(
-        AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy),
-        trainer.config.train.steps,
-        len(trainer.images),
-    )
-    colours.freeze(~found.keeps)
-    trainer.colours = colours
+    found = find_view_dependent(_looks(trainer, seen, background), looks, trainer.model.options, background, tolerance)
+    trainer.model.drop_harmonics(~found.keeps, found.offsets)
+    trainer.model.keep_plain(~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy))
 
 
-def _looks(trainer: Trainer, indices: Sequence[int], background: Tensor) -> Iterator[MeasuredView]:
+def _looks(trainer: GaussianTrainer, indices: Sequence[int], background: Tensor) -> Iterator[MeasuredView]:
     """Yield training views as they are drawn now."""
     for image in (trainer.images[i] for i in indices):
         with torch.no_grad():
-            now = trainer.training.moment(trainer.scene, image, trainer.done).gaussians.detach()
+            now = trainer.model.training.time_step(trainer.model.scene, image, trainer.done).gaussians.detach()
         yield MeasuredView(now, image.cameras, image.composite(background), image.mask)

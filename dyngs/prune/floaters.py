@@ -15,10 +15,10 @@ from torch import Tensor
 
 from dyngs.config import StaticModel
 from dyngs.gaussians.rendering import contributions
-from dyngs.training.background import background_colour
+from dyngs.kinds import GaussianTrainer
+from dyngs.models.views import background_colour
 from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
-from dyngs.training.trainer import Trainer
 
 MAIN_FRACTION = 0.5
 """Fraction of the weight of a Gaussian that must lie in one view."""
@@ -37,7 +37,7 @@ FEWEST_VIEWS, MOST = 20, 0.01
 class FloaterRemoval:
     """Listener that removes floaters when training ends, if that is asked for; static scenes only."""
 
-    def __init__(self, loop: Loop, trainer: Callable[[], Trainer]) -> None:
+    def __init__(self, loop: Loop, trainer: Callable[[], GaussianTrainer]) -> None:
         self._loop, self._trainer = loop, trainer
 
     def __call__(self, event: Event) -> None:
@@ -53,23 +53,23 @@ class FloaterRemoval:
                 found = floaters(trainer)
             case _:
                 return
-        before, count = len(trainer.scene), int(found.sum())
+        before, count = len(trainer.model.scene), int(found.sum())
         if not count:
             return
         fraction = f"{count:,} of {before:,} Gaussians hang close before single cameras"
         if count > MOST * before:
             self._loop.tell(Message(f"{fraction}: too many to be floaters, none is removed"))
             return
-        trainer.keep(~found)
+        trainer.model.keep(~found, trainer.done)
         self._loop.tell(Message(f"{fraction}: removed (train.remove_floaters)"))
-        self._loop.tell(TopologyChanged(step, before, len(trainer.scene)))
+        self._loop.tell(TopologyChanged(step, before, len(trainer.model.scene)))
 
 
 @torch.no_grad()
-def floaters(trainer: Trainer) -> Tensor:
+def floaters(trainer: GaussianTrainer) -> Tensor:
     """Return (N,) bool which Gaussians of a static scene are floaters, by all of its training views."""
-    scene, background = trainer.scene, background_colour(trainer.background)
-    gaussians, options = scene.gaussians.detach(), replace(trainer.options, depth="expected", absgrad=False)
+    scene, background = trainer.model.scene, background_colour(trainer.background)
+    gaussians, options = scene.gaussians.detach(), replace(trainer.model.options, depth="expected", absgrad=False)
     total, most = torch.zeros_like(gaussians.logit_opacities), torch.zeros_like(gaussians.logit_opacities)
     nearness = torch.full_like(total, torch.inf)
     for camera in trainer.images.cameras():
@@ -77,7 +77,7 @@ def floaters(trainer: Trainer) -> Tensor:
         drawn = scene.render(small, None, options=options, background=background)
         assert drawn.depth is not None
         depths = drawn.depth[0][drawn.alpha[0] > SOLID]
-        weight = contributions(gaussians, small, trainer.options)[0]
+        weight = contributions(gaussians, small, trainer.model.options)[0]
         pose = small.cam_from_world[0]
         depth = depths.median() if depths.numel() else depths.new_zeros(())
         is_main = weight > most

@@ -93,7 +93,7 @@ def importance(views: ScoringViews, *, slopes: bool) -> Importance:
     scene, options, behind = views.scene, views.options, views.background
     fractions, opacities, volumes, squares = [], [], [], torch.zeros((), device=behind.device)
     for time in views.times:
-        moment = scene.moment(time)
+        moment = scene.time_step(time)
         now = moment.gaussians
         sums = [contributions(now, camera, options)[0] for camera in views.cameras]
         fractions.append(torch.stack(sums).sum(0))

@@ -24,11 +24,11 @@ from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import GaussianTrainer
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
 from dyngs.prune.stage import PROBED_VIEWS, chosen_scores, probe_images, quality_of
 from dyngs.storage.measure import CoarseFile, coarsest_file
-from dyngs.training.state import Checkpoint
-from dyngs.training.trainer import Trainer
 
 HELD_OUT_FRACTION, MOST_HELD_OUT = 1 / 8, 32
 """Fraction and number of the training views that are held out; the number also limits those never trained on."""
@@ -137,11 +137,11 @@ class Search:
         unseen: images that the run was never trained on; without any, training views are held out.
     """
 
-    def __init__(self, trainer: Trainer, start: Checkpoint, tell: Tell, unseen: Sequence[Image] = ()) -> None:
+    def __init__(self, trainer: GaussianTrainer, start: Checkpoint, tell: Tell, unseen: Sequence[Image] = ()) -> None:
         self.trainer, self.start, self.tell = trainer, start, tell
         self.held_out = () if unseen else evenly_held_out(len(trainer.images))
         self.trials = 0
-        self._begin = trainer.config, trainer.options, trainer.colours
+        self._begin = trainer.config, trainer.model.colours
         trainer.held_out = frozenset(self.held_out)
         self._scores = chosen_scores(trainer)
         self._truths = list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
@@ -153,8 +153,8 @@ class Search:
     def run(self, max_loss: float) -> Found:
         """Return what can be taken away for ``max_loss``, dB."""
         self._restart()
-        config, exact = self._begin[0], quality_of(self.trainer, self.trainer.scene, self._truths)
-        self._exact_trained = quality_of(self.trainer, self.trainer.scene, self._others())
+        config, exact = self._begin[0], quality_of(self.trainer, self.trainer.model.scene, self._truths)
+        self._exact_trained = quality_of(self.trainer, self.trainer.model.scene, self._others())
         accepted, limits = [Candidate(Cut(), config, self.start, self.trainer.num_gaussians, exact, 0.0)], []
         self._reference = exact if self._is_fair else self._fine_tuned()
         how = "" if self._is_fair else ", fine-tuned on the others"
@@ -171,9 +171,9 @@ class Search:
     def _fine_tuned(self) -> float:
         """Return the PSNR of the run as it is, fine-tuned; what fine-tuning costs views that it trains on is added."""
         trainer, probes = self.trainer, self._others()
-        before = quality_of(trainer, trainer.scene, probes)
+        before = quality_of(trainer, trainer.model.scene, probes)
         psnr = self._tried(Cut()).psnr
-        cost = before - quality_of(trainer, trainer.scene, probes)
+        cost = before - quality_of(trainer, trainer.model.scene, probes)
         if cost > 0:
             self.tell(f"fine-tuning alone costs {cost:.2f} dB, which counts as lost: more --steps may cost less")
         return psnr + max(cost, 0.0)
@@ -201,8 +201,7 @@ class Search:
 
     def _quality(self, scene: Scene) -> float:
         """Return the mean PSNR of the views that count, drawn of ``scene`` as it wants to be drawn, dB."""
-        self.trainer.options = replace(self.trainer.options, alpha_min=scene.options.alpha_min)
-        return quality_of(self.trainer, scene, self._truths)
+        return quality_of(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
 
     def _knobs(self) -> dict[str, Callable[[Cut], Sequence[tuple[str, Cut]]]]:
         """Return for each kind of thing the steps of taking it away, beyond a cut, the mildest first."""
@@ -241,16 +240,19 @@ class Search:
         end = trainer.config.train.steps + trainer.config.prune.steps
         while trainer.done < end:
             trainer.step()
-        psnr = quality_of(trainer, trainer.scene, self._truths)
-        trained_loss = self._exact_trained - quality_of(trainer, trainer.scene, self._others())
+        psnr = quality_of(trainer, trainer.model.scene, self._truths)
+        trained_loss = self._exact_trained - quality_of(trainer, trainer.model.scene, self._others())
         end_state = trainer.checkpoint()
-        return Candidate(cut, trainer.config, end_state, len(trainer.scene), psnr, self._reference - psnr, trained_loss)
+        return Candidate(
+            cut, trainer.config, end_state, len(trainer.model.scene), psnr, self._reference - psnr, trained_loss
+        )
 
     def _restart(self) -> None:
         trainer = self.trainer
-        trainer.config, trainer.options, trainer.colours = self._begin
+        trainer.config, trainer.model.colours = self._begin
+        trainer.model.draw_as(trainer.config.model)
         trainer.restore(self.start)
-        trainer.scene = trainer.scene.unmasked()
+        trainer.model.exchange(trainer.model.scene.unmasked())
 
     def _fewer_gaussians(self, so_far: Cut) -> Sequence[tuple[str, Cut]]:
         count = len(self._scores)
@@ -266,15 +268,15 @@ class Search:
         """Return sizes at which fewer pieces, and fewer nodes, cost as much each before fine-tuning."""
         self._restart()
         trainer = self.trainer
-        whole = field_size(trainer.scene)
+        whole = field_size(trainer.model.scene)
         if whole is None:
             return []
         images = self._others()
         at_most: list[FieldSize] = []
-        exact = quality_of(trainer, trainer.scene, images)
+        exact = quality_of(trainer, trainer.model.scene, images)
 
         def loss(size: FieldSize) -> float:
-            return exact - quality_of(trainer, with_field(trainer.scene, size), images)
+            return exact - quality_of(trainer, with_field(trainer.model.scene, size), images)
 
         pieces = {n: loss(FieldSize(whole.nodes, n)) for n in _halved(whole.pieces, 1)}
         nodes = {n: loss(FieldSize(n, whole.pieces)) for n in _halved(whole.nodes, FEWEST_NODES)}

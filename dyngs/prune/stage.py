@@ -17,19 +17,17 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import PruneConfig
-from dyngs.config.kinds import field_of
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
+from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
+from dyngs.models.views import background_colour
 from dyngs.ops.transfer import sent
 from dyngs.prune.score import Importance, ScoringViews, highest, importance
-from dyngs.static.fixed import FixedDensifier
-from dyngs.training.background import background_colour
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
-from dyngs.training.trainer import Trainer
 
 MOVING_VIEWS, MOVING_TIMES = 8, 24
 """Numbers of training cameras and times whose pairs are scored in dynamic scenes."""
@@ -66,7 +64,7 @@ class Pruned:
 class PruneStage:
     """Listener that prunes when training ends and fine-tuning begins."""
 
-    def __init__(self, loop: Loop, trainer: Callable[[], Trainer]) -> None:
+    def __init__(self, loop: Loop, trainer: Callable[[], GaussianTrainer]) -> None:
         self._loop, self._trainer = loop, trainer
 
     def __call__(self, event: Event) -> None:
@@ -79,12 +77,12 @@ class PruneStage:
 
 
 @torch.no_grad()
-def prune_(trainer: Trainer) -> Pruned:
+def prune_(trainer: GaussianTrainer) -> Pruned:
     """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their number stays."""
-    trainer.scene = trainer.scene.unmasked()
-    before, whole = len(trainer.scene), training_quality(trainer, trainer.scene)
+    trainer.model.exchange(trainer.model.scene.unmasked())
+    before, whole = len(trainer.model.scene), training_quality(trainer, trainer.model.scene)
     remove_(trainer, chosen_scores(trainer) if trainer.config.prune.fraction > 0 else None)
-    scene, active = trainer.scene, 1.0
+    scene, active = trainer.model.scene, 1.0
     loss = whole - training_quality(trainer, scene.unmasked())
     if scene.masks is not None:
         masks = scene.masks
@@ -93,23 +91,24 @@ def prune_(trainer: Trainer) -> Pruned:
 
 
 @torch.no_grad()
-def remove_(trainer: Trainer, scores: Tensor | None) -> None:
+def remove_(trainer: GaussianTrainer, scores: Tensor | None) -> None:
     """Leave all but the fraction ``prune.fraction`` with the lowest ``scores`` (N,), and mask them if requested."""
     options = trainer.config.prune
-    whole = trainer.scene = trainer.scene.unmasked()
+    whole = trainer.model.scene.unmasked()
+    trainer.model.exchange(whole)
     kept = torch.ones(len(whole), dtype=torch.bool, device=whole.gaussians.means.device)
     if scores is not None:
         kept = highest(scores, options.fraction)
-        trainer.keep(kept)
-    trainer.densifier = FixedDensifier()
-    if options.mask_times > 1 and field_of(trainer.config) is not None and not whole.is_static:
-        trainer.scene = replace(trainer.scene, masks=_masks(trainer, whole, kept))
+        trainer.model.keep(kept, trainer.done)
+    trainer.model.stop_growing()
+    if options.mask_times > 1 and trainer.config.model.may_move and not whole.is_static:
+        trainer.model.exchange(replace(trainer.model.scene, masks=_masks(trainer, whole, kept)))
 
 
 @torch.no_grad()
-def chosen_scores(trainer: Trainer) -> Tensor:
+def chosen_scores(trainer: GaussianTrainer) -> Tensor:
     """Return (N,) the score that the configuration asks for."""
-    options, scene = trainer.config.prune, trainer.scene.unmasked()
+    options, scene = trainer.config.prune, trainer.model.scene.unmasked()
     return scores_of(importance(scoring_views(trainer, scene), slopes=options.score == "sensitivity"), options)
 
 
@@ -125,9 +124,9 @@ def scores_of(found: Importance, options: PruneConfig) -> Tensor:
 
 
 @torch.no_grad()
-def default_scores(trainer: Trainer) -> Tensor:
+def default_scores(trainer: GaussianTrainer) -> Tensor:
     """Return (N,) how much each Gaussian matters now: the first score of docs/prune.md."""
-    scene = trainer.scene.unmasked()
+    scene = trainer.model.scene.unmasked()
     return scores_of(importance(scoring_views(trainer, scene), slopes=True), PruneConfig())
 
 
@@ -141,31 +140,34 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
     return [different[i] for i in evenly_spaced(len(different), count)]
 
 
-def scoring_views(trainer: Trainer, scene: Scene, times: Sequence[float | None] | None = None) -> ScoringViews:
+def scoring_views(trainer: GaussianTrainer, scene: Scene, times: Sequence[float | None] | None = None) -> ScoringViews:
     """Return all pairs of some training cameras and some times; with no times all that matters are cameras."""
     background = background_colour(trainer.background)
     if times is None:
         times = [None] if scene.is_static else [scene.times[i] for i in evenly_spaced(len(scene.times), MOVING_TIMES)]
     views = STILL_VIEWS if scene.is_static else MOVING_VIEWS
     cameras = distinct_cameras(trainer.images.cameras(), views)
-    return ScoringViews(scene, cameras, times, trainer.options, background)
+    return ScoringViews(scene, cameras, times, trainer.model.options, background)
 
 
 @torch.no_grad()
-def training_quality(trainer: Trainer, scene: Scene) -> float:
+def training_quality(trainer: GaussianTrainer, scene: Scene) -> float:
     """Return the mean PSNR of at most 16 training images drawn of ``scene``, dB."""
     return quality_of(trainer, scene, probe_images(trainer))
 
 
-def probe_images(trainer: Trainer) -> list[Image]:
+def probe_images(trainer: GaussianTrainer) -> list[Image]:
     """Return at most 16 training images, evenly chosen."""
     return [trainer.images[i] for i in evenly_spaced(len(trainer.images), PROBED_VIEWS)]
 
 
 @torch.no_grad()
-def quality_of(trainer: Trainer, scene: Scene, images: Sequence[Image]) -> float:
-    """Return the mean PSNR of ``images`` drawn of ``scene``, dB."""
-    background, options = sent(background_colour(trainer.background), trainer.device), trainer.options
+def quality_of(
+    trainer: GaussianTrainer, scene: Scene, images: Sequence[Image], alpha_min: float | None = None
+) -> float:
+    """Return the mean PSNR of ``images`` drawn of ``scene``, dB; ``alpha_min`` instead of that of training."""
+    background, options = sent(background_colour(trainer.background), trainer.device), trainer.model.options
+    options = options if alpha_min is None else replace(options, alpha_min=alpha_min)
     scene, values = scene.to(trainer.device), []
     for image in images:
         drawn = scene.render(image.cameras, image.time, options=options, background=background).rgb[0]
@@ -173,7 +175,7 @@ def quality_of(trainer: Trainer, scene: Scene, images: Sequence[Image]) -> float
     return fmean(values)
 
 
-def _masks(trainer: Trainer, scene: Scene, kept: Tensor) -> VisibilityMasks:
+def _masks(trainer: GaussianTrainer, scene: Scene, kept: Tensor) -> VisibilityMasks:
     """Return at which of evenly spaced key times each Gaussian kept is seen from any of the survey's cameras."""
     options, last = trainer.config.prune, len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel
-from dyngs.config.kinds import person_of
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
@@ -28,10 +27,10 @@ from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, requir
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.motion.placement import rest_clip
 from dyngs.human.template.body_reader import template_path
+from dyngs.models.views import background_colour
 from dyngs.runs.checkpoint import LoadedRun, info_of
 from dyngs.runs.inputs import inputs_of
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
-from dyngs.training.background import background_colour
 
 SUFFIX = ".safetensors"
 
@@ -66,8 +65,8 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
     Raises:
         DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
     """
-    scene, model = avatar_of(run.scene), person_of(run.config)
-    if scene is None or model is None:
+    scene, model = avatar_of(run.scene), run.config.model
+    if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
             f"--format avatar needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
         )

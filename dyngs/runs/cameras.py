@@ -7,9 +7,9 @@ from pathlib import Path
 
 from dyngs.data.capture import View
 from dyngs.errors import reading
+from dyngs.models.checkpoint import OTHER_CONFIG
 from dyngs.runs.checkpoint import LoadedRun, checkpoint_paths, latest_checkpoint
 from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
-from dyngs.training.state import OTHER_CONFIG
 
 
 def found_corrections(run_dir: Path, run: LoadedRun, trained_on: Sequence[View]) -> CameraCorrections | None:

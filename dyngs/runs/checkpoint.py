@@ -17,17 +17,17 @@ from typing import Any
 
 import torch
 
-from dyngs.build import restored_scene
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.config.kinds import network_of
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, as_word, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.kinds import restored_model
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.renderable import Renderable
 from dyngs.storage.file import read_scene
-from dyngs.training.state import Checkpoint, CheckpointInfo
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
@@ -43,15 +43,24 @@ class LoadedRun:
     """A trained model, ready to be drawn.
 
     Attributes:
-        scene: what is drawn at any time.
+        renderable: what is drawn at any time.
         step, seconds_train: how far and how long it was trained (0 s where ``timing.json`` is lost).
     """
 
     config: Config
-    scene: Scene
+    renderable: Renderable
     step: int
     seconds_train: float
     info: CheckpointInfo
+
+    @property
+    def scene(self) -> Scene:
+        """Its scene of Gaussians.
+
+        Raises:
+            DyngsError: it is made of something else.
+        """
+        return require_gaussians(self.renderable, f"a run of model.kind={self.config.model.kind}")
 
 
 def checkpoint_paths(run_dir: Path) -> list[Path]:
@@ -138,12 +147,12 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
     ``data_root`` is where its capture lies by now, if that was moved.
     """
     config = load_resolved(run_dir, data_root=data_root)
-    if network_of(config) is not None:
+    if config.model.is_network:
         raise DyngsError(
             f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
         )
     checkpoint = _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
-    scene = restored_scene(checkpoint, config.model)
+    scene = restored_model(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
 

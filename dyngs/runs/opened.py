@@ -14,7 +14,6 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.camera_paths.aim import up_direction
 from dyngs.config import Config, DataConfig, HumanModel, StaticModel
-from dyngs.config.kinds import person_of
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
@@ -24,6 +23,9 @@ from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion import placement
 from dyngs.human.motion.clip import captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
+from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.models.renderable import Renderable
+from dyngs.models.views import background_colour, training_cameras
 from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
@@ -31,9 +33,6 @@ from dyngs.splats.formats import all_suffixes, known_format, read_splats
 from dyngs.splats.rotation import AXES
 from dyngs.splats.splat_file import Nonfinite, SplatFile, splat_options
 from dyngs.static.scene import StaticScene
-from dyngs.training.background import background_colour
-from dyngs.training.state import CheckpointInfo
-from dyngs.training.views import training_cameras
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""
@@ -136,7 +135,7 @@ class Opened(LoadedRun):
     @property
     def background(self) -> Tensor:
         """(3,) colour behind the scene: that of training, black where that was random."""
-        own = self.scene.background
+        own = self.renderable.background
         return torch.zeros(3, device="cpu") if own is None else own
 
     @property
@@ -147,7 +146,7 @@ class Opened(LoadedRun):
     @property
     def person(self) -> HumanScene | None:
         """The scene if it is of a person."""
-        return avatar_of(self.scene)
+        return avatar_of(self.renderable)
 
     @property
     def up(self) -> tuple[np.ndarray, str] | None:
@@ -162,7 +161,7 @@ class Opened(LoadedRun):
     @property
     def seconds(self) -> float:
         """Seconds that pass from time 0 to 1: as the capture or the motion says, else 30 frames a second."""
-        frames = max(len(self.scene.times), 1)
+        frames = max(len(self.renderable.times), 1)
         if self.fps is not None:
             return max(frames / self.fps, SHORTEST)
         known = None if self.in_training or self.missing else self.capture.seconds
@@ -174,17 +173,17 @@ class Opened(LoadedRun):
             self._kept[name] = compute()
         return self._kept[name]
 
-    def showing(self, scene: Scene) -> Opened:
+    def showing(self, scene: Renderable) -> Opened:
         """Return the same with another scene."""
-        return replace(self, scene=scene)
+        return replace(self, renderable=scene)
 
     def to(self, device: torch.device | str) -> Opened:
         """Return the same with its scene on ``device``, which then draws it."""
-        return self.showing(self.scene.to(device))
+        return self.showing(self.renderable.to(device))
 
     def on_background(self, name: str) -> Opened:
         """Return the same before a "white" or "black" background."""
-        return self.showing(replace(self.scene, background=background_colour(name)))
+        return self.showing(self.renderable.on_background(background_colour(name)))
 
     def noted(self, *notes: str) -> Opened:
         """Return the same with more notes."""
@@ -216,7 +215,7 @@ class Opened(LoadedRun):
         else:
             clip = placement.place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         playing = scene.playing(clip).to(person.gaussians.means.device)
-        return replace(self, scene=playing, fps=motion.fps, as_captured=False)
+        return replace(self, renderable=playing, fps=motion.fps, as_captured=False)
 
     def at_rest(self) -> Opened:
         """Return the same with its person in the rest pose of the template, upright on the floor.
@@ -226,11 +225,11 @@ class Opened(LoadedRun):
         """
         scene, _ = self._person_for("--pose rest")
         rest = placement.rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-        return replace(self, scene=scene.playing(rest), as_captured=False)
+        return replace(self, renderable=scene.playing(rest), as_captured=False)
 
     def _person_for(self, wanted: str) -> tuple[HumanScene, HumanModel]:
-        model = person_of(self.config)
-        if self.person is None or model is None:
+        model = self.config.model
+        if self.person is None or not isinstance(model, HumanModel):
             kind = self.config.model.kind
             raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {kind}")
         return self.person, model
@@ -298,17 +297,17 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
     raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
 
 
-def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Scene:
+def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
     """Return the scene of a run as the views of ``split`` show it: a person plays the clip of that split.
 
     The split pose, and splits with body parameters of their own, have the poses of their files. Others show the clip of
     training with its refined poses, interpolated at times between.
     """
-    avatar = avatar_of(run.scene)
+    avatar = avatar_of(run.renderable)
     if avatar is None or capture.body is None:
-        return run.scene
+        return run.renderable
     own, trained = capture.body[cast(Split, split)], capture.body["train"]
     if split != "pose" and same_bodies(own, trained):
-        return run.scene
+        return run.renderable
     shown = captured_motion(capture.root, own, split_views(capture, split), avatar.skeleton.joints)
     return avatar.playing(shown.clip)

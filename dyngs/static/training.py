@@ -2,43 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 from torch import Tensor
 
-from dyngs.camera import Cameras
-from dyngs.data.loader import Image
-from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.scene import Moment, Scene
-from dyngs.state import State
-from dyngs.static.filters import filter_std
+from dyngs.config import StaticModel
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.model import GaussianModel, SceneTraining
+from dyngs.gaussians.scene import drawn_as_trained
+from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import Kind, Setting
 from dyngs.static.scene import StaticScene
 
 
-class FilterUpdate:
-    """Recomputation of Mip-Splatting's 3D filter at given steps.
-
-    Args:
-        cameras: the training cameras; none: there is no filter.
-        steps: steps after which it is, besides those that change the set of Gaussians.
-    """
-
-    def __init__(self, cameras: Sequence[Cameras] = (), steps: range = range(0)) -> None:
-        self.cameras, self.steps = cameras, steps
-
-    def of(self, gaussians: Gaussians) -> Tensor | None:
-        """Return the filter (N,) of the Gaussians; None where there is none."""
-        return filter_std(gaussians.means, self.cameras) if self.cameras else None
-
-    def is_due(self, step: int, edited: bool) -> bool:
-        return bool(self.cameras) and (edited or step in self.steps)
-
-
-class StaticTraining:
+class StaticTraining(SceneTraining[StaticScene]):
     """See ``SceneTraining``; nothing is learned beside the Gaussians and their colours."""
-
-    moves_by = ("", "")
 
     def __init__(self, update: FilterUpdate) -> None:
         self._update = update
@@ -47,46 +28,26 @@ class StaticTraining:
         """Return the scene of the first Gaussians."""
         return StaticScene(gaussians=gaussians, filter_std=self._update.of(gaussians))
 
-    def trains_on(self, time: float | None, step: int) -> bool:
-        """Return true: every image, always."""
-        return True
-
-    def window(self, step: int) -> tuple[float, float]:
-        """Return [0, 1]: all times, always."""
-        return 0.0, 1.0
-
-    def extend(self, scene: Scene, seen: tuple[float, float], step: int) -> None:
-        """Do nothing: all times are trained on."""
-
-    def moment(self, scene: Scene, image: Image, step: int) -> Moment:
-        return scene.moment(image.time)
-
-    def optimize(self, scene: Scene, step: int) -> int:
-        """Return 0: the scene learns nothing beside its Gaussians."""
-        return 0
-
-    def learned(self, scene: Scene) -> None:
-        """Return None, as ``optimize`` says."""
-
     def after_step(self, scene: StaticScene, step: int, edited: bool) -> StaticScene:
         if self._update.is_due(step, edited):
             return replace(scene, filter_std=self._update.of(scene.gaussians))
         return scene
 
-    def revised(self, scene: Scene, step: int) -> tuple[Scene, EditResult] | None:
-        """Return None: the set of Gaussians is left to the strategy."""
-        return None
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
+        return StaticScene.restored(gaussians, tensors)
 
-    def all_moving(self, scene: StaticScene, extent: float) -> StaticScene:
-        """Return ``scene``: nothing moves."""
-        return scene
 
-    def follow(self, edit: TopologyEdit) -> None:
-        """Do nothing: nothing is kept per Gaussian."""
+def start(setting: Setting) -> GaussianModel:
+    """Return the model of a static scene before its first step."""
+    gaussians = first_gaussians(setting)
+    colours, training = colours_of(setting, gaussians, sees_time=False), StaticTraining(filter_update(setting))
+    return GaussianModel(setting, training.first_scene(gaussians), training, densifier_of(setting), colours)
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> StaticScene:
-        scene = StaticScene.restored(gaussians, tensors)
-        return replace(scene, colour=like.colour, options=like.options, background=like.background)
 
-    def state(self) -> State:
-        return {}
+def restore(model: StaticModel, checkpoint: Checkpoint) -> StaticScene:
+    """Return the scene of a checkpoint."""
+    scene = StaticScene.restored(Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
+    return drawn_as_trained(scene, model, checkpoint)
+
+
+KIND = Kind(StaticModel, start, restore)

@@ -10,7 +10,6 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from dyngs.build import restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import Config
 from dyngs.data.capture import Capture, View
@@ -19,6 +18,9 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import Scene, render_options
+from dyngs.kinds import restored_scene
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.storage.file import SceneInfo, decoded, encoded
 from dyngs.storage.precision import (
     GREY_LEVELS,
@@ -30,9 +32,6 @@ from dyngs.storage.precision import (
 )
 from dyngs.storage.quantize import step_below
 from dyngs.storage.tensors import COARSENESS, completed, drawable
-from dyngs.training.background import evaluation_background
-from dyngs.training.state import Checkpoint
-from dyngs.training.views import training_cameras
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""

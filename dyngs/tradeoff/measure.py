@@ -13,8 +13,8 @@ from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.evaluate.drawing import Drawing, seconds_in_turn
-from dyngs.evaluate.report import render_options
 from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import render_options
 from dyngs.metrics import Lpips, psnr, ssim
 from dyngs.tradeoff.measurements import Quartiles, Speed
 from dyngs.tradeoff.variants import Variant

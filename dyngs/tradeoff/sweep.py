@@ -25,7 +25,9 @@ from dyngs.errors import DyngsError, counted
 from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.files.write import write_text
+from dyngs.gaussians.scene import require_gaussians
 from dyngs.metrics import load_lpips
+from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
@@ -36,7 +38,6 @@ from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
 from dyngs.tradeoff.variants import Variant, Variation, single_changes
-from dyngs.training.background import evaluation_background
 from dyngs.training.processes import numbers_of_torchrun
 
 TIMED_VIEWS = 8
@@ -137,9 +138,9 @@ def sweep(
     load_resolved(runs.run_dir)  # what is no run is refused before anything else
     inputs_of(runs.run_dir).require_output(runs.out)
     with MemoryMeter() as meter:
+        own = run_settings(runs.run_dir)  # refuses what cannot be varied before anything is written
         session = _Session(runs, plan, meter, log)
         _require_same_source(runs, plan, is_first=group.is_first)
-        own = run_settings(runs.run_dir)
         idle = [v.setting.name for v in plan.variations if not any(own.allows(v.setting, value) for value in v.values)]
         if idle and group.is_first:
             log(f"nothing to vary in this run: {', '.join(idle)}")
@@ -187,7 +188,7 @@ class _Session:
             psnr=quality.psnr,
             ssim=quality.ssim,
             lpips=quality.lpips,
-            num_gaussians=len(drawing.scene),
+            num_gaussians=len(require_gaussians(drawing.scene, variant.slug)),
             mb=megabytes_on_disk(folder),
             memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background)
             if self._plan.device == CPU
@@ -217,7 +218,8 @@ class _Session:
 
     def _drawing(self, variant: Variant) -> Drawing:
         run = load_run(self._runs.folder(variant))
-        scene = scene_of_split(run, self._capture, self._plan.split).to(self._plan.device)
+        scene = require_gaussians(scene_of_split(run, self._capture, self._plan.split), variant.slug)
+        scene = scene.to(self._plan.device)
         return Drawing(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
 
     def _images(self, count: int) -> list[Image]:

@@ -8,14 +8,13 @@ from pathlib import Path
 
 from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores, train
-from dyngs.build import assemble, restored_scene
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
-from dyngs.config.kinds import field_of, network_of
 from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import num_bytes_exact, write_scene_file
+from dyngs.kinds import assemble, restored_scene
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.stage import prune_
 from dyngs.runs.checkpoint import (
@@ -99,7 +98,7 @@ class VariantRuns:
         out = self.out / "training" / wanted.slug
         run = load_resolved(self.run_dir)
         changes = [*field_changes(run, wanted)]
-        if field_of(run) is not None:  # a variant is what it says: nothing is chosen, and it stays a moving scene
+        if run.model.may_move:  # a variant is what it says: nothing is chosen, and it stays a moving scene
             changes += ["model.choose=false"]
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
@@ -135,10 +134,10 @@ def run_settings(run_dir: Path) -> RunSettings:
     if has_only_scene_file(run_dir):
         raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from")
     config = load_resolved(run_dir)
-    if network_of(config) is not None:
-        raise DyngsError(f"{run_dir}: a network, not a scene; vary what it predicts")
+    if not config.model.made_of_gaussians:
+        raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to vary")
     scene = load_run(run_dir).scene
-    model, moves_by = config.model, field_of(config)
+    model = config.model
     return RunSettings(
         sh_degree=scene.gaussians.sh_degree,
         mode=model.rasterize_mode.value,
@@ -146,7 +145,7 @@ def run_settings(run_dir: Path) -> RunSettings:
         transmittance_min=model.transmittance_min,
         mask_times=config.prune.mask_times,
         colour=config.colour.kind,
-        field=None if moves_by is None or scene.is_static else moves_by.kind,
+        field=model.deform.kind if isinstance(model, DynamicModel) and not scene.is_static else None,
     )
 
 
@@ -185,9 +184,9 @@ def _pruning_overrides(wanted: Variant, own: PruneConfig) -> Sequence[str]:
 
 def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
     """Yield overrides for a field of another kind, which moves the same attributes, or of another size."""
-    field = field_of(config)
-    if field is None:
+    if not isinstance(config.model, DynamicModel):
         return
+    field = config.model.deform
     kind = wanted.field or field.kind
     if kind != field.kind:
         moves = FieldSection.model_fields

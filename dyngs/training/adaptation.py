@@ -11,9 +11,9 @@ from torch import Tensor
 from dyngs.config import Config, HumanPredictorModel
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.prediction.network import AtlasNetwork, predict_gaussians
-from dyngs.static.rates import Rates
-from dyngs.training.background import evaluation_background
+from dyngs.models.views import evaluation_background
 from dyngs.training.prediction import MAX_GRADIENT, Filmed, human_options, image_loss, scene_of
 
 _RATE = 1e-4
@@ -52,7 +52,7 @@ def adapt_network(
         scene = scene_of(human, avatar, Rates(1))[0]
         total = torch.zeros((), device=mean.device)
         for image in images:
-            moment = scene.moment(image.time)
+            moment = scene.time_step(image.time)
             rendering = scene.render(image.cameras, moment, options=options, background=background)
             total = total + image_loss(rendering, image, image.composite(background), config) / len(images)
         optimizer.zero_grad(set_to_none=True)

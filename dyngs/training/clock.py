@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from dyngs.config import Config
-from dyngs.training.schedule import image_divisor, motion_begins_after, scaled
+from dyngs.deform.schedule import motion_begins_after
+from dyngs.models.schedule import image_divisor, scaled
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 18.0, 300.0, 9e-4
 """Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two cores."""

@@ -9,19 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dyngs.config import Config, DynamicModel, HumanModel, TrainConfig
-from dyngs.config.kinds import network_of
+from dyngs.deform.schedule import deform_schedule, motion_begins_after
 from dyngs.deform.training import DeformSchedule
 from dyngs.errors import DyngsError
-from dyngs.static.rates import Rates
+from dyngs.gaussians.schedule import Rates, means_rate, rates_of
+from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 from dyngs.training.corrections.exposure import WARM_UP
-from dyngs.training.schedule import (
-    PUBLISHED_STEPS,
-    deform_schedule,
-    means_rate,
-    motion_begins_after,
-    rates_of,
-    scaled,
-)
 
 
 @dataclass(frozen=True)
@@ -96,7 +89,7 @@ def told(before: Config, after: Config, done: int) -> str:
     """Return the line that says how a run goes on after ``done`` steps."""
     was, steps = before.train.steps, after.train.steps
     line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {steps:,} steps"
-    if network_of(after) is not None:
+    if not after.model.made_of_gaussians:
         return line
     then, now = (means_rate(c.optim, rates_of(c).progress(done), 1.0) for c in (before, after))
     stop = scaled(after.strategy.stop, steps)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.config import Config, DeformField, HumanModel, HumanPredictorModel
-from dyngs.config.kinds import added_for_motion, field_of, network_of, person_of, stored_sh_degree
+from dyngs.config import Config, DeformField, DynamicModel
 from dyngs.conventions import num_sh_terms
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
@@ -28,18 +27,16 @@ FEWEST = 500
 
 def require_possible(config: Config) -> None:
     """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
-    match config.model:
-        case HumanModel() | HumanPredictorModel() if config.camera.refine == "always":
-            raise DyngsError("camera.refine: cameras of people are not refined, their poses are; leave it out")
-        case _:
-            pass
+    if config.model.is_posed and config.camera.refine == "always":
+        raise DyngsError("camera.refine: cameras of people are not refined, their poses are; leave it out")
     _require_batch(config)
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]
-    if given and network_of(config) is not None:
-        raise DyngsError(f"budget.{given[0]}: a network has no budget; leave it out")
-    if config.train.minutes is not None and network_of(config) is not None:
-        raise DyngsError("train.minutes: a network is trained for train.steps; leave it out")
+    if given and not config.model.made_of_gaussians:
+        kind = config.model.kind
+        raise DyngsError(f"budget.{given[0]}: model.kind={kind} has no Gaussians that could be limited; leave it out")
+    if config.train.minutes is not None and not config.model.made_of_gaussians:
+        raise DyngsError(f"train.minutes: model.kind={config.model.kind} is trained for train.steps; leave it out")
     if config.train.minutes is not None and config.prune.is_wanted:
         raise DyngsError(
             "train.minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
@@ -69,7 +66,7 @@ def _require_batch(config: Config) -> None:
     if config.train.batch_size == 1:
         return
     asked = f"train.batch_size={config.train.batch_size}"
-    if network_of(config) is not None:
+    if config.model.is_network:
         raise DyngsError(f"{asked}: a network is trained on one person per step, by one process; leave it out")
     single = {
         "train.robust": config.train.robust,
@@ -94,7 +91,7 @@ def within_cap(config: Config, num_times: int) -> Config:
     cap, changes = most_gaussians(config, num_times), {}
     if cap is None:
         return config
-    added = added_for_motion(config)
+    added = config.model.added_for_motion
     if added:
         added = min(added, int(RANDOM_FRACTION * cap))
         changes["model"] = config.model.model_copy(update={"num_random_moving": added})
@@ -113,7 +110,7 @@ def most_gaussians(config: Config, num_times: int) -> int | None:
         DyngsError: a size that has no room for a scene.
     """
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
-    if config.budget.max_mb is not None and person_of(config) is None:
+    if config.budget.max_mb is not None and not config.model.is_posed:
         limits.append(room(config, num_times, config.budget.max_mb))
     return min(limits, default=None)
 
@@ -124,8 +121,8 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     Raises:
         DyngsError: fewer than ``FEWEST``; says which size has room for them.
     """
-    fixed, moves_by = 0.0, field_of(config)
-    each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(stored_sh_degree(config)) - 1)
+    fixed, moves_by = 0.0, config.model.deform if isinstance(config.model, DynamicModel) else None
+    each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
     if moves_by is not None and num_times > 1:
         one, two = (num_field_values(moves_by, num_times, count) for count in (1, 2))
         fixed, each = FIELD_BYTES * (2 * one - two), each + FIELD_BYTES * (two - one)

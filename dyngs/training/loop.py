@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import Protocol
 
 from dyngs.errors import DyngsError
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.adam import Count
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Listener, Message, Started, StepDone, StepReport, TotalChanged
-from dyngs.training.state import Checkpoint
 
 
 class Trainable(Protocol):

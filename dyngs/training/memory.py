@@ -14,19 +14,21 @@ from dyngs.config import (
     Config,
     ControlNodesField,
     DefaultStrategy,
+    DeformField,
+    DynamicModel,
     FixedStrategy,
     HexplaneField,
+    HumanModel,
     McmcStrategy,
     MlpField,
     RandomInit,
     TrajectoryField,
 )
-from dyngs.config.kinds import added_for_motion, field_of, person_of, stored_sh_degree
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
+from dyngs.gaussians.schedule import densify_schedule, growth_per_change
 from dyngs.ops.device import gpu_memory, num_gpus
 from dyngs.training.limits import num_field_values
-from dyngs.training.schedule import densify_schedule, growth_per_change
 from dyngs.training.trainer import Trainer
 
 COPIES = 7
@@ -261,9 +263,8 @@ def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
 
 def _limit_of_gaussians(config: Config) -> tuple[str, int]:
     """Return the key that limits the number of Gaussians, and its value."""
-    person = person_of(config)
-    if person is not None:
-        return "model.resolution", person.resolution
+    if isinstance(config.model, HumanModel):
+        return "model.resolution", config.model.resolution
     match config.strategy:
         case DefaultStrategy() | McmcStrategy():
             return "strategy.max_gaussians", config.strategy.max_gaussians
@@ -279,6 +280,8 @@ def require_room(config: Config) -> None:
     Raises:
         DyngsError: says how many can.
     """
+    if not config.model.made_of_gaussians:
+        return
     whole, each = whole_memory(), 4 * NEEDED_COPIES * stored_values(config)
     match config.init:
         case RandomInit() if whole is not None and config.init.num_random * each > whole:
@@ -292,13 +295,13 @@ def require_room(config: Config) -> None:
 
 def stored_values(config: Config) -> int:
     """Return the number of values of a Gaussian that are trained, beside those of a field."""
-    return SHAPE_VALUES + 3 * num_sh_terms(stored_sh_degree(config))
+    return SHAPE_VALUES + 3 * num_sh_terms(config.stored_sh_degree)
 
 
 def gaussian_bytes(config: Config) -> int:
     """Return the bytes of memory that a Gaussian takes in training, where it moves if anything may."""
-    each, field = 4 * COPIES * stored_values(config), field_of(config)
-    if person_of(config) is not None:
+    each, field = 4 * COPIES * stored_values(config), _field(config)
+    if config.model.is_posed:
         return each + POSING_BYTES
     match field:
         case None:
@@ -314,9 +317,13 @@ def gaussian_bytes(config: Config) -> int:
             assert_never(field)
 
 
+def _field(config: Config) -> DeformField | None:
+    return config.model.deform if isinstance(config.model, DynamicModel) else None
+
+
 def field_bytes(config: Config, num_times: int) -> int:
     """Return the bytes of memory of what a deformation field learns beside its Gaussians; 0 where there is none."""
-    field = field_of(config)
+    field = _field(config)
     if field is None or num_times < 2:
         return 0
     one, two = (num_field_values(field, num_times, count) for count in (1, 2))
@@ -349,7 +356,7 @@ def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE)
             changes = num_changes(config) / USUAL_CHANGES
             detail = min(longest_side / USUAL_SIDE, 1.0) ** 0.5
             usual = round(USUAL_GAUSSIANS * detail * (changes if changes < 1 else min(changes, 4.0) ** 0.5))
-            return max(now, min(usual, config.strategy.growth_limit)) + added_for_motion(config)
+            return max(now, min(usual, config.strategy.growth_limit)) + config.model.added_for_motion
 
 
 def _mcmc_gaussians(config: Config, strategy: McmcStrategy, now: int) -> int:

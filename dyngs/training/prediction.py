@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
-from dyngs.config.kinds import network_of
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
-from dyngs.gaussians.rendering import Rendering
 from dyngs.gaussians.scene import render_options
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.prediction.network import AtlasNetwork, PredictedAvatar, num_input_channels, predict_gaussians
@@ -22,16 +22,18 @@ from dyngs.human.prediction.person import CapturedPerson, captured_person, sprea
 from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atlas
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import load_template
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.kind import Kind, Setting
+from dyngs.models.model import Model
+from dyngs.models.renderable import Renderable, Rendering
+from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.transfer import sent
 from dyngs.state import fields_moved_to
-from dyngs.static.rates import Rates
 from dyngs.tensor_checks import require_tensor
-from dyngs.training.background import background_colour, evaluation_background
 from dyngs.training.events import StepReport
 from dyngs.training.sampler import ViewSampler
-from dyngs.training.state import OTHER_CONFIG, Checkpoint, CheckpointInfo
 
 SQUARED_WEIGHT = 1.0
 """Weight of the mean squared error in the loss, which counts edges more."""
@@ -128,7 +130,7 @@ class NetworkTrainer:
         sitter, maps = person.sitter_on(self.device), person.maps(choice, self.device)
         avatar = predict_gaussians(sitter, maps, self.mean, self.network, self.model.min_silhouette_fraction)
         scene, training = scene_of(human_options(self.model), avatar, Rates(1))
-        moment = training.moment(scene, targets[0], step)
+        moment = training.time_step(scene, targets[0], step)
         total = torch.zeros((), device=self.mean.device)
         for image in targets:
             rendering = scene.render(image.cameras, moment, options=drawing, background=background)
@@ -199,9 +201,9 @@ class NetworkTrainer:
 
 def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config) -> Tensor:
     """Return the loss of a rendering of one view against ``truth`` (H, W, 3), the image on the same background."""
-    options, model = config.train, network_of(config)
+    options, model = config.train, config.model
     loss = l1_ssim_loss(rendering.rgb[0], truth, options.ssim_weight, image.mask)
-    if model is not None:
+    if isinstance(model, HumanPredictorModel):
         difference = rendering.rgb[0] - truth
         known = difference if image.mask is None else difference * image.mask[..., None]
         loss = loss + SQUARED_WEIGHT * known.square().mean()
@@ -210,13 +212,15 @@ def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config
     return loss
 
 
-def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrainer:
+def assemble_network(config: Config) -> NetworkTrainer:
     """Return the trainer of ``model.kind: human_predictor``: captures read, nothing trained.
 
     Raises:
         DyngsError: ``data.root`` has no captures of people, or settings that do not go together.
     """
-    device = device_for(config.run.device)
+    device, model = device_for(config.run.device), config.model
+    if not isinstance(model, HumanPredictorModel):
+        raise TypeError(f"not a network: {model!r}")
     body, generator = load_template(human_options(model)), torch.Generator().manual_seed(config.run.seed)
     network = new_network(model, generator).to(device)
     people = [filmed(data, model, body) for data in captures_in(config.data)]
@@ -235,6 +239,14 @@ def assemble_network(config: Config, model: HumanPredictorModel) -> NetworkTrain
         generator=generator,
         device=device,
     )
+
+
+def _no_scene(_: HumanPredictorModel, checkpoint: Checkpoint) -> Renderable:
+    raise DyngsError(f"{checkpoint.name}: a network, not a scene; `dyngs predict RUN CAPTURE --out RUN` makes one")
+
+
+def _no_model(setting: Setting) -> Model[Any]:
+    raise TypeError("a network is not trained on one capture")
 
 
 def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
@@ -341,3 +353,6 @@ def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[
     """Return a predicted avatar as a scene, and how it is trained on."""
     training = HumanTraining(model, avatar.subject.motion.frames, rates)
     return training.first_scene(avatar.gaussians, avatar.subject), training
+
+
+KIND = Kind(HumanPredictorModel, _no_model, _no_scene, trainer=assemble_network)

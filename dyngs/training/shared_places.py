@@ -22,7 +22,7 @@ from dyngs.camera import Cameras
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.affine import SATURATED
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 from dyngs.training.other_views import grid_of
 
 DRAWN_FROM, ASKED = 100, 40

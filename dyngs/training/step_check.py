@@ -10,25 +10,22 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.gaussians import Gaussians
 from dyngs.ops.transfer import ReadBack, sent
 
 
 class StepCheck:
-    """The loss of a step, term by term, and whether the Gaussians that were drawn are finite.
+    """The loss of a step, term by term, and whether what was drawn is finite.
 
     Args:
         terms: of the loss, () each, on any device.
-        moved: Gaussians that a field or body has moved: one that is not finite would not be drawn, so that a diverging
-            field could go unseen; None: they are those of the optimizer, which stay finite.
+        moved: what was moved, by name; see ``Drawn``.
         device: of the scene.
     """
 
-    def __init__(self, terms: Mapping[str, Tensor], moved: Gaussians | None, device: torch.device) -> None:
-        parts = {} if moved is None else moved.tensors()
-        self._terms, self._parts = tuple(terms), tuple(parts)
+    def __init__(self, terms: Mapping[str, Tensor], moved: Mapping[str, Tensor], device: torch.device) -> None:
+        self._terms, self._parts = tuple(terms), tuple(moved)
         numbers = [sent(x.detach(), device).double() for x in terms.values()]
-        numbers += [x.detach().isfinite().all().double() for x in parts.values()]
+        numbers += [x.detach().isfinite().all().double() for x in moved.values()]
         self._read = ReadBack(torch.stack(numbers))
 
     def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:

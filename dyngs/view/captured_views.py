@@ -13,9 +13,9 @@ from dyngs.camera_paths.aim import look_at_point
 from dyngs.config import DataConfig
 from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader
-from dyngs.export.chosen_path import orbit_around
+from dyngs.export.chosen_path import orbit_around, points_at
+from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, scene_of_split
-from dyngs.training.views import training_cameras
 
 THUMBNAIL = 96
 """Longest side of the small images, px."""
@@ -95,8 +95,8 @@ def viewpoint_of(opened: Opened) -> Viewpoint:
 
 def has_timeline(opened: Opened) -> bool:
     """Return whether there are times to choose from, now or later."""
-    may_move = opened.in_training and len(opened.scene.times) > 1
-    return may_move or not opened.scene.is_static or opened.person is not None
+    may_move = opened.in_training and len(opened.renderable.times) > 1
+    return may_move or not opened.renderable.is_static or opened.person is not None
 
 
 def _views_of_capture(opened: Opened) -> CapturedViews:
@@ -106,7 +106,7 @@ def _views_of_capture(opened: Opened) -> CapturedViews:
     capture, by_name = opened.capture, {}
     for split in ("train", "val", "test"):
         found = capture.splits.get(split, ())
-        if found and scene_of_split(opened, capture, split) is opened.scene:
+        if found and scene_of_split(opened, capture, split) is opened.renderable:
             by_name |= {view.name: view for view in found}
     return captured_views(tuple(by_name.values()), opened.config.data)
 
@@ -120,7 +120,7 @@ def _viewpoint(opened: Opened) -> Viewpoint:
         if opened.person is not None:
             center = opened.person.at(None).means.double().cpu().numpy().mean(0)
     else:
-        means = opened.scene.at(None).means.double().cpu().numpy()
+        means = points_at(opened.renderable).double().cpu().numpy()
         start = orbit_around(opened, 1)
         center, eyes = np.median(means[np.isfinite(means).all(1)], axis=0), start.centers.double().cpu().numpy()
     extent = float(np.median(np.linalg.norm(eyes - center, axis=1)))

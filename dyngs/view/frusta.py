@@ -87,7 +87,7 @@ class Frusta:
     def _go(self, index: int) -> None:
         time = views_of(self._browsing.session.opened).times[index]
         self._browsing.go_to(index)
-        if time is not None and not self._browsing.session.opened.scene.is_static:
+        if time is not None and not self._browsing.session.opened.renderable.is_static:
             self._browsing.session.set_time(time)
             if self._browsing.time_slider is not None:
                 self._browsing.time_slider.value = round(time, 3)

@@ -15,8 +15,8 @@ from dyngs.camera_paths.path import resize_cameras
 from dyngs.conventions import SH_C0
 from dyngs.export.contact_sheet import color_map, depth_to_rgb
 from dyngs.files.write import to_uint8
-from dyngs.gaussians.rendering import Rendering
-from dyngs.gaussians.scene import Moment, Scene
+from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.models.renderable import Renderable, Rendering, TimeStep
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import views_of
 
@@ -125,18 +125,18 @@ def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> n
 def _rendering(opened: Opened, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
     scene = _part(opened, part)
-    kept: dict[str, tuple[float | None, Moment]] = opened.once("moments", dict)
+    kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)
     if part not in kept or kept[part][0] != time:
-        kept[part] = time, scene.moment(time)
+        kept[part] = time, scene.time_step(time)
     options = replace(scene.options, depth="expected") if with_depth else None
     return scene.render(camera, kept[part][1], options=options).to(device="cpu")
 
 
-def _part(opened: Opened, part: Part) -> Scene:
+def _part(opened: Opened, part: Part) -> Renderable:
     """Return the scene, or only what moves of it, or only what does not."""
     match part:
         case "all":
-            return opened.scene
+            return opened.renderable
         case "moving" | "still":
             return opened.once(part, lambda: opened.scene.part(part))
 
@@ -152,7 +152,7 @@ def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> 
             moves[scene.rows] = True
         coloured = coloured.select(moves if part == "moving" else ~moves)
     plain = replace(scene, colour=None, background=None)
-    made = plain.render(camera, Moment(coloured, time), options=replace(opened.scene.options, sh_degree=0))
+    made = plain.render(camera, GaussianTimeStep(coloured, time), options=replace(opened.scene.options, sh_degree=0))
     return to_uint8(made.rgb[0].clamp(0, 1).cpu().numpy())
 
 

@@ -242,7 +242,7 @@ class Session:
             return None
         if look.view is not None:
             return look.view
-        shown, time = views_of(opened), None if opened.scene.is_static else self.time
+        shown, time = views_of(opened), None if opened.renderable.is_static else self.time
         return nearest_camera(eye.camera(), time, shown.poses, shown.times, viewpoint_of(opened).extent)
 
     def due(self) -> float | None:
@@ -304,12 +304,12 @@ class Session:
                 time = time if recorded is None else recorded
             look, opened = self.look, self.opened
         layer = "colour" if look.layer == "error" and view is None else look.layer
-        shown, divide = None if opened.scene.is_static else time, look.divide if look.comparing else 1.0
+        shown, divide = None if opened.renderable.is_static else time, look.divide if look.comparing else 1.0
         return Shot(camera, shown, layer, look.part, view, divide)
 
     @property
     def _is_moving(self) -> bool:
-        is_playing = self.timeline.playing and not self.opened.scene.is_static
+        is_playing = self.timeline.playing and not self.opened.renderable.is_static
         return is_playing or self._preview is not None
 
     @property

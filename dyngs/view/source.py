@@ -12,7 +12,6 @@ import torch
 from dyngs.api.predict import network_config, predict_person
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
-from dyngs.config.kinds import network_of
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.files.wrong_place import command_for
@@ -191,7 +190,7 @@ def first_of(source: Source) -> Opened:
 
 def is_network(path: Path) -> bool:
     """Return whether ``path`` is the run of a network that predicts people."""
-    return path.is_dir() and _is_run(path) and network_of(load_resolved(path)) is not None
+    return path.is_dir() and _is_run(path) and load_resolved(path).model.is_network
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -212,7 +211,7 @@ def _is_run(folder: Path) -> bool:
 def _has_scene(run: Path) -> bool:
     try:
         has_any = (run / SCENE_FILE).is_file() or bool(checkpoint_paths(run))
-        return has_any and network_of(load_resolved(run)) is None
+        return has_any and not load_resolved(run).model.is_network
     except (DyngsError, OSError):
         return False
 

@@ -6,18 +6,18 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.config import Config
-from dyngs.config.kinds import network_of
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
+from dyngs.models.renderable import Renderable
+from dyngs.models.views import background_colour
 from dyngs.runs.opened import Captured, Opened, cameras_for_paths
-from dyngs.training.background import background_colour
 from dyngs.training.events import Event, StepDone
-from dyngs.training.state import CheckpointInfo
 from dyngs.training.trainer import Trainer
 from dyngs.view.captured_views import captured_views
 from dyngs.view.gate import free_port
@@ -89,7 +89,7 @@ class TrainingView:
     """
 
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
-        if network_of(config) is not None:
+        if config.model.is_network:
             raise DyngsError("--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts")
         require_viser()
         free_port(serving.host, serving.port)  # now, not after reading the capture
@@ -121,7 +121,7 @@ class TrainingView:
     def _draw(self, event: StepDone, drawn: DrawnBetweenSteps) -> float:
         match event.loop.trainer:
             case Trainer() as trainer:
-                return drawn.after_step(trainer.scene)
+                return drawn.after_step(trainer.model.scene)
             case _:
                 return 0.0
 
@@ -138,20 +138,21 @@ class TrainingView:
         return DrawnBetweenSteps(self._viewer.drawer)
 
 
-def opened_training(trainer: Trainer) -> Opened:
+def opened_training(trainer: Trainer[Any]) -> Opened:
     """Return the scene of a trainer with the views that it is trained on."""
     config, views = trainer.config, trainer.images.views
     shown, cameras = captured_views(views, config.data, trainer.images), cameras_for_paths(views, config.data)
-    captured = Captured(config.data)
+    captured = Captured(config.data, trainer.capture)
     captured.once("views", lambda: shown)
     captured.once("cameras", lambda: cameras)
-    mode = trainer.scene.options.mode.value
-    info = CheckpointInfo(trainer.done, trainer.extent, trainer.world_offset, trainer.background, mode)
     with torch.no_grad():
-        scene = _shell(trainer.scene, background_colour(trainer.background))
-    return Opened(config, scene, trainer.done, 0.0, info, name=config.run.name, captured=captured, in_training=True)
+        scene = _shell(trainer.model.scene, background_colour(trainer.background))
+    name = config.run.name
+    return Opened(config, scene, trainer.done, 0.0, trainer.info, name=name, captured=captured, in_training=True)
 
 
-def _shell(scene: Scene, background: Tensor) -> Scene:
+def _shell(scene: Renderable, background: Tensor) -> Renderable:
     """Return the same scene with caches of its own, to be drawn whatever its values are."""
-    return replace(scene, options=replace(scene.options, nonfinite="skip"), background=background)
+    if isinstance(scene, Scene):
+        scene = replace(scene, options=replace(scene.options, nonfinite="skip"))
+    return scene.on_background(background)

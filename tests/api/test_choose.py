@@ -17,9 +17,11 @@ from dyngs.api.choose import Choice, Setting, _Plan, as_static, choose, write_ch
 from dyngs.api.view_scores import explained_pixels
 from dyngs.config import Config, DynamicModel, StaticModel
 from dyngs.config.io import load_config, packaged_preset
+from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.kinds import with_points
 from dyngs.runs.folder import CHOICES_NAME
 
 LONG = "train.steps=100_000"
@@ -29,11 +31,16 @@ def preset(root: Path, *keys: str, name: str = "dynamic") -> Config:
     return load_config(packaged_preset(name), [f"data.root={root}", "run.threads=1", *keys])
 
 
+def decided(config: Config) -> tuple[Config, list[Choice]]:
+    best, found, _ = choose(config, read_capture(config.data))
+    return best, found
+
+
 def scored(monkeypatch: pytest.MonkeyPatch, psnr_of: Any) -> list[Config]:
     """Let nothing be trained: a small run has the PSNR that ``psnr_of`` gives it, and differs a little by view."""
     tried: list[Config] = []
 
-    def trained(config: Config, held_out: frozenset[int]) -> Any:
+    def trained(config: Config, capture: Capture, held_out: frozenset[int]) -> Any:
         tried.append(config)
         return SimpleNamespace(config=config, held_out=held_out)
 
@@ -51,7 +58,7 @@ def scored(monkeypatch: pytest.MonkeyPatch, psnr_of: Any) -> list[Config]:
 
 def test_all_runs_differ_in_one_setting_and_winners_stay(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tried = scored(monkeypatch, lambda c: 20.0 + isinstance(c.model, DynamicModel) - (c.colour.kind == "network"))
-    best, found = choose(preset(moving, LONG))
+    best, found = decided(preset(moving, LONG))
     assert [choice.taken for choice in found] == [True, False, False]
     assert isinstance(best.model, DynamicModel)
     assert not best.model.choose
@@ -65,7 +72,7 @@ def test_where_motion_does_not_pay_the_scene_is_static_and_no_more_is_asked(
 ) -> None:
     tried = scored(monkeypatch, lambda c: 20.0 - isinstance(c.model, DynamicModel))
     config = preset(moving, LONG)
-    best, found = choose(config)
+    best, found = decided(config)
     assert best == as_static(config)
     assert [choice.setting for choice in found] == ["model.kind=dynamic"]
     assert len(tried) == 4, "two of each"
@@ -74,9 +81,9 @@ def test_where_motion_does_not_pay_the_scene_is_static_and_no_more_is_asked(
 def test_what_was_requested_is_not_questioned(moving: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tried = scored(monkeypatch, lambda _: 20.0 + len(tried))
     keys = ("colour.kind=sh", "model.deform.move_opacities=false", "camera.refine=never")
-    _, found = choose(preset(moving, LONG, *keys))
+    _, found = decided(preset(moving, LONG, *keys))
     assert [choice.setting for choice in found] == ["model.kind=dynamic"]
-    assert choose(preset(moving, "model.choose=false"))[1] == []
+    assert decided(preset(moving, "model.choose=false"))[1] == []
 
 
 def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
@@ -85,9 +92,9 @@ def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
     monkeypatch.setattr(module, "FEWEST_VIEWS", 2)
     tried = scored(monkeypatch, lambda c: 20.0 + (c.train.robust == "always"))
     config = preset(still, LONG, name="static")
-    assert choose(config) == (config, [])
+    assert decided(config) == (config, [])
     assert not tried
-    best, found = choose(preset(still, LONG, "train.robust=auto", "train.exposure=auto", name="static"))
+    best, found = decided(preset(still, LONG, "train.robust=auto", "train.exposure=auto", name="static"))
     assert (best.train.robust, best.train.exposure) == ("always", "never")
     assert [choice.setting for choice in found] == ["train.exposure=always", "train.robust=always"]
 
@@ -95,7 +102,7 @@ def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
 @pytest.mark.parametrize("keys", [("train.steps=400",), (LONG, "train.minutes=3")])
 def test_short_runs_ask_nothing(keys: tuple[str, ...], moving: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = preset(moving, *keys)
-    best, found = choose(config)
+    best, found = decided(config)
     assert isinstance(best.model, DynamicModel)
     assert not found
     assert "too short a run" in capsys.readouterr().out
@@ -152,7 +159,7 @@ def test_half_is_explained_and_neither_image_is_favoured() -> None:
 
 def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> None:
     with pytest.raises(DyngsError, match=r"no times.*configs/static.yaml.*data\.times=order"):
-        choose(preset(still))
+        decided(preset(still))
 
 
 def test_as_static_has_the_static_preset_and_what_was_requested(moving: Path) -> None:
@@ -191,6 +198,7 @@ def test_never_worse_than_static(moves: bool, tmp_path: Path) -> None:
     capture = read_capture(config.data)
     plan = replace(_Plan.of(config, capture, 1), steps=500, runs=2)
     moving = config.model_copy(update={"model": config.model.model_copy(update={"choose": False})})
-    best, (choice,) = module._decided(module._at_rest(config), [Setting("model.kind=dynamic", lambda _: moving)], plan)
+    settings, base = [Setting("model.kind=dynamic", lambda _: moving)], module._at_rest(config)
+    best, (choice,) = module._decided(base, settings, plan, with_points(capture, base))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves

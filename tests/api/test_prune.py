@@ -12,11 +12,11 @@ from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.api.prune import file_of, prune_run, prune_within
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.comparison import compared
+from dyngs.kinds import assemble
 from dyngs.prune.search import evenly_held_out
 from dyngs.prune.stage import quality_of
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoint, load_run
@@ -62,7 +62,7 @@ def test_on_a_gpu_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pyt
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
     here = compared([run_dir, file_of(expected.folder)], 1)
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
         found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
         there = compared([run_dir, file_of(found.folder)], 1, GPU)
@@ -109,7 +109,7 @@ def _spoil(trainer: object, cut: object, scores: object) -> None:
 
     apply_cut(trainer, cut, scores)  # pyright: ignore[reportArgumentType]
     if cut != Cut():
-        trainer.scene.gaussians.sh.data[:, 0] += 0.8  # pyright: ignore[reportAttributeAccessIssue]
+        trainer.model.scene.gaussians.sh.data[:, 0] += 0.8  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_an_interruption_leaves_nothing(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,6 @@ from tiny_fields import KINDS, busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import (
     Config,
     DataConfig,
@@ -27,11 +26,15 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
+from dyngs.data import read
+from dyngs.data.capture import Capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run, save_checkpoint
+from dyngs.training import losses
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import StepReport, Trainer
 
@@ -270,15 +273,13 @@ def test_bad_input_leaves_no_folder(tmp_path: Path) -> None:
 def test_a_loss_that_is_not_finite_stops_the_run(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from dyngs.training import trainer
-
-    real, calls = trainer.l1_ssim_loss, []
+    real, calls = losses.l1_ssim_loss, []
 
     def failing(rendered: Tensor, target: Tensor, weight: float, mask: Tensor | None) -> Tensor:
         calls.append(0)
         return real(rendered, target, weight, mask) * (float("nan") if len(calls) == 6 else 1.0)
 
-    monkeypatch.setattr(trainer, "l1_ssim_loss", failing)
+    monkeypatch.setattr(losses, "l1_ssim_loss", failing)
     config = _config(capture, tmp_path / "run", train=TrainConfig(steps=14, save_every=4))
     with pytest.raises(DyngsError, match=r"step 6, view .*'image' is nan.*step_0000004"):
         train(config)
@@ -291,6 +292,21 @@ def test_checkpoints_and_scores_come_when_asked(capture: Path, tmp_path: Path) -
     assert [path.stem for path in checkpoint_paths(folder)] == ["step_0000006", "step_0000009"]
     assert [(record["step"], "split" in record) for record in _log(folder)] == [(6, True), (9, False)]
     assert json.loads((folder / "metrics.json").read_text())["num_views"] == 1
+
+
+def test_the_capture_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Deciding, training and evaluating hand it on."""
+    root, reads, real = write_tiny_capture(tmp_path / "capture"), list[Path](), read._finished
+
+    def counted(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
+        reads.append(capture.root)
+        return real(capture, options, decode_videos)
+
+    monkeypatch.setattr(read, "_finished", counted)
+    words = ["train.steps=4", "train.eval_every=2", "init.num_random=40", "model.num_random_moving=20", "run.threads=1"]
+    config = load_config(packaged_preset("dynamic"), [f"data.root={root}", f"run.dir={tmp_path / 'run'}", *words])
+    assert (tmp_path / "run" / "metrics.json") in train(config).iterdir()
+    assert len(reads) == 1
 
 
 # --- scenes that move -------------------------------------------------------------------------------------------------
@@ -357,7 +373,7 @@ def test_what_is_loaded_is_what_the_trainer_draws(moving_capture: Path, tmp_path
     assert scene.is_static == (steps == 2)
     for time in (0.0, 0.37, 1.0):
         image = replace(trainer.images[0], time=time)
-        drawn = trainer.training.moment(trainer.scene, image, steps + 1).gaussians
+        drawn = trainer.model.training.time_step(trainer.model.scene, image, steps + 1).gaussians
         for name, x in scene.at(time).tensors().items():
             torch.testing.assert_close(x, drawn.tensors()[name].detach(), rtol=1e-6, atol=1e-7)
 
@@ -432,7 +448,7 @@ def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> 
     real = Trainer.step
 
     def stepping(trainer: Trainer) -> StepReport:
-        scene = trainer.scene
+        scene = trainer.model.scene
         if trainer.done + 1 == step and isinstance(scene, DynamicScene) and scene.field is not None:
             for x in scene.field.parameters.values().values():
                 x.fill_(value)

@@ -11,10 +11,10 @@ from limited import limited
 from dyngs.api.train import train
 from dyngs.budget import cost
 from dyngs.budget.cost import CostMeter, Range
-from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, DefaultStrategy, FixedStrategy, McmcStrategy, RandomInit, TrainConfig
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.kinds import assemble
 from dyngs.training.clock import step_cost, with_steps
 from dyngs.training.events import StepDone
 

@@ -10,7 +10,6 @@ from tiny_fields import busy_config
 
 from dyngs.api.train import train
 from dyngs.budget.count import CountLimit
-from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -25,6 +24,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
+from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")

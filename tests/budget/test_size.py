@@ -10,11 +10,11 @@ import torch
 
 from dyngs.api.train import train
 from dyngs.budget.size import write_within
-from dyngs.build import assemble
 from dyngs.config import BudgetConfig, Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.prune.stage import quality_of
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, has_only_scene_file, latest_checkpoint, load_run
 from dyngs.runs.folder import EXPORT_FOLDER

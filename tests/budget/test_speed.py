@@ -24,7 +24,6 @@ from dyngs.budget.speed import (
     drawing_seconds,
     least_seconds,
 )
-from dyngs.build import assemble, restored_scene
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -42,6 +41,7 @@ from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.drawing import Drawing
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import assemble, restored_scene
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
@@ -190,7 +190,7 @@ def test_what_never_grows_does_not_begin_to(person: Path, tmp_path: Path) -> Non
     limit.found.base = BASE
     run.loop.subscribe(limit)
     run.loop.run(lambda: trainer.done >= 8)
-    assert limit.found.before > len(trainer.scene.gaussians)
+    assert limit.found.before > len(trainer.model.scene.gaussians)
     assert limit.found.cap == config.strategy.growth_limit == 0
 
 
@@ -221,11 +221,11 @@ def test_a_machine_that_becomes_too_slow_is_told_of(
     limit.found = Measured(base=1e-3, seconds=1e-3)
     while trainer.done < trainer.config.train.steps:
         trainer.step()
-    count = len(trainer.scene.gaussians)
+    count = len(trainer.model.scene.gaussians)
     monkeypatch.setattr("dyngs.budget.speed.drawing_seconds", lambda *_: 1.0)
     limit(StepDone(report_of(trainer.done), run.loop))
     assert texts == []
-    assert len(trainer.scene.gaussians) == count
+    assert len(trainer.model.scene.gaussians) == count
     with pytest.raises(DyngsError, match=r"budget.min_fps=100: drawn at 1 per second"):
         limit.reached()
 

@@ -25,16 +25,16 @@ from dyngs.budget.time import (
     refitted,
     same_phase,
 )
-from dyngs.build import assemble
 from dyngs.config import AutoColour, Config, DataConfig, DynamicModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.training.clock import Forecast, Stopwatch, with_steps
 from dyngs.training.events import StepReport
 from dyngs.training.loop import Loop
 from dyngs.training.processes import Processes
-from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))

@@ -14,7 +14,6 @@ from scenes import look_around, weights
 from tiny_fields import KINDS, busy_config, cloud, stir, stirred_field, tiny_field, tiny_options, write_tiny_capture
 from torch import Tensor
 
-from dyngs.build import assemble, restored_scene
 from dyngs.camera import Cameras
 from dyngs.config import ControlNodesField, DynamicModel, HexplaneField, StaticModel, TrainConfig
 from dyngs.deform.control_nodes import ControlNodes
@@ -28,6 +27,7 @@ from dyngs.deform.time_window import FRONTIER_VIEWS, TimeWindow
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import render
+from dyngs.kinds import assemble, restored_scene
 from dyngs.ops.planes import PlaneLevel, hexplane_features
 from dyngs.state import tensors_of
 from dyngs.static.scene import StaticScene
@@ -102,7 +102,7 @@ def test_times_outside_the_clip_are_clamped(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_single_training_time_is_a_static_scene(tmp_path: Path, kind: str) -> None:
     trainer = assemble(busy_config(timed(tmp_path / "capture", [0.5] * 5), tmp_path, kind))
-    assert isinstance(trainer.scene, StaticScene)
+    assert isinstance(trainer.model.scene, StaticScene)
     assert trainer.step().loss > 0
 
 
@@ -116,8 +116,8 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     trainer = assemble(config.model_copy(update={"model": model}))
     seen = {trainer.step().image.time for _ in range(12)}
     assert seen == {0.0, 1.0}
-    assert isinstance(trainer.scene, DynamicScene)
-    field = trainer.scene.field
+    assert isinstance(trainer.model.scene, DynamicScene)
+    field = trainer.model.scene.field
     if isinstance(field, Hexplane):
         assert field.levels[0].time.shape[1] == 2
     if isinstance(field, ControlNodes):
@@ -175,18 +175,18 @@ def test_no_moving_gaussians(kind: str) -> None:
 def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: str) -> None:
     """The run goes on with what is left, and its checkpoint can be loaded."""
     trainer = fine_trainer(capture, kind)
-    scene, two = trainer.scene, TopologyEdit.select(torch.tensor([0, 3]))
+    scene, two = trainer.model.scene, TopologyEdit.select(torch.tensor([0, 3]))
     assert isinstance(scene, DynamicScene)
     assert scene.field is not None
     field = scene.field.edited(two)
     field.regroup()
-    trainer.scene = replace(scene, moving=two.source, field=field)
+    trainer.model.exchange(replace(scene, moving=two.source, field=field))
     trainer.step()
-    keep = torch.ones(len(trainer.scene), dtype=torch.bool)
-    keep[trainer.scene.rows] = False
+    keep = torch.ones(len(trainer.model.scene), dtype=torch.bool)
+    keep[trainer.model.scene.rows] = False
     assert not keep.all()
-    trainer.densifier = assemble(trainer.config).densifier
-    trainer.keep(keep)
+    trainer.model.densifier = assemble(trainer.config).model.densifier
+    trainer.model.keep(keep, trainer.done)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert trainer.num_moving == 0
@@ -308,17 +308,17 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
 def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> None:
     """The next step stops before anything changes, and names step, view, attributes and time."""
     trainer = fine_trainer(capture, kind)
-    scene = trainer.scene
+    scene = trainer.model.scene
     assert isinstance(scene, DynamicScene)
     assert scene.field is not None
     for x in scene.field.parameters.values().values():
         x.fill_(bad)
-    before = trainer.scene.gaussians.means.detach().clone()
+    before = trainer.model.scene.gaussians.means.detach().clone()
     with pytest.raises(
         DyngsError, match=r"^step 11, view '.*': the field makes means.* at [0-9.]+ not finite; .*deform$"
     ):
         trainer.step()
-    assert torch.equal(trainer.scene.gaussians.means, before)
+    assert torch.equal(trainer.model.scene.gaussians.means, before)
 
 
 # --- where motion begins ----------------------------------------------------------------------------------------------
@@ -327,9 +327,9 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 def test_a_image_that_a_still_model_explains(capture: Path) -> None:
     """No error stands out: nothing moves, no random Gaussians, no field; the run goes on static."""
     trainer = fine_trainer(capture, "control_nodes", motion_threshold=10.0)
-    assert isinstance(trainer.scene, DynamicScene)
-    assert trainer.scene.field is None
-    assert len(trainer.scene.gaussians) == len(reference_set(capture))
+    assert isinstance(trainer.model.scene, DynamicScene)
+    assert trainer.model.scene.field is None
+    assert len(trainer.model.scene.gaussians) == len(reference_set(capture))
     assert trainer.step().loss > 0
 
 
@@ -340,7 +340,7 @@ def test_no_random_gaussians(capture: Path) -> None:
         trainer = assemble(busy_config(capture, capture, "trajectory", num_random_moving=added))
         for _ in range(8):
             trainer.step()
-        sizes.append(len(trainer.scene.gaussians))
+        sizes.append(len(trainer.model.scene.gaussians))
         moving.append(trainer.num_moving)
         assert trainer.step().loss > 0
     assert sizes[0] == sizes[1] + 12
@@ -353,7 +353,7 @@ def reference_set(capture: Path) -> Gaussians:
     trainer = assemble(config.model_copy(update={"model": StaticModel(sh_degree=1)}))
     for _ in range(10):
         trainer.step()
-    return trainer.scene.gaussians
+    return trainer.model.scene.gaussians
 
 
 @pytest.mark.parametrize("filtered", [False, True])

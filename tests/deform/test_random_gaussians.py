@@ -9,8 +9,8 @@ from tiny_fields import cloud
 
 from dyngs.config import OptimConfig
 from dyngs.deform.random_gaussians import box_of, with_random_gaussians
+from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.state import tensors_of
-from dyngs.static.optimizer import GaussianOptimizer
 
 
 @settings(max_examples=60, deadline=None)

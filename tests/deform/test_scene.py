@@ -15,9 +15,9 @@ from dyngs.deform.fields import field_state
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.filters import fuse_filter
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import tensors_of
-from dyngs.static.filters import fuse_filter
 from dyngs.static.scene import StaticScene
 
 ROWS = torch.tensor([1, 4, 5, 8])

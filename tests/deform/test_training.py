@@ -26,12 +26,12 @@ from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors
 from dyngs.deform.training import DeformSchedule, DynamicTraining, TrainingViews
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.rendering import render
-from dyngs.gaussians.scene import Moment
+from dyngs.gaussians.scene import GaussianTimeStep
+from dyngs.gaussians.schedule import Rates
 from dyngs.state import part_of, tensors_of
-from dyngs.static.optimizer import GaussianOptimizer
-from dyngs.static.rates import Rates
-from dyngs.static.training import FilterUpdate
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 TIMES = tuple(i / 20 for i in range(21))
@@ -75,12 +75,12 @@ class Run:
     training: DynamicTraining
     scene: DynamicScene
 
-    def moment(self, time: float | None, step: int) -> Moment:
-        return self.training.moment(self.scene, image(time), step)
+    def time_step(self, time: float | None, step: int) -> GaussianTimeStep:
+        return self.training.time_step(self.scene, image(time), step)
 
     def drawn_at(self, time: float) -> Gaussians:
         """At the end of the run."""
-        return self.moment(time, STEPS).gaussians.detach()
+        return self.time_step(time, STEPS).gaussians.detach()
 
     def after_step(self, step: int, result: EditResult | None = None) -> int:
         """Optimize, follow ``result``, bring up to date; the number of rows left out for bad gradients."""
@@ -151,7 +151,7 @@ def test_before_the_fine_phase_it_is_the_static_model() -> None:
     run = new_run(gaussians, still_errors=lambda _: alike(torch.arange(9.0)))
     for step in (1, FINE):
         assert run.grow(step - 1) is None
-        drawn = run.moment(0.3, step)
+        drawn = run.time_step(0.3, step)
         assert drawn.gaussians is gaussians
         assert drawn.penalties == {}
         assert run.scene.num_moving == 0
@@ -166,7 +166,7 @@ def test_on_the_newest_views_only_the_motion_learns(step: int, tracks: bool) -> 
     """What is new must not spoil the form before it is followed."""
     gaussians = flat_cloud()
     run = begun(gaussians, time_window=0.3, full=FINE + 10)
-    run.moment(0.6, step).gaussians.means.sum().backward()
+    run.time_step(0.6, step).gaussians.means.sum().backward()
     assert run.scene.field is not None
     assert run.scene.field.parameters["means"].grad is not None
     assert (gaussians.means.grad is None) == tracks
@@ -221,7 +221,7 @@ def test_small_errors_are_no_motion(errors: tuple[float, ...], motion_threshold:
     else:
         assert (result, run.scene.field, run.scene.rows.tolist(), run.scene.num_moving) == (None, None, [], 0)
         assert run.model_state.keys() == {"times"}
-        assert run.moment(0.2, FINE + 1).gaussians is gaussians
+        assert run.time_step(0.2, FINE + 1).gaussians is gaussians
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -249,7 +249,7 @@ def test_the_filter_of_a_still_model_counts_the_random_gaussians() -> None:
     """A checkpoint of that very step has as many values as Gaussians."""
     update, errors = FilterUpdate([camera()]), alike(torch.tensor(ERRORS))
     run = new_run(flat_cloud(), still_errors=lambda _: errors, update=update, num_random_moving=4)
-    run.moment(0.3, FINE)
+    run.time_step(0.3, FINE)
     assert len(run.model_state["filter_std"]) == 9
     run.grow(FINE)
     assert len(run.model_state["filter_std"]) == 13
@@ -264,7 +264,7 @@ def test_the_field_learns_after_the_fine_phase(kind: str) -> None:
     gaussians = flat_cloud()
     run = begun(gaussians, deform=tiny_options(kind), motion_sparsity=0.1)
     for step in (FINE + 1, FINE + 2):
-        drawn = run.moment(0.7, step)
+        drawn = run.time_step(0.7, step)
         (drawn.gaussians.means[:, 1].sum() + sum(drawn.penalties.values(), torch.zeros(()))).backward()
         canonical = gaussians.means.detach().clone()
         assert run.after_step(step) == 0
@@ -295,7 +295,7 @@ def test_motion_is_learned_from_images(kind: str) -> None:
     times = [(7 * i % 11) / 10 for i in range(steps)]
     for step, time in enumerate(times, start=1):
         truth = gaussians.detach().replace(means=gaussians.means.detach() + (time - 0.5) * shift)
-        drawn = run.moment(time, step).gaussians
+        drawn = run.time_step(time, step).gaussians
         images = [render(x, camera()).rgb for x in (drawn, truth)]
         (images[0] - images[1]).abs().mean().backward()
         run.after_step(step)
@@ -328,9 +328,9 @@ def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
     gaussians = flat_cloud()
     run = begun(gaussians, motion_sparsity=0.5)
     move(run, torch.arange(9.0))
-    penalty = run.moment(1.0, FINE + 1).penalties["motion sparsity"]
+    penalty = run.time_step(1.0, FINE + 1).penalties["motion sparsity"]
     assert float(penalty.detach()) == pytest.approx(0.5 * 4.0, rel=1e-5)
-    assert begun(gaussians).moment(1.0, FINE + 1).penalties == {}
+    assert begun(gaussians).time_step(1.0, FINE + 1).penalties == {}
 
 
 # --- freezing ---------------------------------------------------------------------------------------------------------
@@ -385,7 +385,7 @@ def test_where_nothing_moves_the_field_goes_for_good() -> None:
     run.after_step(SPLIT)
     assert (run.scene.field, run.scene.rows.tolist(), run.scene.num_moving) == (None, [], 0)
     assert run.model_state.keys() == {"times"}
-    assert run.moment(0.2, SPLIT + 1).gaussians is gaussians
+    assert run.time_step(0.2, SPLIT + 1).gaussians is gaussians
     run.after_step(SPLIT + 1, EditResult(TopologyEdit.select(torch.arange(9) < 5)))
     assert run.scene.field is None
 
@@ -489,14 +489,14 @@ def test_state_goes_round(kind: str, phase: str) -> None:
         run.after_step(SPLIT)
     other = new_run(gaussians, deform=deform)
     stored = {name: x.clone() for name, x in run.model_state.items()}
-    other.scene = other.training.restored(gaussians, stored, other.scene)
+    other.scene = other.training.restored(gaussians, stored)
     assert other.model_state.keys() == run.model_state.keys()
     assert all(torch.equal(x, other.model_state[name]) for name, x in run.model_state.items())
     assert other.scene.num_moving == run.scene.num_moving
     for time in (0.0, 0.4):
         for name, x in run.drawn_at(time).tensors().items():
             assert torch.equal(x, other.drawn_at(time).tensors()[name]), name
-    assert other.training.restored(gaussians, {}, other.scene).field is None
+    assert other.training.restored(gaussians, {}).field is None
 
 
 # --- the box ----------------------------------------------------------------------------------------------------------
@@ -541,7 +541,7 @@ def test_motion_begins_with_what_travels() -> None:
         assert (middle - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.05
     stored = run.model_state | tensors_of(run.training.state())
     other = begin()
-    scene = other.training.restored(run.scene.gaussians, stored, run.scene)
+    scene = other.training.restored(run.scene.gaussians, stored)
     assert other.training.trains_on(0.0, FINE + 1)
     assert scene.field is not None
     assert run.scene.field is not None

@@ -23,13 +23,13 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import (
     evaluate_run,
     parameter_megabytes,
-    render_options,
     report_path,
     split_views,
 )
 from dyngs.files.write import write_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import render_options
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.static.scene import StaticScene
 

@@ -24,7 +24,7 @@ from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.training.views import training_cameras
+from dyngs.models.views import training_cameras
 
 
 def imported(path: str) -> ModuleType:
@@ -124,8 +124,10 @@ def test_the_true_motion_of_the_benchmark_follows_the_true_tracks(
     root = write_dynamic_capture(name, tmp_path / name, DynamicOptions(12, num_times=5, num_cameras=2, samples=1))
     options = [f"data.root={root}", "train.steps=4", "train.initial_downscale=1"]
     trainer = MOTION.oracle(name, load_config(MOTION.PRESET, options))
-    gaussians = trainer.scene.gaussians
-    opaque = trainer.scene.with_gaussians(gaussians.replace(logit_opacities=gaussians.logit_opacities.detach() + 5))
+    gaussians = trainer.model.scene.gaussians
+    opaque = trainer.model.scene.with_gaussians(
+        gaussians.replace(logit_opacities=gaussians.logit_opacities.detach() + 5)
+    )
     capture = read_capture(trainer.config.data)
     pairs = list(
         zip(capture.splits["test"], training_cameras(capture.splits["test"], trainer.config.data), strict=True)

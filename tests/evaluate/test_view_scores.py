@@ -22,10 +22,11 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split
 from dyngs.evaluate.view_scores import mean_of, person_box, person_scores, right_half_scores, score_views
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import Rendering, RenderOptions, render
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.metrics import Lpips, psnr, ssim
+from dyngs.models.renderable import Rendering
 from dyngs.runs.checkpoint import load_run
 from dyngs.static.scene import StaticScene
 
@@ -123,7 +124,7 @@ def test_a_mean_is_known_where_all_values_are() -> None:
 def image_and_rendering() -> tuple[Image, Rendering]:
     image = seen_from(cameras_before_wall(1))[0]
     rgb = 0.6 * torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(0))
-    rendering = Rendering(rgb[None], torch.zeros(1, 60, 80), None, torch.zeros(1, 0, 2, dtype=torch.int32))
+    rendering = Rendering(rgb[None], torch.zeros(1, 60, 80), None)
     return replace(image, rgb_premultiplied=rgb), rendering
 
 
@@ -173,7 +174,7 @@ def of_a_square(mask: torch.Tensor | None = None) -> tuple[Image, Rendering]:
     alpha[3:7, 8:13] = 1
     image = Image("a", CAMERA, 0.5 * alpha[..., None].expand(-1, -1, 3).contiguous(), alpha, mask, None)
     shown = (0.6 * alpha + 1 - alpha)[..., None].expand(-1, -1, 3)
-    return image, Rendering(shown[None].contiguous(), (1 - alpha)[None], None, torch.zeros(1, 1, 2))
+    return image, Rendering(shown[None].contiguous(), (1 - alpha)[None], None)
 
 
 def test_scores_in_the_box_and_on_black() -> None:

@@ -11,7 +11,6 @@ import torch
 from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.camera_paths.path import CameraPath, write_path
 from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
 from dyngs.conventions import RasterizeMode
@@ -21,6 +20,7 @@ from dyngs.export.chosen_path import PathOptions, choose_path, orbit_around, vie
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.kinds import assemble
 from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
 from dyngs.splats.ply import write_ply
 

@@ -15,7 +15,8 @@ from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import Rendering, RenderOptions, contributions, render, sensitivities
+from dyngs.gaussians.rendering import RenderOptions, contributions, render, sensitivities
+from dyngs.models.renderable import Rendering
 from dyngs.ops.projection import ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from tiny_fields import busy_config
 
-from dyngs.build import assemble, restored_scene
 from dyngs.config import Config, DynamicModel
+from dyngs.kinds import assemble, restored_scene
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, cut_config, field_size
-from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -38,17 +38,17 @@ def trainer(config: Config, end: Checkpoint) -> Trainer:
 
 
 def test_everything_that_a_cut_says(trainer: Trainer) -> None:
-    count, whole = len(trainer.scene), field_size(trainer.scene)
+    count, whole = len(trainer.model.scene), field_size(trainer.model.scene)
     assert whole is not None
     assert whole.pieces == 3
     cut = Cut(fraction=0.5, alpha_min=0.02, field=FieldSize(2, 1), harmonics=100.0)
     apply_cut(trainer, cut, torch.arange(float(count)))
     for _ in range(3):
         trainer.step()
-    scene = trainer.scene
+    scene = trainer.model.scene
     assert len(scene) == count - count // 2
     assert field_size(scene) == FieldSize(2, 1)
-    assert (scene.options.alpha_min, trainer.options.alpha_min) == (0.02, 0.02)
+    assert (scene.options.alpha_min, trainer.model.options.alpha_min) == (0.02, 0.02)
     assert not bool(scene.gaussians.sh[:, 1:].any())
     again = restored_scene(trainer.checkpoint(), trainer.config.model)
     assert field_size(again) == FieldSize(2, 1)
@@ -59,19 +59,19 @@ def test_everything_that_a_cut_says(trainer: Trainer) -> None:
 
 
 def test_some_harmonics_stay_and_the_others_stay_gone(trainer: Trainer) -> None:
-    count = len(trainer.scene)
-    trainer.scene.gaussians.sh.data[: count // 2, 1:] = 0  # these cannot be worth anything
+    count = len(trainer.model.scene)
+    trainer.model.scene.gaussians.sh.data[: count // 2, 1:] = 0  # these cannot be worth anything
     apply_cut(trainer, Cut(harmonics=1e-6), torch.zeros(count))
-    frozen = trainer.colours.frozen_rest()
+    frozen = trainer.model.colours.frozen_rest()
     if frozen is None:
         pytest.skip("in this scene no harmonics pay")
     trainer.step()
     assert bool(frozen[: count // 2].all())
-    assert not bool(trainer.scene.gaussians.sh[frozen, 1:].any())
+    assert not bool(trainer.model.scene.gaussians.sh[frozen, 1:].any())
 
 
 def test_nothing_is_taken_by_no_cut(trainer: Trainer, end: Checkpoint, config: Config) -> None:
-    apply_cut(trainer, Cut(), torch.zeros(len(trainer.scene)))
+    apply_cut(trainer, Cut(), torch.zeros(len(trainer.model.scene)))
     assert cut_config(config, Cut()) == config
     assert str(Cut()) == "nothing"
     for name, x in trainer.checkpoint().tensors.items():

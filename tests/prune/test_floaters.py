@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.gaussians import Gaussians
+from dyngs.kinds import assemble
 from dyngs.prune import floaters as module
 from dyngs.prune.floaters import floaters
 from dyngs.runs.checkpoint import load_run
@@ -31,10 +31,10 @@ def trainer(still: Path) -> Trainer:
     trainer = assemble(config_of(still))
     cameras = trainer.images[0].cameras
     before = cameras.centers[0] + 0.3 * cameras.cam_from_world[0, 2, :3]
-    gaussians = trainer.scene.gaussians.detach()
+    gaussians = trainer.model.scene.gaussians.detach()
     tensors = {name: torch.cat([x, x[:1]]) for name, x in gaussians.tensors().items()}
     tensors["means"][-1], tensors["log_scales"][-1], tensors["logit_opacities"][-1] = before, -4.0, 1.0
-    trainer.scene = trainer.scene.with_gaussians(Gaussians(**tensors))
+    trainer.model.begin_with(trainer.model.scene.with_gaussians(Gaussians(**tensors)), trainer.model.training)
     return trainer
 
 
@@ -65,7 +65,7 @@ def test_they_are_removed_before_the_run_is_saved(
 ) -> None:
     """Unless they are too many to be floaters."""
     monkeypatch.setattr(module, "FEWEST_VIEWS", 3)
-    monkeypatch.setattr(module, "floaters", lambda trainer: torch.arange(len(trainer.scene)) < count)
+    monkeypatch.setattr(module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < count)
     run = train(config_of(still, "train.remove_floaters=true", f"run.dir={tmp_path / 'run'}"))
     assert len(load_run(run).scene) == 300 - removed
     said = capsys.readouterr().err
@@ -78,7 +78,7 @@ def test_few_views_or_no_wish_leave_all(
     keys: tuple[str, ...], still: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "FEWEST_VIEWS", 3 if "false" in keys[0] else 20)
-    monkeypatch.setattr(module, "floaters", lambda trainer: torch.arange(len(trainer.scene)) < 2)
+    monkeypatch.setattr(module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < 2)
     assert len(load_run(train(config_of(still, *keys, f"run.dir={tmp_path / 'run'}"))).scene) == 300
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from tiny_fields import busy_config
 
-from dyngs.build import assemble
 from dyngs.config import PruneConfig
+from dyngs.kinds import assemble
 from dyngs.prune.cut import Cut
 from dyngs.prune.search import Candidate, Limit, Search, _fewest, _halved, evenly_held_out
 from dyngs.training.trainer import Trainer

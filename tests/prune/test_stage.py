@@ -11,7 +11,6 @@ from tiny_fields import KINDS, busy_config
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import (
     Config,
@@ -26,9 +25,10 @@ from dyngs.config import (
 from dyngs.config.io import load_resolved
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.scene import DynamicScene
+from dyngs.gaussians.densify import Densifier
+from dyngs.kinds import assemble
 from dyngs.prune.stage import Pruned, PruneStage, distinct_cameras, prune_
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.static.fixed import FixedDensifier
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
@@ -101,13 +101,13 @@ def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
     """No noise, no relocation: the number stays, and the state of the strategy is gone."""
     strategy = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90)
     trainer = trained(still_config(still, tmp_path, strategy=strategy))
-    before = len(trainer.scene.gaussians)
+    before = len(trainer.model.scene.gaussians)
     found = prune_(trainer)
     assert found.before == before
-    assert isinstance(trainer.densifier, FixedDensifier)
+    assert isinstance(trainer.model.densifier, Densifier)
     for _ in range(4):
         trainer.step()
-    assert len(trainer.scene.gaussians) == found.after == before - before // 2
+    assert len(trainer.model.scene.gaussians) == found.after == before - before // 2
 
 
 def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
@@ -120,13 +120,13 @@ def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
 def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> None:
     stage = STAGE.model_copy(update={"score": score})
     trainer = trained(moving_config(moving, tmp_path, "trajectory", stage))
-    before = trainer.scene.gaussians.detach()
+    before = trainer.model.scene.gaussians.detach()
     found = prune_(trainer)
-    after = trainer.scene.gaussians
+    after = trainer.model.scene.gaussians
     assert (found.before, found.after) == (len(before), len(after))
     assert found.after == len(before) - len(before) // 2
     assert _all_rows_of(after.means, before.means)
-    assert isinstance(trainer.scene, DynamicScene)
+    assert isinstance(trainer.model.scene, DynamicScene)
     assert trainer.num_moving <= len(after)
 
 
@@ -138,14 +138,14 @@ def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     """What no key time sees is not drawn, and receives no gradient."""
     trainer = trained(moving_config(moving, tmp_path, "trajectory"))
     prune_(trainer)
-    scene = trainer.scene
+    scene = trainer.model.scene
     assert scene.masks is not None
     image = trainer.images[3]
-    drawn = trainer.training.moment(scene, image, trainer.done + 1)
+    drawn = trainer.model.training.time_step(scene, image, trainer.done + 1)
     active = scene.masks.active(scene.masks.interval(image.time or 0.0))
     assert len(drawn.gaussians) == len(active)
     drawn.gaussians.means.sum().backward()
-    grad = trainer.scene.gaussians.means.grad
+    grad = trainer.model.scene.gaussians.means.grad
     assert grad is not None
     assert torch.equal(torch.nonzero(grad.any(1))[:, 0], active)
 

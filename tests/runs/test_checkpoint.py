@@ -17,13 +17,14 @@ import torch
 from forged import CONTENTS, contents, forged, one_line, require_drawable, stored_as_they_are
 from moving_scene import MOVING_ROWS, TRAIN_TIMES, moved_x, write_moving_run
 
-from dyngs.build import restored_scene
 from dyngs.config import Config, DataConfig, RunConfig, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
 from dyngs.files import tensor_file
 from dyngs.files.tensor_file import write_tensors
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.filters import fuse_filter
+from dyngs.kinds import restored_scene
 from dyngs.runs import checkpoint
 from dyngs.runs.checkpoint import (
     Checkpoint,
@@ -35,7 +36,6 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.static.filters import fuse_filter
 from dyngs.storage.tensors import drawable
 
 REPOSITORY = Path(__file__).parents[2]

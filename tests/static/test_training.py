@@ -7,10 +7,10 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
 from dyngs.state import part_of, tensors_of
-from dyngs.static.filters import filter_std, fuse_filter
 from dyngs.static.scene import StaticScene
-from dyngs.static.training import FilterUpdate, StaticTraining
+from dyngs.static.training import StaticTraining
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
 
@@ -32,7 +32,7 @@ def _image(time: float | None = None) -> Image:
 def test_without_filter_parameters_pass_through() -> None:
     training, gaussians = StaticTraining(FilterUpdate()), _gaussians(2.0)
     scene = training.first_scene(gaussians)
-    moment = training.moment(scene, _image(), 1)
+    moment = training.time_step(scene, _image(), 1)
     assert moment.gaussians is gaussians
     assert moment.penalties == {}
     assert training.optimize(scene, 1) == 0
@@ -48,7 +48,7 @@ def test_nothing_depends_on_time() -> None:
     scene = training.first_scene(_gaussians(2.0, 7))
     assert scene.num_moving == 0
     assert training.all_moving(scene, 1.0) is scene
-    drawn = [training.moment(scene, _image(time), 1).gaussians for time in (None, 0.0, 1.0)]
+    drawn = [training.time_step(scene, _image(time), 1).gaussians for time in (None, 0.0, 1.0)]
     assert all(x is scene.gaussians for x in drawn)
 
 
@@ -63,7 +63,7 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
     with_near, with_far = (fuse_filter(far, filter_std(x.means, [_camera()])) for x in (near, far))
 
     def drawn(scene: StaticScene) -> Gaussians:
-        return training.moment(scene.with_gaussians(far), _image(), 1).gaussians
+        return training.time_step(scene.with_gaussians(far), _image(), 1).gaussians
 
     scene = training.after_step(training.first_scene(near).with_gaussians(far), 50, False)
     assert torch.equal(drawn(scene).log_scales, with_near.log_scales)
@@ -80,6 +80,6 @@ def test_state_goes_round() -> None:
     training = StaticTraining(FilterUpdate([_camera()]))
     first = training.first_scene(_gaussians(2.0))
     stored = part_of(tensors_of(first.state()), "model")
-    second = training.restored(_gaussians(4.0), stored, first)
-    drawn = (training.moment(scene, _image(), 1).gaussians.log_scales for scene in (first, second))
+    second = training.restored(_gaussians(4.0), stored)
+    drawn = (training.time_step(scene, _image(), 1).gaussians.log_scales for scene in (first, second))
     assert torch.equal(*drawn)

@@ -9,10 +9,10 @@ import pytest
 import torch
 from moving_scene import write_moving_run
 
-from dyngs.build import restored_scene
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import Scene
+from dyngs.kinds import restored_scene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.storage.file import decoded
 from dyngs.storage.measure import COMPARED, FACTORS, StoragePlan, coarsest_file, storage_plan

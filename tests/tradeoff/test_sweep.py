@@ -20,7 +20,8 @@ from dyngs.api.train import num_cores, train
 from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
-from dyngs.evaluate.report import evaluate_run, render_options
+from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians.scene import render_options
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
 from dyngs.tradeoff.measure import render_options_of
 from dyngs.tradeoff.measurements import Measurement, read_measurement
@@ -104,7 +105,7 @@ def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: Va
 def test_on_a_gpu_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     briefly = replace(PLAN, variations=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
     expected = sweep(VariantRuns(runs.run_dir, tmp_path / "here", 1), briefly, lambda line: None)
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
         there = VariantRuns(runs.run_dir, tmp_path / "there", 1)
         found = sweep(there, replace(briefly, device=GPU), lambda line: None)

@@ -8,8 +8,8 @@ import torch
 from tiny_people import NET, people, person
 
 from dyngs.config import Config
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.prediction.network import predict_gaussians
-from dyngs.static.rates import Rates
 from dyngs.training.adaptation import adapt_network
 from dyngs.training.prediction import Filmed, human_options, new_network, scene_of
 
@@ -36,7 +36,7 @@ def error_after(shown: Filmed, steps: int) -> float:
         avatar = predict_gaussians(shown.sitter, shown.look(views), mean, network, NET.min_silhouette_fraction)
         scene, white = scene_of(human_options(NET), avatar, Rates(1))[0], torch.ones(3)
         return sum(
-            (scene.render(image.cameras, scene.moment(image.time), background=white).rgb[0] - image.composite(white))
+            (scene.render(image.cameras, scene.time_step(image.time), background=white).rgb[0] - image.composite(white))
             .abs()
             .mean()
             .item()

@@ -10,8 +10,8 @@ import pytest
 
 from dyngs.config import Config
 from dyngs.config.io import load_config
+from dyngs.models.schedule import image_divisor
 from dyngs.training.clock import Forecast
-from dyngs.training.schedule import image_divisor
 
 STEPS = 6000
 

@@ -26,12 +26,13 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.deform.schedule import deform_schedule
 from dyngs.errors import DyngsError
+from dyngs.gaussians.schedule import Rates, active_sh_degree
 from dyngs.human.synthetic.capture import write_human_capture
+from dyngs.models.schedule import image_divisor
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.static.rates import Rates
 from dyngs.training.extend import told, with_length
-from dyngs.training.schedule import active_sh_degree, deform_schedule, image_divisor
 from dyngs.training.trainer import StepReport, Trainer
 
 KINDS = ("default", "mcmc", "control_nodes", "human")

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from tiny_fields import busy_config, tiny_options, write_tiny_capture
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -28,6 +27,7 @@ from dyngs.config import (
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.limits import most_gaussians, require_possible, room, within_cap
 from dyngs.training.trainer import Trainer
@@ -68,7 +68,7 @@ def largest_count(trainer: Trainer) -> int:
     counts = []
     while trainer.done < trainer.config.train.steps:
         trainer.step()
-        counts.append(len(trainer.scene.gaussians))
+        counts.append(len(trainer.model.scene.gaussians))
     return max(counts)
 
 
@@ -140,12 +140,12 @@ def test_a_size_without_room_is_refused_and_the_one_named_is_not(model: StaticMo
 
 def test_what_contradicts_is_refused(tmp_path: Path) -> None:
     require_possible(NOTHING)
-    with pytest.raises(DyngsError, match=r"budget.max_mb: a network"):
+    with pytest.raises(DyngsError, match=r"budget.max_mb: model.kind=human_predictor has no Gaussians"):
         require_possible(limited(NOTHING.model_copy(update={"model": HumanPredictorModel()}), max_mb=5.0))
     both = NOTHING.model_copy(update={"prune": PruneConfig(fraction=0.5), "run": RunConfig(dir=tmp_path / "run")})
     with pytest.raises(DyngsError, match=r"train.minutes: .*dyngs prune"):
         train(timed(both, 5.0))
-    with pytest.raises(DyngsError, match=r"train.minutes: a network"):
+    with pytest.raises(DyngsError, match=r"train.minutes: model.kind=human_predictor is trained for"):
         require_possible(timed(NOTHING.model_copy(update={"model": HumanPredictorModel()}), 5.0))
     assert not (tmp_path / "run").exists()
 

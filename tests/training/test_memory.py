@@ -10,7 +10,6 @@ import pytest
 from pretend_gpu import GPU, pretend_gpu
 from tensor_bytes import TensorBytes
 
-from dyngs.build import assemble
 from dyngs.config import (
     Config,
     DataConfig,
@@ -25,6 +24,7 @@ from dyngs.config import (
 )
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.training import memory
 from dyngs.training.memory import (
     MemoryForecast,
@@ -72,7 +72,7 @@ def _config(capture: Path, **changes: object) -> Config:
 
 
 def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     monkeypatch.setattr(memory, "gpu_memory", lambda _: (3 * GB, 8 * GB))
     monkeypatch.setattr("dyngs.data.loader.gpu_memory", lambda _: (2000, 8 * GB))
     config = _config(capture, strategy=DefaultStrategy(max_gaussians=10**7), train=TrainConfig(steps=30_000))
@@ -200,8 +200,8 @@ def _peak(config: Config, steps: int) -> tuple[int, int]:
     """The most bytes of tensors in a run of ``steps``, in which all may move, and the number of Gaussians."""
     with TensorBytes() as found:
         trainer = assemble(config)
-        if not trainer.scene.is_static or trainer.scene.times:
-            trainer.scene = trainer.training.all_moving(trainer.scene, trainer.extent)
+        if not trainer.model.scene.is_static or trainer.model.scene.times:
+            trainer.model.exchange(trainer.model.training.all_moving(trainer.model.scene, trainer.extent))
             trainer.done = 25  # past the step at which motion begins
         found.most = found.now
         for _ in range(steps):

@@ -35,7 +35,7 @@ def config(folder: Path, run: Path, **changes: object) -> Config:
 def assembled(config: Config) -> NetworkTrainer:
     """The trainer of its network, before the first step."""
     assert isinstance(config.model, HumanPredictorModel)
-    return assemble_network(config, config.model)
+    return assemble_network(config)
 
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) -> None:

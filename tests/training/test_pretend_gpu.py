@@ -11,17 +11,16 @@ from pretend_gpu import GPU, OnGpu, pretend_gpu
 from tiny_people import NET, people
 
 from dyngs.api.train import train
-from dyngs.build import assemble
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.images import write_split_images
+from dyngs.kinds import assemble
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import open_run
-from dyngs.state import tensors_of
 from dyngs.training.prediction import assemble_network
-from dyngs.training.state import Checkpoint
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -33,7 +32,7 @@ def config_of(kind: str, root: Path, *more: str) -> Config:
 
 def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.device) -> Trainer:
     """The trainer after all steps."""
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: device)
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: device)
     trainer = assemble(config)
     while trainer.done < config.train.steps:
         trainer.step()
@@ -65,12 +64,12 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     """The same kernels compute, so that not a bit may differ; an operator given tensors of both devices raises."""
     kind, capture, more = CASES[name]
     config = config_of(kind, request.getfixturevalue(capture), *more)
-    expected = tensors_of(trained(config, monkeypatch, torch.device("cpu")).state())
+    expected = trained(config, monkeypatch, torch.device("cpu")).checkpoint().tensors
     with pretend_gpu():
         trainer = trained(config, monkeypatch, GPU)
-        assert all(isinstance(x, OnGpu) for x in trainer.scene.gaussians.tensors().values())
+        assert all(isinstance(x, OnGpu) for x in trainer.model.scene.gaussians.tensors().values())
         found = trainer.checkpoint().tensors
-        assert len(trainer.scene) != 100 or name not in ("growing", "mcmc", "mip"), "the set was to change"
+        assert len(trainer.model.scene) != 100 or name not in ("growing", "mcmc", "mip"), "the set was to change"
     assert found.keys() == expected.keys()
     assert [key for key, x in expected.items() if not torch.equal(found[key], x)] == []
 
@@ -85,7 +84,7 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
         """After the last step but one and the last, which is done on what was stored."""
         monkeypatch.setattr("dyngs.training.prediction.device_for", lambda _: device)
         config = Config.model_validate({"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}})
-        trainer, resumed = assemble_network(config, NET), assemble_network(config, NET)
+        trainer, resumed = assemble_network(config), assemble_network(config)
         for _ in range(steps - 1):
             trainer.step()
         found = [trainer.checkpoint()]
@@ -102,12 +101,12 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
 
 def test_a_network_too_large_for_the_kernel_is_computed_by_torch(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_of("static", still, *STATIC, "colour.kind=network")
-    expected = trained(config, monkeypatch, torch.device("cpu")).colours.network
+    expected = trained(config, monkeypatch, torch.device("cpu")).model.colours.network
     assert expected is not None
     monkeypatch.setattr("dyngs.ops.perceptron.GPU_WIDTH", 31)
     monkeypatch.setattr("dyngs.ops.perceptron.perceptron_op", None)  # the CPU has had it
     with pretend_gpu():
-        network = trained(config, monkeypatch, GPU).colours.network
+        network = trained(config, monkeypatch, GPU).model.colours.network
         assert network is not None
         found = network.layers[0].weight.detach().cpu()
     torch.testing.assert_close(found, expected.layers[0].weight, rtol=1e-3, atol=1e-4)
@@ -115,21 +114,21 @@ def test_a_network_too_large_for_the_kernel_is_computed_by_torch(still: Path, mo
 
 def test_a_run_goes_on_there_from_a_checkpoint(still: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_of("static", still, *STATIC, "camera.refine=always", "train.exposure=always")
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: torch.device("cpu"))
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: torch.device("cpu"))
     begun, expected = assemble(config), assemble(config)
     for _ in range(10):
         begun.step()
     stored = begun.checkpoint()
     expected.restore(stored)
     with pretend_gpu():
-        monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+        monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
         resumed = assemble(config, restored=True)
         resumed.restore(stored)
         for _ in range(10):
             expected.step()
             resumed.step()
         found = resumed.checkpoint().tensors
-    assert [key for key, x in tensors_of(expected.state()).items() if not torch.equal(found[key], x)] == []
+    assert [key for key, x in expected.checkpoint().tensors.items() if not torch.equal(found[key], x)] == []
 
 
 @pytest.mark.parametrize("name", ["static", "nodes", "hexplane", "human"])
@@ -141,7 +140,7 @@ def test_how_often_the_host_waits_in_a_step(
     long = ("train.steps=40", "strategy.kind=fixed")  # nothing but steps happens in those that are looked at
     config = config_of(kind, request.getfixturevalue(capture), *more, *long)
     with pretend_gpu() as gpu:
-        monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+        monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
         trainer = assemble(config)
         for _ in range(8):
             trainer.step()
@@ -217,6 +216,6 @@ def test_with_limits_and_pruning_it_ends_with_the_same_bytes(
         return [checkpoint_paths(folder)[-1].read_bytes(), (folder / EXPORT_FOLDER / SCENE_FILE).read_bytes()]
 
     expected = run("cpu")
-    monkeypatch.setattr("dyngs.build.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
         assert run("GPU") == expected

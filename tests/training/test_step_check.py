@@ -23,13 +23,13 @@ def image() -> Image:
 
 def test_the_loss_is_the_sum_of_its_terms(image: Image) -> None:
     terms = {"image": torch.tensor(0.5, requires_grad=True), "alpha": torch.tensor(0.125, dtype=torch.float64)}
-    assert StepCheck(terms, random_scene().gaussians, CPU).loss(3, image, MOVES_BY) == 0.625
-    assert StepCheck(terms, None, CPU).loss(3, image, MOVES_BY) == 0.625
+    assert StepCheck(terms, random_scene().gaussians.tensors(), CPU).loss(3, image, MOVES_BY) == 0.625
+    assert StepCheck(terms, {}, CPU).loss(3, image, MOVES_BY) == 0.625
 
 
 def test_the_value_is_that_of_the_moment_of_asking(image: Image) -> None:
     term = torch.tensor(0.5)
-    check = StepCheck({"image": term}, None, CPU)
+    check = StepCheck({"image": term}, {}, CPU)
     term.fill_(torch.nan)
     assert check.loss(3, image, MOVES_BY) == 0.5
 
@@ -39,7 +39,7 @@ def test_the_value_is_that_of_the_moment_of_asking(image: Image) -> None:
 def test_a_term_that_is_not_finite_is_named(image: Image, name: str, advice: str, value: float) -> None:
     terms = {"image": torch.tensor(0.5), "alpha": torch.tensor(0.1)} | {name: torch.tensor(value)}
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': the loss term '{name}' is {value}; {advice}"):
-        StepCheck(terms, None, CPU).loss(3, image, MOVES_BY)
+        StepCheck(terms, {}, CPU).loss(3, image, MOVES_BY)
 
 
 def test_gaussians_that_are_not_finite_come_first(image: Image) -> None:
@@ -49,4 +49,4 @@ def test_gaussians_that_are_not_finite_come_first(image: Image) -> None:
     terms = {"image": torch.tensor(torch.nan)}
     message = r"the field makes means, quats at 0\.25 not finite; lower the rates in model\.deform$"
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': {message}"):
-        StepCheck(terms, gaussians, CPU).loss(3, image, MOVES_BY)
+        StepCheck(terms, gaussians.tensors(), CPU).loss(3, image, MOVES_BY)

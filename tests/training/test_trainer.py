@@ -16,7 +16,6 @@ import torch
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
-from dyngs.build import assemble, restored_scene
 from dyngs.config import (
     AutoColour,
     Config,
@@ -36,11 +35,12 @@ from dyngs.errors import DyngsError
 from dyngs.files.tensor_file import write_tensors
 from dyngs.files.write import write_image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.gaussians.scene import Moment, Scene, SceneTraining
+from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.kinds import GaussianTrainer, assemble, restored_scene
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
 from dyngs.state import Role, State, with_role
-from dyngs.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _trainer(capture: Path, **data: object) -> Trainer:
+def _trainer(capture: Path, **data: object) -> GaussianTrainer:
     return assemble(
         Config(
             data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
@@ -78,8 +78,10 @@ class _LiftedScene(Scene):
     def rows(self) -> Tensor:
         return torch.arange(len(self))
 
-    def moment(self, time: float | None) -> Moment:
-        return Moment(self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time)
+    def time_step(self, time: float | None) -> GaussianTimeStep:
+        return GaussianTimeStep(
+            self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time
+        )
 
     def edited(self, edit: TopologyEdit) -> _LiftedScene:
         return replace(self, gaussians=self.gaussians.edited(edit))
@@ -88,7 +90,7 @@ class _LiftedScene(Scene):
         return {}
 
 
-class _Lifted:
+class _Lifted(SceneTraining[_LiftedScene]):
     """How it is trained; what it has done is part of its state."""
 
     moves_by = ("field", "model.deform")
@@ -100,9 +102,9 @@ class _Lifted:
     def trains_on(self, time: float | None, step: int) -> bool:
         return True
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         penalties = {"height": self.penalty * scene.gaussians.means[:, 2].abs().sum()} if self.penalty else {}
-        return replace(scene.moment(image.time), penalties=penalties)
+        return replace(scene.time_step(image.time), penalties=penalties)
 
     def optimize(self, scene: _LiftedScene, step: int) -> int:
         self.steps.append(step)
@@ -125,29 +127,29 @@ class _Lifted:
 
     def follow(self, edit: TopologyEdit) -> None: ...
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> _LiftedScene:
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
         self.steps = tensors["steps"].tolist()
-        return _LiftedScene(gaussians=gaussians, options=like.options, background=like.background)
+        return _LiftedScene(gaussians=gaussians)
 
     def state(self) -> State:
         return with_role({"steps": torch.tensor(self.steps)}, Role.TRAINING)
 
 
-def _trained_by(trainer: Trainer, training: SceneTraining[Any]) -> Trainer:
+def _trained_by(trainer: GaussianTrainer, training: SceneTraining[Any]) -> GaussianTrainer:
     """``trainer`` with its Gaussians in a scene of another kind."""
-    trainer.scene = _LiftedScene(gaussians=trainer.optimizer.parameters)
-    trainer.training = training
+    trainer.model.training = training
+    trainer.model.exchange(_LiftedScene(gaussians=trainer.model.scene.gaussians))
     return trainer
 
 
 def test_a_scene_of_another_kind_is_trained(capture: Path) -> None:
     training = _Lifted()
     trainer = _trained_by(_trainer(capture), training)
-    before = trainer.scene.gaussians.means.detach().clone()
+    before = trainer.model.scene.gaussians.means.detach().clone()
     losses = [trainer.step().loss for _ in range(30)]
     assert training.steps == list(range(1, 31))
     assert sum(losses[-4:]) < sum(losses[:4])
-    assert not torch.equal(trainer.scene.gaussians.means, before)
+    assert not torch.equal(trainer.model.scene.gaussians.means, before)
     other = _trained_by(_trainer(capture), _Lifted())
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
@@ -158,11 +160,11 @@ def test_penalties_of_the_training_are_part_of_the_loss(capture: Path) -> None:
     penalizing = _Lifted()
     penalizing.penalty = 0.01
     plain, penalized = _trained_by(_trainer(capture), _Lifted()), _trained_by(_trainer(capture), penalizing)
-    heights = plain.optimizer.parameters.means.detach()[:, 2].abs()
+    heights = plain.model.scene.gaussians.means.detach()[:, 2].abs()
     assert penalized.step().loss == pytest.approx(plain.step().loss + 0.01 * float(heights.sum()), rel=1e-5)
     for _ in range(20):
         penalized.step()
-    assert penalized.optimizer.parameters.means.detach()[:, 2].abs().mean() < heights.mean()
+    assert penalized.model.scene.gaussians.means.detach()[:, 2].abs().mean() < heights.mean()
 
 
 class _Growing(_Lifted):
@@ -183,9 +185,9 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
     counts = []
     for _ in range(4):
         trainer.step()
-        counts.append(len(trainer.scene.gaussians))
+        counts.append(len(trainer.model.scene.gaussians))
         if trainer.done == 2:
-            moments = trainer.optimizer.state()["exp_avg_sq.means"].tensor
+            moments = trainer.model.optimizer_state["exp_avg_sq.means"].tensor
             assert moments[:50].any()
             assert not moments[50:].any()
             other = _trained_by(_trainer(capture), _Growing())
@@ -193,7 +195,7 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
     assert counts == [50, 100, 100, 100]
     for _ in range(2):
         other.step()
-    assert torch.equal(other.optimizer.parameters.means, trainer.scene.gaussians.means)
+    assert torch.equal(other.model.scene.gaussians.means, trainer.model.scene.gaussians.means)
 
 
 # --- kinds of colour --------------------------------------------------------------------------------------------------
@@ -213,7 +215,9 @@ def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _coloured(capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None) -> Trainer:
+def _coloured(
+    capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None
+) -> GaussianTrainer:
     return assemble(
         Config(
             data=DataConfig(root=capture),
@@ -253,16 +257,16 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
     seen, findings, counts = set(), {}, set()
     for step in range(1, 41):
         report = trainer.step()
-        counts.add(len(trainer.scene.gaussians))
+        counts.add(len(trainer.model.scene.gaussians))
         if report.finding is not None:
             findings[step] = report.finding
-            dropped = trainer.colours.frozen_rest()
+            dropped = trainer.model.colours.frozen_rest()
         if step <= MEASURED_AFTER:
             seen.add(report.image.name)
     assert len(seen) == 6
     assert list(findings) == [MEASURED_AFTER]
     assert len(counts) > 4
-    sh, frozen = trainer.scene.gaussians.sh, trainer.colours.frozen_rest()
+    sh, frozen = trainer.model.scene.gaussians.sh, trainer.model.colours.frozen_rest()
     if name == "none pays":
         assert "does not pay" in findings[MEASURED_AFTER]
         assert sh.shape[1] == 1
@@ -278,11 +282,11 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
     trainer = _coloured(seven_views, COLOURS["network"])
     for _ in range(30):
         trainer.step()
-    assert trainer.scene.gaussians.sh_degree == 0
-    scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.colours.network
+    assert trainer.model.scene.gaussians.sh_degree == 0
+    scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.model.colours.network
     assert network is not None
     camera = trainer.images[0].cameras
-    gaussians, shader = trainer.scene.gaussians.detach(), network.shader(None, None)
+    gaussians, shader = trainer.model.scene.gaussians.detach(), network.shader(None, None)
     drawn = scene.render(camera, options=RenderOptions(), background=torch.zeros(3)).rgb
     assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
     assert not torch.equal(drawn, render(gaussians, camera).rgb)
@@ -293,30 +297,30 @@ def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> Non
 class _Exploding(_Lifted):
     """From step 3 on it draws positions and rotations that are not finite."""
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         if step < 3:
-            return super().moment(scene, image, step)
+            return super().time_step(scene, image, step)
         now, factor = scene.gaussians, float("nan")
-        return Moment(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
+        return GaussianTimeStep(now.replace(means=now.means * factor, quats=now.quats * factor), image.time)
 
 
 class _Overweight(_Lifted):
     """From step 3 on it has an infinite penalty."""
 
-    def moment(self, scene: _LiftedScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: _LiftedScene, image: Image, step: int) -> GaussianTimeStep:
         self.penalty = 0.0 if step < 3 else float("inf")
-        return super().moment(scene, image, step)
+        return super().time_step(scene, image, step)
 
 
-def _stops_in_step_3(trainer: Trainer) -> str:
+def _stops_in_step_3(trainer: GaussianTrainer) -> str:
     """The error's message; the trainer is left as after step 2."""
     trainer.step()
     trainer.step()
-    before = {name: x.detach().clone() for name, x in trainer.scene.gaussians.tensors().items()}
+    before = {name: x.detach().clone() for name, x in trainer.model.scene.gaussians.tensors().items()}
     with pytest.raises(DyngsError) as caught:
         trainer.step()
     assert trainer.done == 2
-    assert all(torch.equal(x, before[name]) for name, x in trainer.scene.gaussians.tensors().items())
+    assert all(torch.equal(x, before[name]) for name, x in trainer.model.scene.gaussians.tensors().items())
     return str(caught.value)
 
 
@@ -427,7 +431,7 @@ def trained_state(root: Path) -> dict[str, Tensor]:
     trainer = _trainer(root)
     for _ in range(4):
         trainer.step()
-    return trainer.scene.gaussians.tensors()
+    return trainer.model.scene.gaussians.tensors()
 
 
 def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> None:
@@ -477,7 +481,7 @@ def test_two_equal_views_in_a_step_are_one_seen_twice(tmp_path: Path) -> None:
         trainer = _trainer(tmp_path)
         trainer.config = trainer.config.model_copy(update={"train": TrainConfig(steps=100, batch_size=batch)})
         losses = [trainer.step().loss for _ in range(4)]
-        states.append((trainer.scene.gaussians.detach().tensors(), trainer.densifier.state(), losses))
+        states.append((trainer.model.scene.gaussians.detach().tensors(), trainer.model.densifier.state(), losses))
     (one, seen, losses), (two, twice, others) = states
     assert all(torch.equal(x, two[name]) for name, x in one.items())
     assert torch.equal(2 * seen["seen"], twice["seen"])

@@ -39,7 +39,7 @@ class Onlooker:
                         other, _ = looking_at_balls()
                         assert other.eye is not None
                         session.move(other.eye)
-                self.drawn.after_step(trainer.scene)
+                self.drawn.after_step(trainer.model.scene)
 
 
 @pytest.mark.parametrize("preset", ["static", "dynamic"])

@@ -8,6 +8,9 @@ from pydantic import Field
 
 from dyngs.config.keys.section import Positive, Section
 
+MEASURED_AT = 0.6
+"""Fraction of a run after which it is measured whose harmonics pay."""
+
 
 class ColourSection(Section):
     """Keys that all kinds of colour share."""
@@ -17,6 +20,14 @@ class ColourSection(Section):
         ge=0,
         description="weight of the mean of -o ln o over opacities o, which removes faint Gaussians; MEGA: 5e-4",
     )
+
+    def stored_degree(self, sh_degree: int) -> int:
+        """Return the degree of the harmonics that training begins with, of ``model.sh_degree``."""
+        return sh_degree
+
+    def measured_after(self, steps: int) -> int | None:
+        """Return the step after which it is measured whose harmonics pay; None where it never is."""
+        return None
 
 
 class ShColour(ColourSection):
@@ -41,6 +52,10 @@ class NetworkColour(ColourSection):
         default=0.01, description="learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run"
     )
 
+    def stored_degree(self, sh_degree: int) -> int:
+        """Return 0: the network gives what depends on the view."""
+        return 0
+
 
 class AutoColour(ColourSection):
     """Harmonics only for the Gaussians whose dependence on the view pays on held-out training views."""
@@ -51,3 +66,6 @@ class AutoColour(ColourSection):
         "on every 8th training view",
     )
     tolerance: float = Field(default=0.05, ge=0, description="PSNR that may be lost by it, dB")
+
+    def measured_after(self, steps: int) -> int:
+        return max(1, round(MEASURED_AT * steps))

@@ -49,8 +49,9 @@ class Config(Section):
     @property
     def total_steps(self) -> int:
         """Steps of training and of the last stage, if there is one."""
-        match self.model:
-            case HumanPredictorModel():
-                return self.train.steps
-            case _:
-                return self.train.steps + (self.prune.steps if self.prune.is_wanted else 0)
+        return self.train.steps + (self.prune.steps if self.prune.is_wanted and self.model.made_of_gaussians else 0)
+
+    @property
+    def stored_sh_degree(self) -> int:
+        """Degree of the harmonics that training begins with."""
+        return self.colour.stored_degree(self.model.sh_degree)

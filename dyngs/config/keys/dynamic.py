@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -91,6 +91,9 @@ DeformField = HexplaneField | MlpField | TrajectoryField | ControlNodesField
 class DynamicModel(SceneModel):
     """Canonical Gaussians and a deformation field over time (docs/dynamic.md)."""
 
+    begins_with_points: ClassVar[bool] = True
+    may_move: ClassVar[bool] = True
+
     kind: Literal["dynamic"] = Field(
         default="dynamic", description="canonical Gaussians and a deformation field over time (docs/dynamic.md)"
     )
@@ -134,3 +137,7 @@ class DynamicModel(SceneModel):
     motion_sparsity: float = Field(
         default=0.01, ge=0, description="weight of the mean displacement of the moving Gaussians, in scene extents"
     )
+
+    @property
+    def added_for_motion(self) -> int:
+        return self.num_random_moving

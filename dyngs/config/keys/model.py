@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -10,8 +10,33 @@ from dyngs.config.keys.section import CutOff, Positive, Section
 from dyngs.conventions import RasterizeMode
 
 
-class SceneModel(Section):
-    """Keys that all models share: how Gaussians are coloured and drawn."""
+class ModelSection(Section):
+    """Base of the sections of all kinds, with what code that does not otherwise care for kinds asks of them.
+
+    Attributes:
+        made_of_gaussians: it has Gaussians, which a strategy adds and limits remove.
+        begins_with_points: they begin where the points of the capture are.
+        is_network: it predicts scenes, and is trained on several captures.
+        is_posed: a body moves it: priors on motion say nothing, and poses are refined instead of cameras.
+        may_move: a field moves it over the times of the capture.
+    """
+
+    made_of_gaussians: ClassVar[bool] = False
+    begins_with_points: ClassVar[bool] = False
+    is_network: ClassVar[bool] = False
+    is_posed: ClassVar[bool] = False
+    may_move: ClassVar[bool] = False
+
+    @property
+    def added_for_motion(self) -> int:
+        """Number of random Gaussians that are added where motion begins."""
+        return 0
+
+
+class SceneModel(ModelSection):
+    """Keys that all models of Gaussians share: how these are coloured and drawn."""
+
+    made_of_gaussians: ClassVar[bool] = True
 
     sh_degree: int = Field(
         default=3, ge=0, le=4, description="degree of the spherical harmonics of a colour; 0: the same from all sides"
@@ -38,5 +63,7 @@ class SceneModel(Section):
 
 class StaticModel(SceneModel):
     """3D Gaussian splatting, Mip-Splatting's filters as options."""
+
+    begins_with_points: ClassVar[bool] = True
 
     kind: Literal["static"] = Field(default="static", description="3D Gaussians of a static scene (3DGS)")

@@ -22,10 +22,10 @@ from dyngs.export.chosen_path import front_of, orbit_around, view_to_show
 from dyngs.export.html.numbers import Lists, add_scene
 from dyngs.files.write import write_text
 from dyngs.human.avatar.posing import LEFT_OUT
+from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.rotation import AXES
-from dyngs.training.views import training_cameras
 
 HERE = Path(__file__).parent
 SCRIPTS = ("data.js", "motion.js", "sort.js", "renderer.js", "camera.js", "player.js", "main.js")

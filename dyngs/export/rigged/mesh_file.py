@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.config.kinds import person_of
+from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
 from dyngs.export.rigged.body import BodyMesh, anchor_normals, body_mesh, rest_vertices
 from dyngs.export.rigged.skeleton import (
@@ -124,8 +124,8 @@ def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTe
     Raises:
         DyngsError: the run is not that of a person, or the template cannot be read.
     """
-    scene, model = avatar_of(run.scene), person_of(run.config)
-    if scene is None or model is None:
+    scene, model = avatar_of(run.scene), run.config.model
+    if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}")
     return scene, load_template(model)
 

@@ -94,7 +94,7 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
     gaussians, seen_along = scene.gaussians, -normals
     if scene.colour is not None:
         upright = scene.playing(rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents))
-        moment = upright.moment(None)
+        moment = upright.time_step(None)
         shader = upright.shader(moment)
         if shader is not None:
             gaussians = with_harmonics(moment.gaussians, shader).gaussians

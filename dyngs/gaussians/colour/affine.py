@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 
 SATURATED = 254.5 / 255
 """A channel this bright may have been any brighter."""

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from dyngs.config import AutoColour, ColourSection, NetworkColour
-from dyngs.config.kinds import MEASURED_AT
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
@@ -178,7 +177,7 @@ class AutoTraining(ColourTraining):
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)
         self.tolerance = options.tolerance
-        self.measured_after = max(1, round(MEASURED_AT * steps))
+        self.measured_after = options.measured_after(steps)
         self.held_out = tuple(range(_HELD_OUT, num_views, HELD_OUT_EVERY))
         self._frozen: Tensor | None = None
 

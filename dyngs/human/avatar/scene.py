@@ -11,7 +11,7 @@ from torch import Tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.parameters import Parameters
-from dyngs.gaussians.scene import Moment, Scene, clamped_time
+from dyngs.gaussians.scene import GaussianTimeStep, Scene
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.corrections import (
     SharedCorrection,
@@ -34,6 +34,7 @@ from dyngs.human.avatar.posing import (
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import check_tree
 from dyngs.human.template.joints import SMPLX_ROWS
+from dyngs.models.renderable import Renderable, clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed, with_role
 from dyngs.tensor_checks import require_indices, require_moments, require_positive, require_tensor
 
@@ -133,7 +134,7 @@ class HumanScene(Scene):
             )
         return self._derived["clip"]
 
-    def moment(self, time: float | None) -> Moment:
+    def time_step(self, time: float | None) -> GaussianTimeStep:
         """Return the person at ``time`` of the clip, clamped to it; None is the first moment.
 
         Who keeps one pose is posed once, but for gradients.
@@ -144,15 +145,15 @@ class HumanScene(Scene):
             self._derived["posed"] = self._posed(None)
         return replace(self._derived["posed"], time=clamped_time(time))
 
-    def _posed(self, time: float | None) -> Moment:
+    def _posed(self, time: float | None) -> GaussianTimeStep:
         now = clamped_time(time)
         return self.in_pose(frame_pose(self.moves_as.at(now), 0), now)
 
-    def in_pose(self, posing: BodyPose, time: float) -> Moment:
+    def in_pose(self, posing: BodyPose, time: float) -> GaussianTimeStep:
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
         offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
-        return Moment(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
+        return GaussianTimeStep(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.
@@ -215,7 +216,7 @@ class HumanScene(Scene):
         return state | {name: StateTensor(x, Role.SHARED) for name, x in given.items()}
 
 
-def avatar_of(scene: Scene) -> HumanScene | None:
+def avatar_of(scene: Renderable) -> HumanScene | None:
     """Return ``scene`` if it is a person, who can be posed; None for any other scene."""
     return scene if isinstance(scene, HumanScene) else None
 

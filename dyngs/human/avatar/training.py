@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -15,8 +14,10 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import Frame
+from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.parameters import Parameters
-from dyngs.gaussians.scene import Moment, Scene
+from dyngs.gaussians.scene import GaussianTimeStep
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
 from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, trust_in
 from dyngs.human.avatar.observations import Subject
@@ -24,7 +25,6 @@ from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor
-from dyngs.static.rates import Rates
 
 NEIGHBOURS = 5
 FRAMES_FROM = 0.25
@@ -38,7 +38,7 @@ WORTH_TELLING = 0.01
 """Least fraction of Gaussians that are hardly seen at which a line says so."""
 
 
-class HumanTraining:
+class HumanTraining(SceneTraining[HumanScene]):
     """See ``SceneTraining``; ``frames`` are numbers of the rows of the clip of training, ``rates`` say how rates fall.
 
     ``views`` are camera and frame of the training views; without any, what they do not show is not filled.
@@ -70,18 +70,7 @@ class HumanTraining:
             shapes=subject.shapes,
         )
 
-    def trains_on(self, time: float | None, step: int) -> bool:
-        """Return true: every image, always."""
-        return True
-
-    def window(self, step: int) -> tuple[float, float]:
-        """Return [0, 1]: all times, always."""
-        return 0.0, 1.0
-
-    def extend(self, scene: HumanScene, seen: tuple[float, float], step: int) -> None:
-        """Do nothing: all times are trained on."""
-
-    def moment(self, scene: HumanScene, image: Image, step: int) -> Moment:
+    def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
         """Return the Gaussians in the pose of ``image``, and the regularizers.
 
         Raises DyngsError: the image's frame has no pose.
@@ -98,7 +87,7 @@ class HumanTraining:
                 penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
         frame = Frame(scene.gaussians.means, posing.rotations[0])
-        return Moment(gaussians, image.time, frame, penalties)
+        return GaussianTimeStep(gaussians, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
         """Update the corrections."""
@@ -114,9 +103,6 @@ class HumanTraining:
     def learned(self, scene: HumanScene) -> Parameters:
         """Return the corrections."""
         return scene.learned
-
-    def after_step(self, scene: HumanScene, step: int, edited: bool) -> HumanScene:
-        return scene
 
     def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene as it is, and after the last step new values for what the images hardly show."""
@@ -140,18 +126,13 @@ class HumanTraining:
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
         return scene, EditResult(None, changes, finding=line if hardly >= WORTH_TELLING else None)
 
-    def all_moving(self, scene: HumanScene, extent: float) -> HumanScene:
-        """Return ``scene``: they do."""
-        return scene
-
     def follow(self, edit: TopologyEdit) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
         self._given_weights = self._near = self._images = None
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor], like: Scene) -> HumanScene:
-        scene = HumanScene.restored(gaussians, tensors)
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self._near, self._given_weights, self._images = tensors.get("near"), None, None
-        return replace(scene, colour=like.colour, options=like.options, background=like.background)
+        return HumanScene.restored(gaussians, tensors)
 
     def state(self) -> State:
         return {} if self._near is None else {"near": StateTensor(self._near, Role.TRAINING)}

@@ -24,7 +24,8 @@ from dyngs.config import TrainConfig
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import videos
 from dyngs.gaussians.colour.affine import SATURATED, recoloured
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.model import Look, Loss
+from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
 from dyngs.state import tensors_of
 from dyngs.tensor_checks import require_tensor
@@ -64,7 +65,7 @@ def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | N
     return ViewExposures(beside, options.steps, images)
 
 
-class ViewExposures:
+class ViewExposures(Loss):
     """An affine colour per training image, and their Adam.
 
     Args:
@@ -126,8 +127,12 @@ class ViewExposures:
             shown = recoloured(self.affine(index), image, rendering, background)
         return up_to_white(shown, image.composite(background))
 
+    def __call__(self, look: Look) -> dict[str, Tensor]:
+        """Return the penalty on an image's affine: far from the identity, or from those next to it in time."""
+        return self.penalties(look.index)
+
     def penalties(self, index: int) -> dict[str, Tensor]:
-        """Return penalties on an image's affine: far from the identity, or from those beside it in time."""
+        """Return the penalty on the affine of an image."""
         value = self._values[index]
         total = (self._weights * value.square()).mean()
         beside = self._beside(index)

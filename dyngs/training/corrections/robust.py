@@ -20,7 +20,7 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 from dyngs.tensor_checks import require_indices, require_tensor
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 

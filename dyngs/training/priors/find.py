@@ -12,6 +12,7 @@ from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.images.lens import undistorted_points
 from dyngs.data.loader import ImageLoader
 from dyngs.data.tracks import Tracks, read_tracks
+from dyngs.models.views import training_cameras
 from dyngs.training.priors.agreement import (
     Agreement,
     depth_agreement,
@@ -24,7 +25,6 @@ from dyngs.training.priors.agreement import (
 from dyngs.training.priors.depth_maps import Kind
 from dyngs.training.priors.point_motion import Glance
 from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
-from dyngs.training.views import training_cameras
 
 _NEAR_TIME = 0.1
 """Depth is judged by images whose times differ by less; the less, the less has moved."""

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering, RenderOptions
 from dyngs.gaussians.scene import Scene
+from dyngs.models.model import Look, Loss
 from dyngs.training.priors.depth_maps import Kind, depth_error
 from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
 
@@ -63,7 +63,7 @@ class PointTracks:
 
 
 @dataclass(frozen=True)
-class UsedPriors:
+class UsedPriors(Loss):
     """Priors that agree with the images.
 
     Attributes:
@@ -80,9 +80,8 @@ class UsedPriors:
     masks: bool = False
     lines: list[str] = field(default_factory=list)
 
-    def options(self, options: RenderOptions, image: Image) -> RenderOptions:
-        """Return how an image is drawn: with depth where it has a map that is used."""
-        return options if self.depth is None or image.depth is None else replace(options, depth="expected")
+    def needs_depth(self, image: Image) -> bool:
+        return self.depth is not None and image.depth is not None
 
     def told(self, finding: str | None) -> str | None:
         """Return the lines that have not been told yet, then ``finding``, and forget them; None: there are none."""
@@ -90,65 +89,43 @@ class UsedPriors:
         self.lines.clear()
         return "\n".join(lines) or None
 
-    def terms(
-        self, scene: Scene, image: Image, rendering: Rendering, view: StepView, generator: torch.Generator
-    ) -> dict[str, Tensor]:
-        """Return the weighted losses by name.
-
-        Args:
-            scene: what is trained.
-            image: a training image, perhaps shrunk.
-            rendering: of the scene, with ``options``.
-            view: which view that is, and what may be looked at.
-            generator: chooses the other image of tracks.
-        """
+    def __call__(self, look: Look) -> dict[str, Tensor]:
         found: dict[str, Tensor | None] = {}
+        image, rendering, scene = look.image, look.drawn.rendering, look.model.scene
         if self.depth is not None and image.depth is not None and rendering.depth is not None:
             drawn, alpha = rendering.depth[0], rendering.alpha[0]
             found["depth"] = depth_error(drawn, alpha, image.depth, self.depth, image.mask)
-        if not scene.is_static and image.time is not None:
-            found |= self._motion(scene, image, view, generator)
+        if isinstance(scene, Scene) and not scene.is_static and image.time is not None:
+            found |= self._motion(scene, look)
         return {name: WEIGHTS.get(name, 1.0) * x for name, x in found.items() if x is not None}
 
-    def _motion(
-        self, scene: Scene, image: Image, view: StepView, generator: torch.Generator
-    ) -> dict[str, Tensor | None]:
-        target = self.flow_to.get(view.index)
-        by_flow = target is not None and image.flow is not None and view.may_use(target.time)
-        pair = None if self.tracks is None else self.tracks.pair(view.index, view.may_use, generator)
+    def _motion(self, scene: Scene, look: Look) -> dict[str, Tensor | None]:
+        image, (first, last) = look.image, look.model.window(look.step)
+
+        def may_use(time: float) -> bool:
+            return first <= time <= last
+
+        target = self.flow_to.get(look.index)
+        by_flow = target is not None and image.flow is not None and may_use(target.time)
+        pair = None if self.tracks is None else self.tracks.pair(look.index, may_use, look.generator)
         if not by_flow and pair is None:
             return {}
         canonical = scene.with_gaussians(scene.gaussians.detach())
-        start, here = canonical.moment(image.time).gaussians, image.cameras
+        start, here = canonical.time_step(image.time).gaussians, image.cameras
 
         def drawn(glance: Glance) -> Tensor:
-            there = _sized_as(here, glance.cameras)
-            return displacements(start, canonical.moment(glance.time).gaussians, here, there, view.options)
+            there, options = _sized_as(here, glance.cameras), replace(scene.options, nonfinite="trust")
+            return displacements(start, canonical.time_step(glance.time).gaussians, here, there, options)
 
         found: dict[str, Tensor | None] = {}
         if by_flow and target is not None:
             found["flow"] = flow_error(drawn(target), image)
         if pair is not None and self.tracks is not None:
             glance, begin, end = pair
-            own = self.tracks.glances[view.index].cameras
+            own = self.tracks.glances[look.index].cameras
             begin, end = (x * _scale(cameras, here) for x, cameras in ((begin, own), (end, glance.cameras)))
             found["tracks"] = track_error(drawn(glance), begin, end)
         return found
-
-
-@dataclass(frozen=True)
-class StepView:
-    """A training view in a step.
-
-    Attributes:
-        index: among the training views.
-        may_use: whether a time may be looked at in this step.
-        options: how images are drawn.
-    """
-
-    index: int
-    may_use: Callable[[float], bool]
-    options: RenderOptions
 
 
 def _scale(cameras: Cameras, here: Cameras) -> Tensor:

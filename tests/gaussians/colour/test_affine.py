@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.gaussians.rendering import Rendering
+from dyngs.models.renderable import Rendering
 
 WARM = torch.tensor([[1.2, 0.05, 0.0, 0.02], [0.0, 1.0, -0.03, -0.01], [0.02, 0.0, 0.8, 0.03]])
 WHITE = torch.ones(3)
@@ -18,7 +18,7 @@ WHITE = torch.ones(3)
 
 def shown_as(rgb: Tensor, transmittance: Tensor | None = None) -> Rendering:
     through = torch.zeros_like(rgb[..., 0]) if transmittance is None else transmittance
-    return Rendering(rgb[None], through[None], None, torch.zeros(1, 0, 2, dtype=torch.int32))
+    return Rendering(rgb[None], through[None], None)
 
 
 def image_and_rendering() -> tuple[Image, Rendering]:

@@ -10,11 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.gaussians.rendering import Rendering
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.pose_fit import (
     IMAGES,
@@ -31,7 +29,9 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, joint_transforms
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.kinds import assemble
 from dyngs.metrics import psnr
+from dyngs.models.renderable import Rendering
 
 WHITE = torch.ones(3)
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]]), 16, 12)
@@ -44,7 +44,7 @@ def of_squares(shift: int = 0) -> tuple[Rendering, Image]:
     drawn[4:8, 4 + shift : 8 + shift] = 1
     image = Image("a", CAMERA, 0.5 * truth[..., None].expand(-1, -1, 3).contiguous(), truth, None, None)
     rgb = (0.5 * drawn + 1 - drawn)[..., None].expand(-1, -1, 3).contiguous()
-    return Rendering(rgb[None], (1 - drawn)[None], None, torch.zeros(1, 1, 2)), image
+    return Rendering(rgb[None], (1 - drawn)[None], None), image
 
 
 def test_both_are_zero_for_the_image_itself() -> None:
@@ -107,11 +107,11 @@ def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
         run=RunConfig(threads=1),
     )
     trainer = assemble(config)
-    assert isinstance(trainer.scene, HumanScene)
+    assert isinstance(trainer.model.scene, HumanScene)
     cameras = {tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.images)}
     grow = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None]
     larger = [Cameras(x.cam_from_world, grow * x.intrinsics, SIZE, SIZE) for x in cameras.values()]
-    return trainer.scene, larger
+    return trainer.model.scene, larger
 
 
 def images_of(scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None) -> list[Image]:

@@ -13,6 +13,7 @@ from dyngs.camera import Cameras
 from dyngs.config import HumanModel
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
+from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip, corrected_pose, correction_penalties
 from dyngs.human.avatar.observations import Subject
@@ -24,7 +25,6 @@ from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body_reader import default_template
 from dyngs.state import part_of, tensors_of
-from dyngs.static.rates import Rates
 
 
 def random_clip(frames: int, seed: int = 0) -> MotionClip:
@@ -108,16 +108,16 @@ def test_parts_are_all_or_nothing() -> None:
 def test_one_pose_is_posed_once_and_the_same_at_all_times() -> None:
     still = reloaded(stirred()).playing(random_clip(1))
     with torch.no_grad():
-        first, later = still.moment(0.0), still.moment(0.7)
+        first, later = still.time_step(0.0), still.time_step(0.7)
         assert first.gaussians is later.gaussians
         assert (first.time, later.time) == (0.0, 0.7)
-    fresh = still.moment(0.7)
+    fresh = still.time_step(0.7)
     assert fresh.gaussians is not later.gaussians
     for name, x in fresh.gaussians.detach().tensors().items():
         assert torch.equal(x, later.gaussians.tensors()[name])
     still.changed()
     with torch.no_grad():
-        assert still.moment(0.0).gaussians is not first.gaussians
+        assert still.time_step(0.0).gaussians is not first.gaussians
 
 
 def test_penalties_pull_corrections_back() -> None:

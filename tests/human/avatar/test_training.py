@@ -10,7 +10,6 @@ from synthetic_bodies import model, write_npz
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.build import assemble, restored_scene
 from dyngs.config import (
     Config,
     DataConfig,
@@ -27,6 +26,7 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.joints import mirrored_joints
+from dyngs.kinds import assemble, restored_scene
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.runs.opened import open_run
 from dyngs.training.trainer import Trainer
@@ -57,8 +57,8 @@ def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes:
 
 
 def human(trainer: Trainer) -> HumanScene:
-    assert isinstance(trainer.scene, HumanScene)
-    return trainer.scene
+    assert isinstance(trainer.model.scene, HumanScene)
+    return trainer.model.scene
 
 
 def tensors_after(trainer: Trainer, steps: int) -> dict[str, Tensor]:
@@ -80,7 +80,7 @@ def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path) -> N
     resumed = assemble(config)
     resumed.restore(first.checkpoint())
     assert same(straight, tensors_after(resumed, 4))
-    counts = {len(assemble(config).optimizer.parameters), len(straight["gaussians.means"])}
+    counts = {len(assemble(config).model.scene), len(straight["gaussians.means"])}
     assert len(counts) == 2, "some must be pruned, or this test shows little"
     learned = [straight[f"model.learned.{name}"] for name in ("poses", "trans", "turns", "joints", "weights")]
     assert all(bool((x != 0).any()) for x in learned)
@@ -108,7 +108,7 @@ def test_what_is_played_back_is_what_was_trained(capture: Path, tmp_path: Path, 
     assert (human(trainer).shapes is not None) == own_body
     tensors_after(trainer, 8)
     image = trainer.images[4]
-    drawn = trainer.training.moment(trainer.scene, image, trainer.done + 1).gaussians
+    drawn = trainer.model.training.time_step(trainer.model.scene, image, trainer.done + 1).gaussians
     scene = restored_scene(trainer.checkpoint(), trainer.config.model)
     played = scene.at(image.time)
     torch.testing.assert_close(played.means, drawn.means.detach(), rtol=0, atol=1e-5)
@@ -158,11 +158,11 @@ def test_penalties_are_zero_at_the_start_and_grow_with_offsets(capture: Path) ->
     trainer = assemble(tiny(capture))
     scene, image, options = human(trainer), trainer.images[0], trainer.config.model
     assert isinstance(options, HumanModel)
-    first = trainer.training.moment(scene, image, 1).penalties
+    first = trainer.model.training.time_step(scene, image, 1).penalties
     assert first["offset"].item() == 0
     assert first["smoothness"].item() == 0
     away = scene.gaussians.replace(means=scene.gaussians.means.detach() + torch.tensor([0.01, 0.0, 0.0]))
-    later = trainer.training.moment(scene.with_gaussians(away), image, 1).penalties
+    later = trainer.model.training.time_step(scene.with_gaussians(away), image, 1).penalties
     assert later["offset"].item() == pytest.approx(options.offset_weight, rel=1e-4)
     assert later["smoothness"].item() == pytest.approx(0, abs=1e-9)
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.capture import View
 from dyngs.errors import DyngsError
@@ -22,6 +21,7 @@ from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avat
 from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.kinds import assemble
 from dyngs.training.trainer import Trainer
 
 
@@ -65,7 +65,7 @@ AWAY = torch.tensor([0.03, 0.0, 0.02])
 @pytest.fixture(scope="module")
 def avatar(person: Path) -> HumanScene:
     """A person of a few hundred Gaussians, which was not trained."""
-    scene = new_trainer(person).scene
+    scene = new_trainer(person).model.scene
     assert isinstance(scene, HumanScene)
     return scene
 

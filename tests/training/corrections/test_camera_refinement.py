@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import CameraConfig, Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.data.capture import View
 from dyngs.errors import DyngsError
+from dyngs.kinds import assemble
 from dyngs.training.corrections.camera_refinement import (
     MIN_POSES,
     STARTS,
@@ -243,7 +243,7 @@ def test_without_refinement_nothing_is_kept_for_it(refine: str, still: Path) -> 
     """Auto is decided before a run begins."""
     trainer = trainer_of(still, refine)
     assert trainer.refinement is None
-    assert not any(name.startswith("cameras") for name in trainer.state())
+    assert not any(name.startswith("cameras") for name in trainer.checkpoint().tensors)
 
 
 def test_a_view_that_was_not_trained_on_has_what_is_known_of_its_camera() -> None:

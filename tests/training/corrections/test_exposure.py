@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.kinds import assemble
+from dyngs.models.renderable import Rendering
 from dyngs.training.corrections.exposure import WARM_UP, ViewExposures
 from dyngs.training.trainer import Trainer
 
@@ -21,7 +21,7 @@ STEPS, GAINS = 200, (0.7, 1.0, 1.3, 1.5)
 
 
 def shown(rgb: Tensor) -> Rendering:
-    return Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None, torch.zeros(1, 0, 2, dtype=torch.int32))
+    return Rendering(rgb[None], torch.zeros(1, *rgb.shape[:2]), None)
 
 
 def trained_on(gains: tuple[float, ...], beside: list[list[int]] | None = None, hidden: int = -1) -> ViewExposures:
@@ -155,7 +155,7 @@ def test_without_them_nothing_is_kept_for_them(still: Path, choice: str) -> None
     """Auto is decided before a run begins."""
     trainer = trainer_of(still, choice, StaticModel(sh_degree=0))
     assert trainer.exposures is None
-    assert not any(name.startswith("exposures") for name in trainer.state())
+    assert not any(name.startswith("exposures") for name in trainer.checkpoint().tensors)
 
 
 def test_other_configs_checkpoints_are_refused(still: Path) -> None:

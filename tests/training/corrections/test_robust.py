@@ -10,11 +10,11 @@ import torch
 from flat_wall import BLACK, SIZE, cameras_before_wall, learned, places, seen_from, with_block, with_depth
 from torch import Tensor
 
-from dyngs.build import assemble
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.data.loader import Image
-from dyngs.gaussians.rendering import Rendering
+from dyngs.kinds import assemble
+from dyngs.models.renderable import Rendering
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.training.corrections.robust import EVERY, WARM_UP, RobustMasks
 from dyngs.training.trainer import Trainer
@@ -180,7 +180,7 @@ def test_without_masks_nothing_is_kept_for_them(still: Path, choice: str) -> Non
     """Auto is decided before a run begins."""
     trainer = trainer_of(still, choice)
     assert trainer.robust is None
-    assert not any(name.startswith("robust") for name in trainer.state())
+    assert not any(name.startswith("robust") for name in trainer.checkpoint().tensors)
 
 
 def test_what_moves_has_none(moving: Path) -> None:

@@ -7,11 +7,11 @@ import torch
 from tiny_captures import edit_json
 from tiny_priors import with_priors
 
-from dyngs.build import assemble
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.kinds import assemble
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
 

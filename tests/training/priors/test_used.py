@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any, Literal, cast
+
 import torch
 from moving_scene import MOVING_ROWS, SETUP, Sliding, camera, row_of_balls
 
@@ -7,8 +9,9 @@ from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.rendering import RenderOptions
+from dyngs.models.model import Drawn, Look, Model
 from dyngs.training.priors.point_motion import Glance
-from dyngs.training.priors.used import PointTracks, StepView, UsedPriors
+from dyngs.training.priors.used import PointTracks, UsedPriors
 
 HERE = camera(32, 24)
 GENERATOR = torch.Generator().manual_seed(0)
@@ -25,14 +28,28 @@ def image(**maps: torch.Tensor) -> Image:
     return Image("a", HERE, torch.zeros(24, 32, 3), None, None, 0.0, **maps)
 
 
-def view(index: int = 0, until: float = 1.0) -> StepView:
-    return StepView(index, lambda time: time <= until, RenderOptions(nonfinite="trust"))
+class Seen:
+    """A model of which times up to ``until`` are trained on."""
+
+    def __init__(self, scene: DynamicScene, until: float) -> None:
+        self.scene, self._until = scene, until
+
+    def window(self, step: int) -> tuple[float, float]:
+        return 0.0, self._until
 
 
-def terms(priors: UsedPriors, own: Image, step: StepView, speed: float = 0.5) -> dict[str, float]:
-    of = scene(speed)
-    rendering = of.render(HERE, 0.0, options=priors.options(step.options, own))
-    return {name: float(x.detach()) for name, x in priors.terms(of, own, rendering, step, GENERATOR).items()}
+def look(priors: UsedPriors, of: DynamicScene, own: Image, index: int = 0, until: float = 1.0) -> Look:
+    depth: Literal["none", "expected"] = "expected" if priors.needs_depth(own) else "none"
+    rendering = of.render(HERE, 0.0, options=RenderOptions(nonfinite="trust", depth=depth))
+    rgb, model = rendering.rgb[0], cast(Model[Any], Seen(of, until))
+    return Look(index, 1, own, Drawn(rendering), rgb, rgb, model, GENERATOR)
+
+
+def terms(
+    priors: UsedPriors, own: Image, *, index: int = 0, until: float = 1.0, speed: float = 0.5
+) -> dict[str, float]:
+    found = priors(look(priors, scene(speed), own, index, until))
+    return {name: float(x.detach()) for name, x in found.items()}
 
 
 def still_flow() -> UsedPriors:
@@ -42,30 +59,29 @@ def still_flow() -> UsedPriors:
 def test_flow_of_a_motion_that_is_not_there_costs() -> None:
     """Flow says that nothing moves: right at speed 0, wrong at another."""
     own = image(flow=torch.zeros(24, 32, 2))
-    assert terms(still_flow(), own, view(), speed=0.0)["flow"] < 1e-6
-    wrong = terms(still_flow(), own, view())["flow"]
+    assert terms(still_flow(), own, speed=0.0)["flow"] < 1e-6
+    wrong = terms(still_flow(), own)["flow"]
     assert wrong > 0.001
 
 
 def test_times_outside_the_window_are_not_looked_at() -> None:
     own = image(flow=torch.zeros(24, 32, 2))
-    assert terms(still_flow(), own, view(until=0.2)) == {}
-    assert terms(still_flow(), own, view(index=1)) == {}
-    assert terms(still_flow(), image(), view()) == {}
+    assert terms(still_flow(), own, until=0.2) == {}
+    assert terms(still_flow(), own, index=1) == {}
+    assert terms(still_flow(), image()) == {}
 
 
 def test_only_the_field_learns_from_motion() -> None:
     of, own = scene(0.5), image(flow=torch.zeros(24, 32, 2))
-    rendering = of.render(HERE, 0.0)
-    loss = still_flow().terms(of, own, rendering, view(), GENERATOR)["flow"]
+    loss = still_flow()(look(still_flow(), of, own))["flow"]
     assert not loss.requires_grad  # this field learns nothing, and the Gaussians have no part
 
 
 def test_depth_is_drawn_only_where_it_is_needed() -> None:
-    own, options = image(depth=torch.ones(24, 32)), RenderOptions()
-    assert UsedPriors().options(options, own) is options
-    assert UsedPriors(depth="depth").options(options, image()) is options
-    assert UsedPriors(depth="depth").options(options, own).depth == "expected"
+    own = image(depth=torch.ones(24, 32))
+    assert not UsedPriors().needs_depth(own)
+    assert not UsedPriors(depth="depth").needs_depth(image())
+    assert UsedPriors(depth="depth").needs_depth(own)
 
 
 def test_tracks_pair_views_of_other_times_that_share_points() -> None:
@@ -87,8 +103,8 @@ def test_tracks_in_images_of_another_size() -> None:
     xy = 2 * (local[:, :2] / local[:, 2:] * k.diagonal()[:2] + k[:2, 2])
     glances = [Glance(full, 0.0), Glance(full, 0.5)]
     priors = UsedPriors(tracks=PointTracks(xy.expand(2, 4, 2), torch.ones(2, 4, dtype=torch.bool), glances))
-    assert terms(priors, image(), view(), speed=0.0)["tracks"] < 1e-6
-    assert terms(priors, image(), view())["tracks"] > 0.01
+    assert terms(priors, image(), speed=0.0)["tracks"] < 1e-6
+    assert terms(priors, image())["tracks"] > 0.01
 
 
 def test_lines_are_told_once() -> None:

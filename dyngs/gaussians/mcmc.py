@@ -9,8 +9,8 @@ from torch import Tensor
 
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.densify import MAX_LOG_VARIANCE, Densifier, DensifySchedule
 from dyngs.ops.quaternions import rotate
-from dyngs.static.densify import MAX_LOG_VARIANCE, DensifySchedule
 
 MAX_COPIES = 50
 NOISE_STEEPNESS = 100.0
@@ -19,7 +19,7 @@ NOISE_MAX_OPACITY = 0.3
 """More opaque Gaussians would move by less than 1e-12 of the published noise; nothing is drawn for them."""
 
 
-class McmcDensifier:
+class McmcDensifier(Densifier):
     """Moves dead Gaussians onto living ones, grows the set up to a cap, and shakes the nearly transparent ones.
 
     Relocation keeps the composited appearance, so there is no threshold on gradients, no opacity reset, no pruning.
@@ -31,15 +31,6 @@ class McmcDensifier:
         """Take the options; ``growth`` is the fraction of Gaussians added per change at the run's length."""
         self.options, self.schedule, self.growth = options, schedule, growth
         self.max_gaussians = options.max_gaussians
-
-    def wants_signal(self, step: int) -> bool:
-        return False
-
-    def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
-        return None
-
-    def tallies(self, step: int, count: int) -> list[Tensor]:
-        return []
 
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
         if not self.schedule.densifies_at(step):
@@ -94,17 +85,8 @@ class McmcDensifier:
         weight = 1 / (1 + (NOISE_STEEPNESS * (opacities - NOISE_OPACITY)).exp())
         parameters.means.detach().index_add_(0, rows, shake * (weight * (self.options.noise * lr_means))[:, None])
 
-    def place(self, device: torch.device) -> None:
-        return None
-
     def limit(self, max_gaussians: int) -> None:
         self.max_gaussians = max_gaussians
-
-    def state(self) -> dict[str, Tensor]:
-        return {}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        return None
 
     def _fraction(self, opacities: Tensor, log_scales: Tensor, picks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return opacities, log scales and a mask of changed rows after each picked row has become several copies."""

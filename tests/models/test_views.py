@@ -7,7 +7,7 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.training.background import WEIGHT, evaluation_background, measured_alpha_weight, share_alike
+from dyngs.models.views import WEIGHT, evaluation_background, measured_alpha_weight, share_alike
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import random_scene
 from torch import Tensor
 
 from dyngs.config import DefaultStrategy
 from dyngs.gaussians import Gaussians
-from dyngs.static.densify import DefaultDensifier, DensifySchedule, plan_edit, rotate
+from dyngs.gaussians.densify import DefaultDensifier, Densifier, DensifySchedule, plan_edit, rotate
 
 EXTENT = 10.0
 SMALL, LARGE = 0.05, 0.5  # either side of dense_fraction * extent = 0.1
@@ -261,3 +262,18 @@ def test_state_goes_round() -> None:
         _signal(d, [3.0, 0.0])
     assert torch.equal(densifier.state()["grad_sum"], other.state()["grad_sum"])
     assert torch.equal(densifier.state()["seen"], other.state()["seen"])
+
+
+def test_a_fixed_set_stays() -> None:
+    gaussians, generator = random_scene(n=5).gaussians, torch.Generator().manual_seed(1)
+    before = {name: x.clone() for name, x in gaussians.tensors().items()}
+    fixed = Densifier()
+    fixed.after_backward(100, torch.ones(1, 5, 4), torch.ones(1, 5, 2), (8, 8))
+    fixed.perturb(gaussians, 1.0, generator)
+    fixed.load_state({"grad_sum": torch.ones(3)})
+    fixed.limit(3)
+    assert not fixed.wants_signal(100)
+    assert fixed.edit(100, gaussians, generator) is None
+    assert (fixed.regularizers(gaussians), fixed.state()) == ({}, {})
+    assert all(torch.equal(x, before[name]) for name, x in gaussians.tensors().items())
+    assert torch.equal(generator.get_state(), torch.Generator().manual_seed(1).get_state())

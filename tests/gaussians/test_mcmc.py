@@ -8,8 +8,8 @@ from torch import Tensor
 
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import Gaussians
-from dyngs.static.densify import DensifySchedule, rotate
-from dyngs.static.mcmc import McmcDensifier, relocated
+from dyngs.gaussians.densify import DensifySchedule, rotate
+from dyngs.gaussians.mcmc import McmcDensifier, relocated
 
 SCHEDULE = DensifySchedule(start=100, stop=1000, every=100)
 

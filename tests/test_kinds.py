@@ -10,14 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.build import (
-    assemble,
-    resolved_background,
-    surroundings,
-    training_cameras,
-    training_times,
-    with_points,
-)
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -38,12 +30,13 @@ from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dy
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import still_errors
 from dyngs.deform.training import DynamicTraining
+from dyngs.gaussians.densify import DefaultDensifier, Densifier
+from dyngs.gaussians.init import surroundings
+from dyngs.gaussians.mcmc import McmcDensifier
+from dyngs.kinds import assemble, with_points
+from dyngs.models.views import AlphaWeight, resolved_background, training_cameras, training_times
 from dyngs.state import tensors_of
-from dyngs.static.densify import DefaultDensifier
-from dyngs.static.fixed import FixedDensifier
-from dyngs.static.mcmc import McmcDensifier
 from dyngs.static.scene import StaticScene
-from dyngs.training.background import AlphaWeight
 
 
 @pytest.fixture(scope="module")
@@ -78,16 +71,20 @@ def test_parts_follow_the_config(capture: Path) -> None:
         strategy=DefaultStrategy(absgrad=True),
     )
     trainer = assemble(config)
-    assert isinstance(trainer.densifier, DefaultDensifier)
-    assert (trainer.options.mode, trainer.options.eps2d, trainer.options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.5)
-    assert trainer.options.absgrad
-    assert trainer.options.alpha_min == 0.01
-    assert trainer.scene.gaussians.sh.shape == (40, 9, 3)
+    assert isinstance(trainer.model.densifier, DefaultDensifier)
+    assert (trainer.model.options.mode, trainer.model.options.eps2d, trainer.model.options.near) == (
+        RasterizeMode.ANTIALIASED,
+        0.1,
+        0.5,
+    )
+    assert trainer.model.options.absgrad
+    assert trainer.model.options.alpha_min == 0.01
+    assert trainer.model.scene.gaussians.sh.shape == (40, 9, 3)
     assert (trainer.background, trainer.has_test_views, len(trainer.images)) == ("white", True, 5)
     mcmc = assemble(config.model_copy(update={"strategy": McmcStrategy(max_gaussians=30)}))
-    assert isinstance(mcmc.densifier, McmcDensifier)
-    assert len(mcmc.optimizer.parameters) == 30
-    assert not mcmc.options.absgrad
+    assert isinstance(mcmc.model.densifier, McmcDensifier)
+    assert len(mcmc.model.scene) == 30
+    assert not mcmc.model.options.absgrad
 
 
 def test_a_fixed_set_of_gaussians_stays(capture: Path) -> None:
@@ -99,9 +96,9 @@ def test_a_fixed_set_of_gaussians_stays(capture: Path) -> None:
         budget=BudgetConfig(max_gaussians=20),
     )
     trainer = assemble(config)
-    assert isinstance(trainer.densifier, FixedDensifier)
+    assert isinstance(trainer.model.densifier, Densifier)
     trainer.step()
-    assert len(trainer.scene.gaussians) == 30, "a limit on their number removes some later on, none are added"
+    assert len(trainer.model.scene.gaussians) == 30, "a limit on their number removes some later on, none are added"
 
 
 def test_auto_background_is_white_only_behind_alpha(capture: Path) -> None:
@@ -140,11 +137,11 @@ def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     assert training_times(read_capture(DataConfig(root=root))) == (0.0, 0.25, 0.5, 0.5, 1.0)
     trainer = assemble(_dynamic(root))
-    assert isinstance(trainer.scene, DynamicScene)
-    assert isinstance(trainer.training, DynamicTraining)
-    assert trainer.scene.times == (0.0, 0.25, 0.5, 1.0)
-    assert trainer.training.schedule.rates.steps == 12
-    assert isinstance(assemble(_dynamic(root, model=StaticModel())).scene, StaticScene)
+    assert isinstance(trainer.model.scene, DynamicScene)
+    assert isinstance(trainer.model.training, DynamicTraining)
+    assert trainer.model.scene.times == (0.0, 0.25, 0.5, 1.0)
+    assert trainer.model.training.schedule.rates.steps == 12
+    assert isinstance(assemble(_dynamic(root, model=StaticModel())).model.scene, StaticScene)
 
 
 def test_silhouettes_are_weighed_by_measurement_only_where_things_may_move(capture: Path, tmp_path: Path) -> None:
@@ -175,7 +172,7 @@ def test_without_times_a_dynamic_config_is_a_static_one(
     results = []
     for model in (DynamicModel(sh_degree=1, filter_3d=filter_3d), StaticModel(sh_degree=1, filter_3d=filter_3d)):
         trainer = assemble(_dynamic(root, model=model))
-        assert isinstance(trainer.scene, StaticScene)
+        assert isinstance(trainer.model.scene, StaticScene)
         for _ in range(8):
             trainer.step()
         results.append(trainer.checkpoint())
@@ -189,11 +186,11 @@ def test_motion_is_looked_for_in_images_from_all_over_the_clip(capture: Path, tm
     """Drawn as in training, on the background of the evaluation."""
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     trainer = assemble(_dynamic(root, data=DataConfig(root=root, background="white")))
-    assert isinstance(trainer.training, DynamicTraining)
-    gaussians = trainer.scene.gaussians.detach()
-    found = trainer.training.capture.still_errors(lambda _: gaussians)
+    assert isinstance(trainer.model.training, DynamicTraining)
+    gaussians = trainer.model.scene.gaussians.detach()
+    found = trainer.model.training.capture.still_errors(lambda _: gaussians)
     images = [trainer.images[i] for i in range(5)]
-    expected = still_errors(lambda _: gaussians, images, trainer.options, torch.ones(3))
+    expected = still_errors(lambda _: gaussians, images, trainer.model.options, torch.ones(3))
     assert torch.equal(found.most, expected.most)
     assert torch.equal(found.usual, expected.usual)
     assert found.most.shape == (50,)
@@ -207,9 +204,9 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     config = _dynamic(root, init=PointsInit(num_random=7))
     found = with_points(read_capture(config.data), config).points
     assert found is not None
-    assert len(assemble(config).scene) == len(found.xyz) > 7
+    assert len(assemble(config).model.scene) == len(found.xyz) > 7
     without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
-    assert len(assemble(without).scene) == 7
+    assert len(assemble(without).model.scene) == 7
 
 
 def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,7 +219,7 @@ def test_no_points_are_triangulated_for_what_is_restored(tmp_path: Path, monkeyp
     def refuse(*_: object) -> None:
         raise AssertionError("triangulated again")
 
-    monkeypatch.setattr("dyngs.build.with_first_points", refuse)
+    monkeypatch.setattr("dyngs.kinds.with_first_points", refuse)
     again = assemble(config, restored=True)
     again.restore(trainer.checkpoint())
     assert again.step().loss == trainer.step().loss
@@ -255,5 +252,5 @@ def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> N
     static, dynamic = (assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0)))
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss
-    mine, others = (tensors_of(trainer.optimizer.state()) for trainer in (static, dynamic))
+    mine, others = (tensors_of(trainer.model.optimizer_state) for trainer in (static, dynamic))
     assert all(torch.equal(x, others[name]) for name, x in mine.items())

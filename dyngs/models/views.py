@@ -1,13 +1,18 @@
-"""The background colour of training and evaluation, and silhouettes where it hides things of its own colour."""
+"""Cameras, times and background of a capture, as training and evaluation need them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig
+from dyngs.data.capture import Capture, View
+from dyngs.data.geometry import scaled_intrinsics
+from dyngs.data.images.images import target_size
 from dyngs.data.loader import Image
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
@@ -84,3 +89,26 @@ def background_colour(name: str, generator: torch.Generator | None = None) -> Te
     if name == "random" and generator is not None:
         return torch.rand(3, generator=generator, device="cpu")
     return torch.full((3,), _BACKGROUNDS["black" if name == "random" else name], device="cpu")
+
+
+def resolved_background(config: Config, capture: Capture) -> str:
+    """Return "white", "black" or "random"; "auto" is white where images have alpha, as in 3DGS, else black."""
+    if config.data.background == "auto":
+        return "white" if capture.has_alpha else "black"
+    return config.data.background
+
+
+def training_cameras(views: Sequence[View], options: DataConfig) -> list[Cameras]:
+    """Return the cameras of ``views`` as images of their training size, one each; no image is read."""
+    cameras = []
+    for view in views:
+        width, height = target_size(view.width, view.height, options.downscale, options.longest_side)
+        intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
+        pose = torch.from_numpy(view.cam_from_world).float()
+        cameras.append(Cameras(pose[None], torch.from_numpy(intrinsics).float()[None], width, height))
+    return cameras
+
+
+def training_times(capture: Capture) -> tuple[float, ...]:
+    """Return the times of the training views in [0, 1], ascending; empty without times."""
+    return tuple(sorted(view.time for view in capture.splits["train"] if view.time is not None))

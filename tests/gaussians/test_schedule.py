@@ -9,20 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
-from dyngs.static.rates import Rates
-from dyngs.training.schedule import (
+from dyngs.deform.schedule import deform_schedule
+from dyngs.gaussians.schedule import (
     GROWTH,
     MAX_GROWTH,
     MIN_RESET_GAP,
+    Rates,
     active_sh_degree,
-    deform_schedule,
     densify_schedule,
     filter_steps,
     grad_threshold,
     growth_per_change,
-    image_divisor,
     means_rate,
 )
+from dyngs.models.schedule import image_divisor
 
 
 def test_at_30000_steps_it_is_the_published_one() -> None:
@@ -154,3 +154,23 @@ def test_images_may_sharpen_at_once() -> None:
     for to in (0.5, 0.2):
         options = TrainConfig(steps=10, initial_downscale=4, resolution_grows_from=0.5, resolution_full_at=to)
         assert [image_divisor(options, step) for step in range(1, 11)] == [4] * 4 + [1] * 6
+
+
+@given(st.integers(1, 1000), st.floats(0, 1))
+def test_rates_fall_once_over_training(steps: int, fraction: float) -> None:
+    rates, since = Rates(steps), int(fraction * (steps - 1))
+    progress = [rates.progress(step, since) for step in range(steps + 20)]
+    assert progress == sorted(progress)
+    assert progress[: since + 1] == [0] * (since + 1)
+    assert progress[steps:] == [1] * 20
+    assert progress[steps - 1] < 1
+
+
+def test_a_stage_goes_back_and_falls_again() -> None:
+    rates = Rates(1000, 200)
+    assert rates.progress(1000) == 1
+    assert rates.progress(1001) == pytest.approx(0.3 + 0.7 / 200)
+    assert rates.progress(1100) == pytest.approx(0.65)
+    assert rates.progress(1200) == rates.progress(5000) == 1
+    assert rates.progress(1100, since=300) == pytest.approx(0.5), "rates that fall from step 300 on are half-way"
+    assert rates.progress(1001, since=600) == 0, "they do not rise above their first value"

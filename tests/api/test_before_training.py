@@ -1,4 +1,4 @@
-"""``dyngs train``: a folder of people is not taken for a folder of photos."""
+"""A folder of people is not taken for a folder of photos."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tiny_people import NET, people
 
-from dyngs.cli.train import _with_poses
+from dyngs.api.before_training import with_capture
 from dyngs.config import Config
 
 
@@ -14,4 +14,4 @@ def test_the_captures_of_a_network_are_left_as_they_are(tmp_path: Path) -> None:
     """The folder of captures is itself no capture, and holds many images below."""
     root = people(tmp_path, (1,))
     config = Config.model_validate({"data": {"root": root}, "model": NET})
-    assert _with_poses(config) == config
+    assert with_capture(config) == config

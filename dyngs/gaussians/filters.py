@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -10,6 +10,8 @@ from torch.nn.functional import logsigmoid
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
+from dyngs.state import Role, State, StateTensor
+from dyngs.tensor_checks import require_tensor
 
 FILTER_VARIANCE = 0.2
 """Variance of the filter in squared sampling intervals."""
@@ -70,3 +72,40 @@ def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
     missing = logsigmoid(-logits).exp() - log_opacity.exp() * torch.expm1(log_ratio)
     fused = log_opacity + log_ratio - missing.clamp_min(torch.finfo(missing.dtype).tiny).log()
     return gaussians.replace(log_scales=log_scales, logit_opacities=fused)
+
+
+def filtered(gaussians: Gaussians, std: Tensor | None) -> Gaussians:
+    """Return the Gaussians fused with their 3D filter (N,); unchanged where that is None."""
+    return gaussians if std is None else fuse_filter(gaussians, std)
+
+
+def filter_state(std: Tensor | None) -> State:
+    """Return the state of a 3D filter, empty without one."""
+    return {} if std is None else {"filter_std": StateTensor(std, Role.PER_GAUSSIAN)}
+
+
+def stored_filter(tensors: Mapping[str, Tensor], count: int) -> Tensor | None:
+    """Return the 3D filter (N,) of a state, None without one. Raises ValueError for one that does not fit N."""
+    std = tensors.get("filter_std")
+    if std is not None and bool((require_tensor("filter_std", std, (count,)) < 0).any()):
+        raise ValueError("'filter_std' holds negative numbers")
+    return std
+
+
+class FilterUpdate:
+    """Recomputation of Mip-Splatting's 3D filter at given steps.
+
+    Args:
+        cameras: the training cameras; none: there is no filter.
+        steps: steps after which it is, besides those that change the set of Gaussians.
+    """
+
+    def __init__(self, cameras: Sequence[Cameras] = (), steps: range = range(0)) -> None:
+        self.cameras, self.steps = cameras, steps
+
+    def of(self, gaussians: Gaussians) -> Tensor | None:
+        """Return the filter (N,) of the Gaussians; None where there is none."""
+        return filter_std(gaussians.means, self.cameras) if self.cameras else None
+
+    def is_due(self, step: int, edited: bool) -> bool:
+        return bool(self.cameras) and (edited or step in self.steps)

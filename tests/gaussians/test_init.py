@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
 from dyngs.data.capture import View
 from dyngs.data.geometry import pinhole_matrix, times_seen
-from dyngs.static.init import StartValues, Surroundings, initial_gaussians, mean_squared_neighbour_distance
+from dyngs.gaussians.init import StartValues, Surroundings, initial_gaussians, mean_squared_neighbour_distance
 
 CENTERS = np.array([[4.0, 0.0, 1.0], [0.0, 4.0, 1.0], [-4.0, 0.0, 1.0], [0.0, -4.0, 1.0]])
 """Of cameras that look at the origin, or where ``offset`` shifts it."""

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.capture.first_points import AROUND_ORIGIN
 from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, Strategy
 from dyngs.conventions import SH_C0, num_sh_terms
-from dyngs.data.capture import View
+from dyngs.data.capture import Capture, View
 from dyngs.data.scene_space import MIN_VIEWS, outside_of_cube, points_in_frusta
 from dyngs.gaussians import Gaussians
 
@@ -83,6 +84,17 @@ class Surroundings:
         offsets = centers - centers.mean(axis=0)
         extent = EXTENT_MARGIN * float(np.linalg.norm(offsets, axis=1).max())
         return extent if extent > 1e-6 else 1.0
+
+
+def surroundings(capture: Capture) -> Surroundings:
+    """Return the properties of a capture that initialisation needs."""
+    points = capture.points
+    return Surroundings(
+        views=capture.splits["train"],
+        points=None if points is None else points.xyz,
+        points_rgb=None if points is None else points.rgb,
+        around_origin=capture.format in AROUND_ORIGIN,
+    )
 
 
 def initial_gaussians(

@@ -1,28 +1,23 @@
-"""Everything that depends on the step: numbers published for 30,000 steps, scaled to the length of the run."""
+"""Everything of Gaussians that depends on the step, scaled from 30,000 steps to the length of the run."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from typing_extensions import assert_never
 
 from dyngs.config import (
     Config,
     DefaultStrategy,
-    DynamicModel,
-    HumanModel,
-    HumanPredictorModel,
     McmcStrategy,
     OptimConfig,
-    StaticModel,
     Strategy,
     TrainConfig,
 )
-from dyngs.deform.training import DeformSchedule
-from dyngs.static.densify import DensifySchedule
-from dyngs.static.rates import Rates
+from dyngs.gaussians.densify import DensifySchedule
+from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 
-PUBLISHED_STEPS = 30_000
 MIN_START = 100
 """Densification never starts earlier: the first gradients say little."""
 MIN_RESET_GAP = 400
@@ -32,23 +27,29 @@ RESET_FRACTION = 0.2
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
-MIN_COARSE_STEPS = 1000
-"""Steps that a static model needs to show where it fails; short runs spend at most a third on it."""
-SPLITS = (0.1, 0.3, 0.5)
-"""Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all times."""
+REWIND = 0.3
+"""Fraction of training whose rates fine-tuning goes back to, to fall again (Renda et al. 2020)."""
 
 
-def scaled(step: int, steps: int) -> int:
-    """Return ``step`` of a 30,000-step run in a run of ``steps``; at least 1."""
-    return max(1, round(step * steps / PUBLISHED_STEPS))
+@dataclass(frozen=True)
+class Rates:
+    """The course of all learning rates that fall over a run.
 
+    Attributes:
+        steps: of training, at the end of which rates are at their lowest.
+        tuning: steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``.
+    """
 
-def image_divisor(options: TrainConfig, step: int) -> int:
-    """Return the divisor of the images' sides at ``step``: ``initial_downscale``, halved evenly until it is 1."""
-    halvings = options.initial_downscale.bit_length() - 1
-    first, last = options.resolution_grows_from, max(options.resolution_grows_from, options.resolution_full_at)
-    fractions = [first + (last - first) * i / max(halvings - 1, 1) for i in range(halvings)]
-    return options.initial_downscale >> sum(step / options.steps >= fraction for fraction in fractions)
+    steps: int
+    tuning: int = 0
+
+    def progress(self, step: int, since: int = 0) -> float:
+        """Return 0 up to step ``since``, rising to 1 at the end: the progress of rates that fall from ``since`` on."""
+        at = float(step)
+        if step > self.steps:
+            tuned = min((step - self.steps) / max(self.tuning, 1), 1.0)
+            at = self.steps * (REWIND + (1 - REWIND) * tuned)
+        return min(max((at - since) / max(self.steps - since, 1), 0.0), 1.0)
 
 
 def rates_of(config: Config) -> Rates:
@@ -116,31 +117,3 @@ def filter_steps(strategy: Strategy, steps: int) -> range:
     """Return the steps after which Mip-Splatting's 3D filter is recomputed: each 100 after densification ends."""
     first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)
-
-
-def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
-    """Return the phases of a dynamic model in a run with ``rates``; ``freeze_below_px`` 0 freezes nothing.
-
-    While new times come in, the field learns at its first rate: what has slowed down follows nothing.
-    """
-    steps = rates.steps
-    fine = min(max(1, round(model.motion_from * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
-    opens = max(fine, round(model.time_window_grows_from * steps))
-    full = max(opens, round(model.time_window_full_at * steps))
-    decays = full if model.time_window < 1 else fine
-    splits = (
-        sorted({full + round(fraction * (steps - full)) for fraction in SPLITS}) if model.freeze_below_px > 0 else []
-    )
-    splits = tuple(step for step in splits if step > full)
-    return DeformSchedule(fine, opens, full, decays, splits, rates)
-
-
-def motion_begins_after(config: Config, steps: int) -> int | None:
-    """Return the last step without motion in a run of ``steps``; None where nothing will move."""
-    match config.model:
-        case DynamicModel():
-            return deform_schedule(config.model, Rates(steps)).fine
-        case StaticModel() | HumanModel() | HumanPredictorModel():
-            return None
-        case _:
-            assert_never(config.model)

@@ -7,8 +7,8 @@ import torch
 
 from dyngs.config import OptimConfig
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.optimizer import ADAM_EPS, GaussianOptimizer
 from dyngs.state import part_of, tensors_of
-from dyngs.static.optimizer import ADAM_EPS, GaussianOptimizer
 
 
 def _gaussians(n: int, seed: int = 0) -> Gaussians:

@@ -1,13 +1,12 @@
 """Adding and removing Gaussians: clone, split and prune by the gradient of the 2D means (3DGS, AbsGS).
 
-``Densifier`` is what the trainer asks of any strategy; the other one is in ``mcmc.py``.
+``Densifier`` is what a model asks of any strategy; the other one is in ``mcmc.py``.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -48,62 +47,55 @@ class DensifySchedule:
         return self.start < step < self.stop and step % self.every == 0
 
 
-class Densifier(Protocol):
-    """A strategy that changes the set of Gaussians during training."""
+class Densifier:
+    """A strategy that changes the set of Gaussians during training; this one leaves it as it is."""
 
-    touches_all: bool
+    touches_all = False
     """Every Gaussian receives a gradient in every step, seen or not."""
 
     def wants_signal(self, step: int) -> bool:
         """Return whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
-        ...
+        return False
 
     def after_backward(self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]) -> None:
         """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of images of ``size`` (width, height)."""
-        ...
 
     def tallies(self, step: int, count: int) -> list[Tensor]:
         """Return what ``step`` has taken in of N = ``count`` Gaussians; processes that share it sum it in place."""
-        ...
+        return []
 
     def edit(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult | None:
         """Return the edit after ``step``; None if nothing changes."""
-        ...
+        return None
 
     def regularizers(self, parameters: Gaussians) -> dict[str, Tensor]:
         """Return differentiable scalars, already weighted, that are added to the loss, by name."""
-        ...
+        return {}
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
         """Add the strategy's noise to the parameters, in place, after the optimizer's step."""
-        ...
 
     def place(self, device: torch.device) -> None:
         """Go on on ``device``."""
-        ...
 
     def limit(self, max_gaussians: int) -> None:
         """Limit the number of Gaussians from now on; none are removed. Not part of the state."""
-        ...
 
     def state(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint must hold, by name."""
-        ...
+        return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Restore the state that ``state()`` returned."""
-        ...
 
 
-class DefaultDensifier:
+class DefaultDensifier(Densifier):
     """Clone, split and prune by the mean norm of the 2D mean's gradient over the views that saw a Gaussian (3DGS).
 
     Small Gaussians with a large gradient are copied, large ones replaced by two samples of themselves, transparent and
     (later) huge ones removed; opacities are lowered now and then. At least one Gaussian is always left. Where the cap
     ``max_gaussians`` leaves no room for all, those with the largest gradients go first.
     """
-
-    touches_all = False
 
     def __init__(self, options: DefaultStrategy, schedule: DensifySchedule, extent: float) -> None:
         self.options, self.schedule, self.extent = options, schedule, extent
@@ -143,12 +135,6 @@ class DefaultDensifier:
         else:
             return None
         return _with_lowered_opacities(result, parameters.logit_opacities) if resets else result
-
-    def regularizers(self, parameters: Gaussians) -> dict[str, Tensor]:
-        return {}
-
-    def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
-        return None
 
     def place(self, device: torch.device) -> None:
         self.grad_sum, self.seen = self.grad_sum.to(device), self.seen.to(device)

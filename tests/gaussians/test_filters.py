@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
-from dyngs.static.filters import filter_std, fuse_filter
+from dyngs.gaussians.filters import filter_std, fuse_filter
 
 
 def _camera(z: float, focal: float = 100.0) -> Cameras:

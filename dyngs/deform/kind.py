@@ -1,0 +1,84 @@
+"""The kind of moving scenes: what they begin with, and how they are restored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dyngs.config import DynamicModel
+from dyngs.data.times import evenly_spaced
+from dyngs.deform.fixed_cameras.changes import Footage, footage_of
+from dyngs.deform.given_masks import moving_fraction_of
+from dyngs.deform.scene import DynamicScene
+from dyngs.deform.schedule import deform_schedule
+from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
+from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.colour.training import ColourTraining
+from dyngs.gaussians.model import GaussianModel, training_options
+from dyngs.gaussians.rendering import Shader
+from dyngs.gaussians.scene import drawn_as_trained
+from dyngs.gaussians.schedule import rates_of
+from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import Kind, Setting
+from dyngs.models.schedule import image_divisor
+from dyngs.models.views import evaluation_background, training_cameras, training_times
+from dyngs.static.training import start as start_static
+
+MAX_STANDING = 12
+"""Fixed cameras from which tracks are found, at most."""
+
+
+def start(setting: Setting) -> GaussianModel:
+    """Return the model of a moving scene before its first step: a static one where there are no times to move in."""
+    model = setting.config.model
+    if not isinstance(model, DynamicModel) or len(set(training_times(setting.capture))) < 2:
+        return start_static(setting)
+    gaussians = first_gaussians(setting)
+    colours = colours_of(setting, gaussians, sees_time=True)
+    schedule = deform_schedule(model, rates_of(setting.config))
+    views = _training_views(setting, model, colours)
+    training = DynamicTraining(model, schedule, views, filter_update(setting), setting.generator)
+    return GaussianModel(setting, training.first_scene(gaussians), training, densifier_of(setting), colours)
+
+
+def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
+    """Return the scene of a checkpoint."""
+    scene = DynamicScene.restored(model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
+    return drawn_as_trained(scene, model, checkpoint)
+
+
+KIND = Kind(DynamicModel, start, restore)
+
+
+def _training_views(setting: Setting, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+    """Return the properties of the capture that training a dynamic scene needs."""
+    config, capture, images = setting.config, setting.capture, setting.images
+    views = capture.splits["train"]
+    _, background = evaluation_background(config.data.background, capture.has_alpha)
+    divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
+    looked_at, options = views_to_compare(views), training_options(config)
+
+    def shader(time: float) -> Shader | None:
+        return None if colours.network is None else colours.network.shader(time)
+
+    def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
+        shown = [images.shrunk(i, divisor) for i in looked_at]
+        if any(image.moves is not None for image in shown):
+            return moving_fraction_of(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
+        return still_errors(gaussians_at, shown, options, background, shader)
+
+    in_place = cameras_in_place(views)
+
+    def standing() -> list[Footage]:
+        used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
+        return [footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used]
+
+    return TrainingViews(
+        training_times(capture),
+        training_cameras(views, config.data),
+        setting.extent,
+        errors_of,
+        cameras_stay=bool(in_place),
+        standing=standing,
+    )

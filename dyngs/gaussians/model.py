@@ -1,0 +1,355 @@
+"""Gaussians in training: the one owner of their values, of the state of Adam, and of what is stored per Gaussian."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from dyngs.config import AutoColour, Config, DefaultStrategy, SceneModel
+from dyngs.conventions import SH_C0, RasterizeMode
+from dyngs.data.loader import Image
+from dyngs.errors import DyngsError
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
+from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, TrainingLooks
+from dyngs.gaussians.colour.view_dependence import MeasuredView
+from dyngs.gaussians.densify import Densifier
+from dyngs.gaussians.optimizer import GaussianOptimizer
+from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import GaussianTimeStep, Scene, render_options
+from dyngs.gaussians.schedule import active_sh_degree, means_rate, rates_of
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import Setting
+from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.schedule import image_divisor
+from dyngs.models.views import background_colour, evaluation_background
+from dyngs.ops.adam import Count
+from dyngs.state import Role, State, prefixed, with_role
+
+S = TypeVar("S", bound=Scene)
+
+
+class SceneTraining(Generic[S]):
+    """Training of a kind of scene: of all that it learns beside the Gaussians and their colours, here nothing.
+
+    Attributes:
+        moves_by: name of what moves the Gaussians and the configuration section of its learning rates, for messages.
+    """
+
+    moves_by: tuple[str, str] = ("", "")
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Return whether an image of ``time`` may be trained on in ``step``; at each step some may."""
+        return True
+
+    def window(self, step: int) -> tuple[float, float]:
+        """Return the first and last time that are trained on at ``step``."""
+        return 0.0, 1.0
+
+    def extend(self, scene: S, seen: tuple[float, float], step: int) -> None:
+        """Continue motion learned for the times in ``seen`` to those that are trained on at ``step``."""
+
+    def time_step(self, scene: S, image: Image, step: int) -> GaussianTimeStep:
+        """Return the Gaussians drawn for ``image`` in ``step``, with the penalties."""
+        return scene.time_step(image.time)
+
+    def optimize(self, scene: S, step: int) -> Count:
+        """Update, in place, what the scene learns; return the number of rows left out for bad gradients."""
+        return 0
+
+    def learned(self, scene: S) -> Parameters | None:
+        """Return what the scene learns; None: nothing."""
+        return None
+
+    def after_step(self, scene: S, step: int, edited: bool) -> S:
+        """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen.
+
+        Args:
+            scene: after the optimizers and the strategy.
+            step: that was done.
+            edited: the set of Gaussians has just changed.
+        """
+        return scene
+
+    def revised(self, scene: S, step: int) -> tuple[S, EditResult] | None:
+        """Return the scene as its kind changes it after ``step``, and the edit of its Gaussians; None: it does not."""
+        return None
+
+    def all_moving(self, scene: S, extent: float) -> S:
+        """Return ``scene`` as expensive to draw as it may become: all Gaussians move, by an untrained field if need be.
+
+        Args:
+            scene: N Gaussians.
+            extent: of the scene, world units.
+        """
+        return scene
+
+    def follow(self, edit: TopologyEdit) -> None:
+        """Let what the training itself keeps per Gaussian follow a change of the set."""
+
+    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> S:
+        """Return the scene of a checkpoint, and take over the training's state.
+
+        Raises:
+            KeyError: a tensor is missing.
+            ValueError: the tensors do not fit together.
+        """
+        raise NotImplementedError
+
+    def state(self) -> State:
+        """Return the tensors that a checkpoint must hold beside the scene."""
+        return {}
+
+
+class GaussianModel(Model[Scene]):
+    """A scene of Gaussians in training.
+
+    Args:
+        setting: of the run.
+        scene: before the first step, or predicted; its Gaussians become leaf tensors.
+        training: how its kind is trained.
+        densifier: the strategy, which adds and removes Gaussians.
+        colours: how they are trained.
+
+    Attributes:
+        options: how training images are drawn.
+    """
+
+    def __init__(
+        self,
+        setting: Setting,
+        scene: Scene,
+        training: SceneTraining[Any],
+        densifier: Densifier,
+        colours: ColourTraining,
+    ) -> None:
+        config = setting.config
+        self._config, self.densifier, self.colours = config, densifier, colours
+        self._setting, self._generator = setting, setting.generator
+        self.options = training_options(config)
+        self.begin_with(scene, training)
+
+    def begin_with(self, scene: Scene, training: SceneTraining[Any]) -> None:
+        """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned yet."""
+        config = self._config
+        self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, config.optim)
+        behind = evaluation_background(config.data.background, self._setting.capture.has_alpha)[1]
+        self._scene = replace(
+            scene.with_gaussians(self._optimizer.parameters),
+            colour=self.colours.network,
+            options=render_options(config.model),
+            background=behind,
+        )
+
+    @property
+    def scene(self) -> Scene:
+        return self._scene
+
+    @property
+    def optimizer_state(self) -> State:
+        """The moments of Adam, by name."""
+        return self._optimizer.state()
+
+    @property
+    def moves_by(self) -> tuple[str, str]:  # type: ignore[override]
+        return self.training.moves_by
+
+    @property
+    def rasterize_mode(self) -> RasterizeMode:
+        return self.options.mode
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self._scene)
+
+    @property
+    def num_moving(self) -> int:
+        return self._scene.num_moving
+
+    @property
+    def leaves(self) -> Sequence[Tensor]:
+        found = [*self._optimizer.parameters.tensors().values()]
+        for learned in (self.colours.learned, self.training.learned(self._scene)):
+            found += [] if learned is None else learned.leaves
+        return found
+
+    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+        scene, densifier = self._scene, self.densifier
+        now = self.training.time_step(scene, image, step)
+        probe = (
+            torch.zeros(1, len(scene), 4, requires_grad=True, device=scene.device)
+            if densifier.wants_signal(step)
+            else None
+        )
+        options = self._options(step)
+        options = replace(options, depth="expected") if depth else options
+        rendering = scene.render(image.cameras, now, options=options, background=background, probe=probe)
+
+        def after_backward() -> None:
+            if probe is not None and probe.grad is not None:
+                size = (image.cameras.width, image.cameras.height)
+                # Fewer Gaussians suit small images: a gradient counts for less there.
+                signal = probe.grad / image_divisor(self._config.train, step)
+                densifier.after_backward(step, signal, rendering.radii, size)
+
+        moved = now.gaussians.tensors() if scene.num_moving else {}
+        return Drawn(rendering, now.penalties, moved, after_backward)
+
+    def regularizers(self) -> Mapping[str, Tensor]:
+        now = self._scene.gaussians
+        return self.densifier.regularizers(now) | self.colours.penalties(now)
+
+    def tallies(self, step: int) -> Sequence[Tensor]:
+        return self.densifier.tallies(step, len(self._scene))
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        return self.training.trains_on(time, step)
+
+    def holds_out(self, index: int, step: int) -> bool:
+        return self.colours.holds_out(index, step)
+
+    def window(self, step: int) -> tuple[float, float]:
+        return self.training.window(step)
+
+    def update(self, step: int) -> Updated:
+        before, generator = self._optimizer.parameters, self._generator
+        lr_means = means_rate(self._config.optim, rates_of(self._config).progress(step), self._setting.extent)
+        frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
+        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
+        bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
+        result = self.densifier.edit(step, self._optimizer.parameters, generator)
+        if result is not None:
+            self._apply(result)
+        self.densifier.perturb(self._optimizer.parameters, lr_means, generator)
+        self._scene = self.training.after_step(self._scene, step, result is not None)
+        revised = self.training.revised(self._scene, step)
+        if revised is not None:
+            scene, result = revised
+            self._apply(result, scene)
+        findings = (self._measured_harmonics(step), None if revised is None else revised[1].finding)
+        self._scene.changed()
+        text = "; ".join(text for text in findings if text) or None
+        return Updated(bad, text, self._optimizer.parameters is not before)
+
+    def exchange(self, scene: Scene) -> None:
+        """Go on with ``scene``: the same Gaussians, moved, masked or drawn in another way."""
+        self._scene = scene.with_gaussians(self._optimizer.parameters)
+        self._scene.changed()
+
+    def keep(self, kept: Tensor, done: int) -> None:
+        """Leave only the Gaussians where ``kept`` (N,) is true, after step ``done``."""
+        self._apply(EditResult(TopologyEdit.select(kept)))
+        self._scene = self.training.after_step(self._scene, done, True)
+        self._scene.changed()
+
+    def stop_growing(self) -> None:
+        """Leave the set of Gaussians as it is from now on."""
+        self.densifier = Densifier()
+
+    def drop_harmonics(self, dropped: Tensor, offsets: Tensor) -> None:
+        """Replace the harmonics of the Gaussians ``dropped`` (N,) for good by their base, with ``offsets`` (N, 3)."""
+        base = self._scene.gaussians.sh.detach()[:, 0] + offsets / SH_C0
+        self._optimizer.drop_rest(base, dropped)
+        self.exchange(self._scene)
+
+    def keep_plain(self, plain: Tensor, colour: AutoColour) -> None:
+        """Leave the harmonics of the Gaussians ``plain`` (N,) zero from now on."""
+        colours = AutoTraining(colour, self._config.train.steps, len(self._setting.images))
+        colours.freeze(plain)
+        self.colours = colours
+
+    def draw_as(self, model: SceneModel) -> None:
+        """Draw with the settings of another section of the same kind from now on."""
+        options = render_options(model)
+        self.options = replace(self.options, alpha_min=options.alpha_min)
+        self._scene = replace(self._scene, options=options)
+
+    def state(self) -> State:
+        state = self._scene.state() | prefixed("model", self.training.state())
+        state |= prefixed("model.colour", self.colours.state()) | self._optimizer.state()
+        return state | prefixed("strategy", with_role(self.densifier.state(), Role.TRAINING))
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        gaussians = Gaussians.stored(checkpoint.part("gaussians"))
+        optimizer = self._optimizer.restored(gaussians, checkpoint.tensors)
+        colour = checkpoint.part("model.colour")
+        network_of(colour)  # raises where its tensors do not fit together
+        self.colours.restore(colour, len(gaussians))
+        scene = self.training.restored(optimizer.parameters, checkpoint.part("model"))
+        if checkpoint.info.step >= self._config.train.steps:
+            self.stop_growing()
+        self.densifier.load_state(checkpoint.part("strategy"))
+        like, self._optimizer = self._scene, optimizer
+        self._scene = replace(scene, colour=self.colours.network, options=like.options, background=like.background)
+
+    def place(self, device: torch.device) -> None:
+        if self._scene.device == device:
+            return
+        self._optimizer = self._optimizer.to(device)
+        self.colours.place(device)
+        self.densifier.place(device)
+        scene: Scene = self._scene.to(device)
+        scene = scene.with_gaussians(self._optimizer.parameters)
+        self._scene = replace(scene, colour=self.colours.network)
+
+    def _options(self, step: int) -> RenderOptions:
+        """Return how images are drawn in ``step``."""
+        degree = active_sh_degree(self._config.train, step, self._scene.gaussians.sh_degree)
+        return replace(self.options, sh_degree=degree)
+
+    def _apply(self, result: EditResult, edited: Scene | None = None) -> None:
+        """Change the set of Gaussians, and everything that is stored per Gaussian with it; ``edited``: is already."""
+        self._optimizer.apply(result)
+        if edited is None:
+            edited = self._scene if result.edit is None else self._scene.edited(result.edit)
+        self._scene = edited.with_gaussians(self._optimizer.parameters)
+        if result.edit is not None:
+            self.colours.follow(result.edit)
+            self.training.follow(result.edit)
+
+    def _measured_harmonics(self, step: int) -> str | None:
+        """Drop harmonics that do not pay, if it is time to measure that; return a line about what was found."""
+        if not self._scene.gaussians.sh_degree:
+            return None
+        found = self.colours.measured(step, lambda: self._looks(step))
+        if found is not None and found.rows is not None and found.offsets is not None:
+            self.drop_harmonics(found.rows, found.offsets)
+        return None if found is None else found.text
+
+    def _looks(self, step: int) -> TrainingLooks:
+        """Return the training views as they are drawn after ``step``."""
+        images, colour = self._setting.images, background_colour(self._setting.background).to(self._scene.device)
+
+        def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
+            for image in (images[i] for i in indices):
+                gaussians = self.training.time_step(self._scene, image, step).gaussians.detach()
+                yield MeasuredView(gaussians, image.cameras, image.composite(colour), image.mask)
+
+        may_train = [i for i, time in enumerate(images.times) if self.training.trains_on(time, step)]
+        return TrainingLooks(may_train, views, self._options(step), colour)
+
+
+def training_options(config: Config) -> RenderOptions:
+    """Return how the training images of a run are drawn."""
+    absgrad = isinstance(config.strategy, DefaultStrategy) and config.strategy.absgrad
+    return replace(render_options(config.model), absgrad=absgrad, nonfinite="trust")
+
+
+def gaussian_model(model: Model[Any] | None, what: str) -> GaussianModel:
+    """Return ``model`` if it is made of Gaussians.
+
+    Args:
+        model: of any kind.
+        what: is not made of them, for the message.
+
+    Raises:
+        DyngsError: it is made of something else.
+    """
+    if not isinstance(model, GaussianModel):
+        raise DyngsError(f"{what}: is not made of Gaussians, which this needs")
+    return model

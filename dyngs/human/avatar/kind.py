@@ -1,0 +1,78 @@
+"""The kind of people: what they begin with, and how they are restored."""
+
+from __future__ import annotations
+
+from dyngs.config import Config, HumanModel
+from dyngs.data.capture import Capture
+from dyngs.data.loader import ImageLoader
+from dyngs.data.times import evenly_spaced
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.model import GaussianModel
+from dyngs.gaussians.scene import drawn_as_trained
+from dyngs.gaussians.schedule import rates_of
+from dyngs.gaussians.start import colours_of, densifier_of
+from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
+from dyngs.human.avatar.observations import Subject, in_colours_of
+from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.training import HumanTraining
+from dyngs.human.motion.clip import captured_motion
+from dyngs.human.template.body_reader import load_template, rest_shape
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import Kind, Setting
+from dyngs.models.views import training_cameras
+
+FIRST_VIEWS = 50
+"""Number of images from which a person's first colours are taken."""
+
+
+def start(setting: Setting) -> GaussianModel:
+    """Return the model of a person before the first step.
+
+    Raises:
+        DyngsError: a capture without body parameters, or a template that cannot be read.
+    """
+    config, model = setting.config, setting.config.model
+    if not isinstance(model, HumanModel):
+        raise TypeError(f"not a person: {model!r}")
+    gaussians, subject = human_start(config, model, setting.capture, setting.images)
+    colours = colours_of(setting, gaussians, sees_time=False)
+    filmed = setting.capture.splits["train"]
+    cameras = training_cameras(filmed, config.data)
+    views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
+    training = HumanTraining(model, subject.motion.frames, rates_of(config), views)
+    lit = model.light and model.refine and colours.network is None
+    scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
+    return GaussianModel(setting, scene, training, densifier_of(setting), colours)
+
+
+def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
+    """Return the scene of a checkpoint."""
+    scene = HumanScene.restored(Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
+    return drawn_as_trained(scene, model, checkpoint)
+
+
+KIND = Kind(HumanModel, start, restore)
+
+
+def human_start(config: Config, model: HumanModel, capture: Capture, images: ImageLoader) -> tuple[Gaussians, Subject]:
+    """Return the first Gaussians of a person, and the person.
+
+    Raises:
+        DyngsError: a capture without body parameters, or a template that cannot be read.
+    """
+    sh_degree = config.stored_sh_degree
+    if capture.body is None:
+        raise DyngsError(f"{capture.root}: has no body parameters, which model.kind=human needs; see docs/human.md")
+    if sh_degree > 1:
+        raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
+    given, body = capture.body["train"], load_template(model)
+    vertices, joints = rest_shape(body, given)
+    filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
+    cameras = training_cameras(capture.splits["train"], config.data) if model.fine_limbs else []
+    parts = surface_texels(body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0]))
+    gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
+    subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
+    shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
+    return in_colours_of(gaussians, normals, subject, shown), subject

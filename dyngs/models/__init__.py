@@ -1,0 +1,5 @@
+"""The seam between what is trained and drawn, and what trains, measures, draws and shows it.
+
+``renderable``: what can be drawn from anywhere at any time. ``model``: what a trainer steps, loss terms, predictors.
+``kind``: a section of the configuration, and what begins and restores its model.
+"""

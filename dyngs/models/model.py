@@ -1,0 +1,188 @@
+"""What a trainer steps: a model that draws training images and is updated; terms of its loss; predictors."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from dyngs.conventions import RasterizeMode
+from dyngs.data.loader import Image
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.renderable import Renderable, Rendering
+from dyngs.ops.adam import Count
+from dyngs.state import State
+
+S_co = TypeVar("S_co", bound=Renderable, covariant=True)
+
+
+def nothing() -> None:
+    """Do nothing."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A training image as a model draws it.
+
+    Attributes:
+        rendering: of the image's camera.
+        penalties: differentiable regularizers of what was drawn, weighted, by name.
+        moved: tensors that something learned has moved, by name: one that is not finite would not be drawn, so that a
+            diverging field could go unseen; empty: nothing was.
+        after_backward: takes in gradients once they are there.
+    """
+
+    rendering: Rendering
+    penalties: Mapping[str, Tensor] = field(default_factory=dict)
+    moved: Mapping[str, Tensor] = field(default_factory=dict)
+    after_backward: Callable[[], None] = nothing
+
+
+@dataclass(frozen=True)
+class Updated:
+    """What an update has done.
+
+    Attributes:
+        bad: number of rows left out because their gradient was not finite.
+        finding: lines about what was found out, or None.
+        is_rearranged: there are other rows now: several processes must have come to the same.
+    """
+
+    bad: Count = 0
+    finding: str | None = None
+    is_rearranged: bool = False
+
+
+class Model(ABC, Generic[S_co]):
+    """A model in training: its scene and everything that training it keeps.
+
+    Attributes:
+        moves_by: name of what moves the scene, and the configuration section of its learning rates, for messages.
+    """
+
+    moves_by: tuple[str, str] = ("", "")
+
+    @property
+    @abstractmethod
+    def scene(self) -> S_co:
+        """What is trained, as it is now."""
+
+    @abstractmethod
+    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+        """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable.
+
+        Args:
+            image: of training, perhaps shrunk.
+            step: that is being done, from 1.
+            background: behind it.
+            depth: the expected depth is needed, too.
+        """
+
+    @abstractmethod
+    def update(self, step: int) -> Updated:
+        """Change what is learned by the gradients that are there, and drop them."""
+
+    @property
+    @abstractmethod
+    def leaves(self) -> Sequence[Tensor]:
+        """Tensors that receive gradients, in a fixed order."""
+
+    @abstractmethod
+    def state(self) -> State:
+        """Return everything that training needs to go on, by name, with its role."""
+
+    @abstractmethod
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to where ``checkpoint`` was taken.
+
+        Raises:
+            KeyError: a tensor is missing.
+            ValueError: one is not as it must be.
+        """
+
+    @abstractmethod
+    def place(self, device: torch.device) -> None:
+        """Go on on ``device``."""
+
+    def regularizers(self) -> Mapping[str, Tensor]:
+        """Return differentiable penalties on what is learned, weighted, by name."""
+        return {}
+
+    def tallies(self, step: int) -> Sequence[Tensor]:
+        """Return what ``step`` has counted; processes that share it sum it in place."""
+        return ()
+
+    def trains_on(self, time: float | None, step: int) -> bool:
+        """Return whether an image of ``time`` may be trained on in ``step``; at each step some may."""
+        return True
+
+    def holds_out(self, index: int, step: int) -> bool:
+        """Return whether training view ``index`` must not be trained on in ``step``."""
+        return False
+
+    def window(self, step: int) -> tuple[float, float]:
+        """Return the first and last time that are trained on at ``step``."""
+        return 0.0, 1.0
+
+    @property
+    def rasterize_mode(self) -> RasterizeMode:
+        """How other programs are to draw it."""
+        return RasterizeMode.CLASSIC
+
+    @property
+    def num_gaussians(self) -> int:
+        """Number of Gaussians; 0 where it is made of something else."""
+        return 0
+
+    @property
+    def num_moving(self) -> int:
+        """Number of Gaussians that depend on time or pose."""
+        return 0
+
+
+@dataclass(frozen=True)
+class Look:
+    """A training image next to its rendering, for terms of the loss.
+
+    Attributes:
+        index: of the view.
+        step: that is being done.
+        image: what was trained on, with a mask of the pixels that count.
+        drawn: by the model.
+        rendered, truth: (H, W, 3) that are compared, on the same background.
+        model: that is trained.
+        generator: the run's only source of randomness.
+    """
+
+    index: int
+    step: int
+    image: Image
+    drawn: Drawn
+    rendered: Tensor
+    truth: Tensor
+    model: Model[Any]
+    generator: torch.Generator
+
+
+class Loss:
+    """Terms of the loss."""
+
+    def needs_depth(self, image: Image) -> bool:
+        """Return whether ``image`` must be drawn with its depth."""
+        return False
+
+    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+        """Return differentiable scalars, weighted, by name."""
+        raise NotImplementedError
+
+
+class Predictor(Protocol):
+    """What makes a scene of a few images, without training."""
+
+    def predict(self, views: Sequence[int]) -> Renderable:
+        """Return the scene that the images ``views`` of a capture show."""
+        ...

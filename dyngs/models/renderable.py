@@ -1,0 +1,150 @@
+"""What can be drawn from anywhere at any time, whatever it is made of."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
+from dyngs.state import Role, State, fields_moved_to
+
+R = TypeVar("R", bound="Renderable")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """How any scene is drawn.
+
+    Attributes:
+        near: what is nearer to the camera is not drawn, world units (3DGS: 0.2).
+        depth: none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha).
+    """
+
+    near: float = 0.2
+    depth: Literal["none", "accumulated", "expected"] = "none"
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """V rendered images.
+
+    Attributes:
+        rgb: (V, H, W, 3), background composited; not clamped above 1.
+        transmittance: (V, H, W) in [0, 1], the fraction of the background that is seen.
+        depth: (V, H, W) view-space z in world units, or None; 0 where nothing is drawn.
+    """
+
+    rgb: Tensor
+    transmittance: Tensor
+    depth: Tensor | None
+
+    @property
+    def alpha(self) -> Tensor:
+        """Return (V, H, W) opacities of the images, in [0, 1]."""
+        return 1 - self.transmittance
+
+    def to(self: T, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> T:
+        """Return the same images on another device or in another precision; integers stay integers."""
+        return fields_moved_to(self, device, dtype)
+
+
+class TimeStep:
+    """A scene at one time, computed once for several images.
+
+    Attributes:
+        time: in [0, 1], for what depends on it.
+    """
+
+    def __init__(self, time: float | None = None) -> None:
+        self.time = time
+
+
+class Renderable(ABC):
+    """What evaluation, rendering, viewer and videos need of a scene.
+
+    Attributes:
+        options: ``DrawOptions``, or more than that: how it is drawn unless ``render`` is told otherwise.
+        background: (3,) colour behind it unless ``render`` is told otherwise; None is black.
+    """
+
+    options: Any
+    background: Tensor | None
+
+    @property
+    @abstractmethod
+    def times(self) -> tuple[float, ...]:
+        """Distinct times of training, or of the motion that is played, in [0, 1], ascending; empty without times."""
+
+    @property
+    def is_static(self) -> bool:
+        """Return whether it looks the same at every time."""
+        return not self.times
+
+    @property
+    @abstractmethod
+    def bounds(self) -> Tensor:
+        """(2, 3) lowest and highest corner of what is to be seen, world units."""
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Device that draws it."""
+
+    @abstractmethod
+    def render(
+        self,
+        cameras: Cameras,
+        time: float | TimeStep | None = None,
+        *,
+        options: Any = None,
+        background: Tensor | None = None,
+    ) -> Rendering:
+        """Return images; differentiable where gradients are enabled.
+
+        Args:
+            cameras: V cameras, on any device.
+            time: in [0, 1], or what ``time_step`` returned; None is the first.
+            options: how to draw; None: as the scene is to be drawn.
+            background: (3,) or (V, 3) colour; None: that of the scene.
+        """
+
+    def time_step(self, time: float | None) -> TimeStep:
+        """Return what drawing at ``time`` needs, clamped to [0, 1]; None is the first.
+
+        Raises:
+            DyngsError: the time is NaN.
+        """
+        return TimeStep(clamped_time(time))
+
+    @abstractmethod
+    def state(self) -> State:
+        """Return everything that is stored, by name, with its role."""
+
+    def drawing_state(self) -> State:
+        """Return the part of ``state`` that drawing needs, in an equivalent form where that is smaller."""
+        return {name: x for name, x in self.state().items() if x.role is not Role.TRAINING}
+
+    def on_background(self: R, colour: Tensor) -> R:
+        """Return it before a background (3,), with caches of its own."""
+        other = copy(self)
+        object.__setattr__(other, "background", colour)  # scenes may be frozen
+        return other
+
+    def to(self: R, device: torch.device | str) -> R:
+        """Return it with its tensors on ``device``."""
+        return fields_moved_to(self, device)
+
+
+def clamped_time(time: float | None) -> float:
+    """Return ``time`` within [0, 1]; None is 0. Raises DyngsError for NaN."""
+    if time is not None and math.isnan(time):
+        raise DyngsError("the time to draw is not a number; give one from 0 to 1")
+    return min(max(0.0 if time is None else time, 0.0), 1.0)
