@@ -74,7 +74,7 @@ def posed(opened: Opened, angles: Angles) -> Opened:
     for name, turns in angles.items():
         row = joint_row(name, poses.shape[1])
         poses[0, row] = _composed(poses[0, row], turns)
-    return replace(opened, scene=person.playing(replace(clip, poses=poses)), as_captured=False)
+    return replace(opened, renderable=person.playing(replace(clip, poses=poses)), as_captured=False)
 
 
 def joint_row(name: str, count: int) -> int:

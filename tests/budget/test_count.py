@@ -101,6 +101,6 @@ def test_the_line_says_whether_it_mattered(captures: dict[str, Path], tmp_path: 
     )
     assert "150; it cost nothing" in CountLimit(limited(trainer), 300).reached()
     person = assemble(config_of("human", captures, tmp_path, BudgetConfig()))
-    count = len(person.optimizer.parameters)
+    count = person.num_gaussians
     person.config = person.config.model_copy(update={"strategy": DefaultStrategy(max_gaussians=count + 2)})
     assert "it cost nothing" in CountLimit(limited(person), count + 1).reached(), "growth was not held back by it"

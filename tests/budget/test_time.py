@@ -27,8 +27,9 @@ from dyngs.budget.time import (
 )
 from dyngs.config import AutoColour, Config, DataConfig, DynamicModel, TrainConfig
 from dyngs.config.io import load_resolved
+from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.kinds import assemble
+from dyngs.kinds import assemble, prepared
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.training.clock import Forecast, Stopwatch, with_steps
@@ -125,7 +126,8 @@ def test_what_happens_once_is_neither_missed_nor_redone() -> None:
 
 def alone(config: Config, folder: Path, resumed: Checkpoint | None = None) -> _Run:
     """A run in one process."""
-    return _Run(config, folder, resumed, processes=Processes(), threads=1)
+    capture = read_capture(config.data) if resumed else prepared(config)
+    return _Run(config, folder, resumed, config, capture=capture, processes=Processes(), threads=1)
 
 
 def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -184,7 +184,9 @@ def directions(centers: torch.Tensor) -> np.ndarray:
 
 
 def test_the_person_is_in_every_image(person: Path) -> None:
-    scene = assemble(Config(data=DataConfig(root=person), model=MODEL, train=TRAIN, run=RunConfig(threads=1))).scene
+    scene = assemble(
+        Config(data=DataConfig(root=person), model=MODEL, train=TRAIN, run=RunConfig(threads=1))
+    ).model.scene
     assert isinstance(scene, HumanScene)
     cameras = orbit_around(opened_scene(scene), 8, (60, 80))
     assert np.diff(directions(cameras.centers)) == pytest.approx(45, abs=1)
