@@ -332,7 +332,7 @@ def test_overrides_may_stand_anywhere(words: list[str], monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    "words", [["prune", "RUN", "--out", "X", "a.b=1", "foo"], ["eval", "RUN", "--split", "val", "a.b=1"]]
+    "words", [["prune", "RUN", "--out", "X", "a.b=1", "foo"], ["eval", "RUN", "--split", "val", "foo"]]
 )
 def test_other_words_may_not(words: list[str], capsys: Capture) -> None:
     assert main(words) == 2

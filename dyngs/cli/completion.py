@@ -10,6 +10,8 @@ from pathlib import Path
 from dyngs.cli.arguments import input_path, input_word, output_path
 from dyngs.cli.docs import docs_folder
 
+_ON_A_RUN = ("eval", "render", "view", "export")
+"""Commands that take where the capture of a run lies by now, and no other setting."""
 _BASH = """\
 # Put this line into ~/.bashrc:   eval "$(dyngs completion bash)"
 _dyngs() {
@@ -131,6 +133,8 @@ class _Place:
         if len(places) < len(actions):
             if not self.passed and not self.resumes and "=" not in word and not places:
                 yield from (*_presets(), *_paths(word, (".yaml", ".yml")))
+            if self.parser.prog.split()[-1] in _ON_A_RUN and not word.startswith("data."):
+                return
             yield from _settings(word, resumes=self.resumes)
 
 

@@ -32,6 +32,7 @@ from dyngs.errors import DyngsError
 from dyngs.kinds import assemble, prepared
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
+from dyngs.runs.lock import Held
 from dyngs.training.clock import Forecast, Stopwatch, with_steps
 from dyngs.training.events import StepReport
 from dyngs.training.loop import Loop
@@ -127,7 +128,9 @@ def test_what_happens_once_is_neither_missed_nor_redone() -> None:
 def alone(config: Config, folder: Path, resumed: Checkpoint | None = None) -> _Run:
     """A run in one process."""
     capture = read_capture(config.data) if resumed else prepared(config)
-    return _Run(config, folder, resumed, config, capture=capture, processes=Processes(), threads=1)
+    folder.mkdir(exist_ok=True)
+    held = Held(folder, alone=True)
+    return _Run(config, folder, resumed, config, capture=capture, held=held, processes=Processes(), threads=1)
 
 
 def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

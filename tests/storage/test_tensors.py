@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from moving_scene import camera
 from tiny_fields import KINDS, cloud, stirred_field, tiny_options
 
-from dyngs.config import DynamicModel, HumanModel
+from dyngs.config import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -287,7 +287,7 @@ def person(weights: torch.Tensor, corrections: torch.Tensor) -> HumanScene:
         height=zeros,
     )
     skeleton = Skeleton(torch.zeros(24, 3), (-1, *[0] * 23))
-    learned = new_corrections(HumanModel(sh_degree=0), clip, skeleton, anchors)
+    learned = new_corrections(clip, skeleton, anchors)
     learned.values()["weights"].copy_(corrections)
     gaussians = cloud(2).replace(sh=torch.zeros(2, 1, 3))
     return HumanScene(gaussians=gaussians, anchors=anchors, skeleton=skeleton, clip=clip, learned=learned)
@@ -298,9 +298,7 @@ def test_corrections_of_skinning_weights_are_applied() -> None:
     corrections = torch.tensor([[0.0, 3.0]]).log1p().repeat(2, 1)
     full = completed(drawable(person(weights, corrections)))
     torch.testing.assert_close(full["model.anchors.weights"], torch.tensor([[3 / 7, 4 / 7], [1.0, 0.0]]))
-    again = HumanScene.restored(
-        HumanModel(sh_degree=0), Gaussians(**part_of(full, "gaussians")), part_of(full, "model")
-    )
+    again = HumanScene.restored(Gaussians(**part_of(full, "gaussians")), part_of(full, "model"))
     assert not again.learned["weights"].any()
 
 
