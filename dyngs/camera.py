@@ -12,6 +12,16 @@ from torch import Tensor
 class Cameras:
     """V pinhole cameras of one image size.
 
+    Example::
+
+        import torch
+
+        import dyngs
+
+        pose = torch.eye(4)[None]  # at the origin, looking along z
+        intrinsics = torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+        cameras = dyngs.Cameras(pose, intrinsics, width=64, height=48)
+
     Attributes:
         cam_from_world: (V, 4, 4) rigid transforms, world to camera, OpenCV axes.
         intrinsics: (V, 3, 3) matrices in pixels; the first pixel's centre is (0.5, 0.5).

@@ -67,6 +67,17 @@ def rasterization(
     Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds. ``meta["means2d"]`` may be
     asked to ``retain_grad()``; with ``absgrad`` it also gets an attribute ``absgrad`` in the backward pass.
 
+    Example::
+
+        import torch
+
+        import dyngs
+
+        means, quats = torch.tensor([[0.0, 0, 4]]), torch.tensor([[1.0, 0, 0, 0]])
+        scales, opacities, colors = torch.full((1, 3), 0.3), torch.tensor([0.9]), torch.tensor([[1.0, 0.5, 0]])
+        pose, intrinsics = torch.eye(4)[None], torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+        images, alphas, meta = dyngs.rasterization(means, quats, scales, opacities, colors, pose, intrinsics, 64, 48)
+
     Args:
         means: (N, 3) world.
         quats: (N, 4) wxyz, any norm.

@@ -15,6 +15,15 @@ class DyngsError(Exception):
     """Bad input or an impossible request: says what, where and what to do, in one line.
 
     The command line prints the message and exits with code 2; library callers catch it.
+
+    Example::
+
+        import dyngs
+
+        try:
+            dyngs.load("runs/nowhere")
+        except dyngs.DyngsError as error:
+            print(error)
     """
 
     def __str__(self) -> str:

@@ -34,6 +34,7 @@ MANY_PARAMETERS = {
 HEAVY = ("pycolmap", "trimesh", "kornia", "OpenImageIO", "skimage", "av", "rich", "tensorboard", "lpips", "matplotlib")
 WITHOUT_MIRROR = {
     "test_devices.py": "about all that poses an avatar",
+    "test_examples.py": "about the public names",
     "test_emulated_gpu.py": "about all ops at once, on another core",
     "test_pretend_gpu.py": "about all that a trainer holds, on another device",
     "test_docs.py": "about README.md and docs/*.md",

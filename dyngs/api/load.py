@@ -9,9 +9,17 @@ from dyngs.runs.opened import open_scene
 
 
 def load(path: Path | str) -> Scene:
-    """Load a scene, to be drawn from anywhere, at any time::
+    """Load a scene, to be drawn from anywhere, at any time.
 
-        scene = dyngs.load("runs/bench")
+    Example::
+
+        import torch
+
+        import dyngs
+
+        scene = dyngs.load("runs/lego")
+        pose = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]])
+        camera = dyngs.Cameras(pose, torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64, 48)
         image = scene.render(camera, time=0.5).rgb[0]
 
     Args:

@@ -109,6 +109,13 @@ def train(
 
     Poses of photos and videos are found first, and a body is fitted to a person where that is needed.
 
+    Example::
+
+        import dyngs
+
+        overrides = ["data.root=lego", "run.dir=runs/short", "train.steps=2", "init.num_random=50"]
+        run = dyngs.train(dyngs.load_config("static", overrides))
+
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose ``train.steps`` may be
             changed: the run then goes on to so many, on their schedules (``dyngs.training.extend``).

@@ -47,6 +47,12 @@ _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
     """Return the configuration of a preset with overrides laid over it.
 
+    Example::
+
+        import dyngs
+
+        config = dyngs.load_config("static", ["data.root=lego", "train.steps=3000"])
+
     Args:
         preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``) where no such file
             exists; None starts from the defaults.

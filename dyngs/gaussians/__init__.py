@@ -19,6 +19,20 @@ LARGEST_LOG_SCALE = 88
 class Gaussians:
     """N Gaussians in the parametrisation that is optimised.
 
+    Example::
+
+        import torch
+
+        import dyngs
+
+        one = dyngs.Gaussians(
+            means=torch.tensor([[0.0, 0, 4]]),
+            quats=torch.tensor([[1.0, 0, 0, 0]]),
+            log_scales=torch.full((1, 3), -1.0),
+            logit_opacities=torch.tensor([3.0]),
+            sh=torch.ones(1, 1, 3),
+        )
+
     Attributes:
         means: (N, 3) centres in world units.
         quats: (N, 4) rotations wxyz; normalised by the rasterizer, a zero quaternion means identity.

@@ -33,6 +33,12 @@ harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but
 class RenderOptions(DrawOptions):
     """Settings of a render, beside those of ``DrawOptions``.
 
+    Example::
+
+        import dyngs
+
+        sharp = dyngs.RenderOptions(eps2d=0.1, mode="antialiased", depth="expected")
+
     Attributes:
         far: centres beyond are culled, as those nearer than ``near`` are, world units.
         eps2d: 2D low-pass variance, px^2 (3DGS: 0.3; Mip-Splatting: 0.1).
@@ -102,6 +108,19 @@ def render(
     Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the probe and what the
     shader computes.
 
+    Example::
+
+        import torch
+
+        import dyngs
+
+        scene = dyngs.load("runs/lego")
+        cameras = dyngs.Cameras(
+            torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]]),
+            torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64, 48
+        )
+        image = dyngs.render(scene.gaussians, cameras).rgb[0]  # (48, 64, 3)
+
     Args:
         gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).
         cameras: V cameras, on the device of the Gaussians.
@@ -159,6 +178,19 @@ def _with_depth(
 
 def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()) -> Tensor:
     """Return the (V, N) sums over pixels of each Gaussian's blending weight: its fraction of every image.
+
+    Example::
+
+        import torch
+
+        import dyngs
+
+        scene = dyngs.load("runs/lego")
+        cameras = dyngs.Cameras(
+            torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]]),
+            torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64, 48
+        )
+        seen = dyngs.contributions(scene.gaussians, cameras).sum(0) > 0
 
     Raises:
         DyngsError: as ``render``.

@@ -52,6 +52,13 @@ class GaussianTimeStep(TimeStep):
 class Scene(Renderable):
     """N Gaussians at any time.
 
+    Example::
+
+        import dyngs
+
+        scene = dyngs.load("runs/lego")
+        gaussians = scene.at(0.5)
+
     Attributes:
         gaussians: as stored: canonical, or at rest. In training they are the optimizer's leaf tensors.
         colour: network that colours them; None: their harmonics do.

@@ -36,6 +36,20 @@ class DrawOptions:
 class Rendering:
     """V rendered images.
 
+    Example::
+
+        import torch
+
+        import dyngs
+
+        scene = dyngs.load("runs/lego")
+        cameras = dyngs.Cameras(
+            torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]]),
+            torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64, 48
+        )
+        rendering = scene.render(cameras)
+        rendering.rgb.shape, rendering.alpha.shape  # (1, 48, 64, 3), (1, 48, 64)
+
     Attributes:
         rgb: (V, H, W, 3), background composited; not clamped above 1.
         transmittance: (V, H, W) in [0, 1], the fraction of the background that is seen.
