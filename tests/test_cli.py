@@ -279,9 +279,9 @@ def test_output_that_nobody_takes_gets_no_traceback(command: str) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="sends a signal")
 def test_ctrl_c_at_any_time_of_the_start_gets_no_traceback(capture: Path, tmp_path: Path) -> None:
     """While dyngs and torch are imported, and in the first steps; a shell sees 130 each time."""
-    words = ["train", "static", f"data.root={capture}", f"run.dir={tmp_path / 'run'}", "train.steps=100000"]
-    command = [sys.executable, "-m", "dyngs", *words]
+    words = ["train", "static", f"data.root={capture}", "train.steps=100000"]
     for wait in (0.5, 0.8, 1.2, 2.0, 3.0):
+        command = [sys.executable, "-m", "dyngs", *words, f"run.dir={tmp_path / f'run after {wait} s'}"]
         process = subprocess.Popen(
             command,
             env=ENVIRONMENT,
