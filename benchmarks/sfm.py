@@ -15,14 +15,14 @@ import json
 import resource
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.distance import pdist
 
 from dyngs.api.train import train
-from dyngs.capture.sfm import SfmOptions, estimate_poses
+from dyngs.capture.sfm import estimate_poses
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
@@ -94,7 +94,7 @@ def row(capture: Path, options: argparse.Namespace, overrides: Sequence[str]) ->
     out, figures = options.folder / f"{name}_posed", options.folder / f"{name}_sfm.json"
     if not figures.exists():
         before, begun = resource.getrusage(resource.RUSAGE_SELF), time.perf_counter()
-        result = estimate_poses(source, out, replace(SfmOptions(), num_threads=options.threads))
+        result = estimate_poses(source, out, SfmOptions(num_threads=options.threads))
         after = resource.getrusage(resource.RUSAGE_SELF)
         cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
         fields = [time.perf_counter() - begun, cpu, result.num_registered, result.num_images, result.mean_error_px]

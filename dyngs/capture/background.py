@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from dyngs.capture.multi_video.steadiness import steadiness
+from dyngs.capture.multi_video.steadiness import STANDS, displaced_by
 from dyngs.data.capture import Capture, Silhouette, View, all_views
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.readers.colmap import find_masks, mask_of
@@ -306,8 +306,7 @@ def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Bac
         colours = area_downscale_uint8(pixels, *camera.size).numpy().astype(np.float32)
         spread = background_of(sampled).noise
         return Background(colours, np.full_like(spread, float(np.median(spread))))
-    moved = steadiness(sampled[..., 1])
-    if not moved.stands:
+    if displaced_by(sampled[..., 1]) > STANDS:
         raise DyngsError(
             f"{camera.where}: the camera moves, so there is no background to compare with; give masks of the person "
             "(--masks)"

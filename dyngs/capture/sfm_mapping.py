@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dyngs.capture.sfm_matches import agreement
-from dyngs.conventions import ReportProgress
+from dyngs.capture.sfm_work import SEED, SfmTask, incremental_options
 
 if TYPE_CHECKING:
     import pycolmap
@@ -29,13 +29,7 @@ _FOCALS = (0.2, 10.0)
 
 @dataclass(frozen=True)
 class Model:
-    """A model found by mapping.
-
-    Attributes:
-        reconstruction: poses, cameras, points.
-        mapper: what found it.
-        agreeing: fraction of the matched pairs whose matches fit the poses.
-    """
+    """A model that ``mapper`` found; ``agreeing`` is the fraction of the matched pairs whose matches fit the poses."""
 
     reconstruction: pycolmap.Reconstruction
     mapper: Mapper
@@ -61,50 +55,24 @@ class Model:
         return float(self.reconstruction.compute_mean_reprojection_error())
 
 
-@dataclass(frozen=True)
-class MappingTask:
-    """Input of mapping.
-
-    Attributes:
-        database: COLMAP's, with verified matches.
-        images: folder of the images, for the colours of points.
-        scratch: folder for files in between.
-        count: images.
-        longest_side: of the images, in pixels.
-        seed: of everything random.
-        report: is told of images that got a pose.
-        first: mapping that is tried first. Incremental mapping of photos is as fast, and its poses are nearer to given
-            ones; it breaks videos into pieces.
-    """
-
-    database: Path
-    images: Path
-    scratch: Path
-    count: int
-    longest_side: int
-    seed: int
-    report: ReportProgress
-    first: Mapper = "global"
-
-
-def mapped(task: MappingTask, wanted: Literal["auto", "global", "incremental"]) -> Model | None:
+def mapped(task: SfmTask) -> Model | None:
     """Return the model with most images; None where none could be found.
 
-    "auto" is ``task.first``, and the other mapping next to it only where the first leaves images out, its poses do
-    not fit the matches of all pairs, or its mean reprojection error is large: see ``better``.
+    "auto" is global mapping for a video and incremental mapping for photos, where it is as fast and its poses are
+    nearer to given ones (it breaks videos into pieces). The other one is tried only where the first leaves images out,
+    its poses do not fit the matches of all pairs, or its mean reprojection error is large: see ``better``.
     """
-    if wanted != "auto":
-        return _found(task, wanted)
-    first = _found(task, task.first)
-    if first is not None and not needs_more(first, task):
-        return first
-    return better(first, _found(task, "incremental" if task.first == "global" else "global"))
+    if task.options.mapper != "auto":
+        return _found(task, task.options.mapper)
+    order: tuple[Mapper, Mapper] = ("global", "incremental") if task.is_video else ("incremental", "global")
+    first = _found(task, order[0])
+    return first if first is not None and not needs_more(first, task) else better(first, _found(task, order[1]))
 
 
-def needs_more(model: Model, task: MappingTask) -> bool:
+def needs_more(model: Model, task: SfmTask) -> bool:
     """Whether images are left out, poses do not fit the matches, a lens is none, or the error is large."""
-    bad = model.registered < task.count or model.agreeing < GOOD_AGREEMENT or not model.has_real_lens
-    return bad or model.error_px > GOOD_ERROR_PX * max(task.longest_side, 1000) / 1000
+    bad = model.registered < len(task.names) or model.agreeing < GOOD_AGREEMENT or not model.has_real_lens
+    return bad or model.error_px > GOOD_ERROR_PX * max(task.side, 1000) / 1000
 
 
 def better(first: Model | None, second: Model | None) -> Model | None:
@@ -124,82 +92,71 @@ def better(first: Model | None, second: Model | None) -> Model | None:
     return second if second.error_px < first.error_px * (1 - _SAME_ERROR) else first
 
 
-def _found(task: MappingTask, mapper: Mapper) -> Model | None:
+def _found(task: SfmTask, mapper: Mapper) -> Model | None:
     """Return the model of one mapper with most images; a failure of its solver counts as no model."""
     import pycolmap
 
-    folder = task.scratch / mapper
+    folder = task.database.with_name("models") / mapper
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    pycolmap.set_random_seed(task.seed)
+    pycolmap.set_random_seed(SEED)
     try:
-        models = (_global if mapper == "global" else _incremental)(task, folder)
+        best = (_global if mapper == "global" else _incremental)(task, folder)
     except (RuntimeError, ValueError):
-        models = {}
-    best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+        best = None
     if best is None or best.num_reg_images() < 2:
         return None
-    task.report("poses, images", best.num_reg_images(), task.count)
-    return Model(best, mapper, agreement(best, task.database, task.longest_side))
+    task.report("poses, images", best.num_reg_images(), len(task.names))
+    return Model(best, mapper, agreement(best, task.database, task.side))
 
 
-def _global(task: MappingTask, folder: Path) -> dict[int, pycolmap.Reconstruction]:
+def _most_images(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    return max(models, key=lambda model: model.num_reg_images(), default=None)
+
+
+def _global(task: SfmTask, folder: Path) -> pycolmap.Reconstruction | None:
     """Map all images at once, then let incremental mapping refine: it filters points by pixels, not by angles."""
     import pycolmap
 
-    task.report("poses, images", 0, task.count)
+    task.report("poses, images", 0, len(task.names))
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = _THREADS
     mapper = options.mapper
     seeded = (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation)
     for part in seeded:
-        part.random_seed = task.seed
+        part.random_seed = SEED
     mapper.track_required_tracks_per_view = _TRACKS_PER_IMAGE
     mapper.bundle_adjustment.ceres.use_gpu = mapper.global_positioning.use_gpu = False
-    found = pycolmap.global_mapping(task.database, task.images, folder, options)
-    best = max(found.values(), key=lambda model: model.num_reg_images(), default=None)
-    if best is None or best.num_reg_images() < task.count:
-        return found
+    best = _most_images(pycolmap.global_mapping(task.database, task.images, folder, options).values())
+    if best is None or best.num_reg_images() < len(task.names):
+        return best
     start = folder / "start"
     start.mkdir()
     best.write(start)
-    refined = pycolmap.incremental_mapping(
-        task.database, task.images, folder, _incremental_options(task), input_path=start
-    )
-    kept = max(refined.values(), key=lambda model: model.num_reg_images(), default=None)
-    return found if kept is None or kept.num_reg_images() < best.num_reg_images() else {0: kept}
+    refined = pycolmap.incremental_mapping(task.database, task.images, folder, _options(), input_path=start)
+    kept = _most_images(refined.values())
+    return best if kept is None or kept.num_reg_images() < best.num_reg_images() else kept
 
 
-def _incremental(task: MappingTask, folder: Path) -> dict[int, pycolmap.Reconstruction]:
+def _incremental(task: SfmTask, folder: Path) -> pycolmap.Reconstruction | None:
     import pycolmap
 
-    told = _counter(task)
-    told()  # the second one of the first pair is told by COLMAP
-    return pycolmap.incremental_mapping(
-        task.database, task.images, folder, _incremental_options(task),
-        initial_image_pair_callback=told, next_image_callback=told,
-    )  # fmt: skip
-
-
-def _counter(task: MappingTask) -> Callable[[], None]:
-    """Return a callback of incremental mapping: an image has got its pose."""
     done = 0
 
-    def count() -> None:
+    def told() -> None:
         nonlocal done
-        done = min(done + 1, task.count)
-        task.report("poses, images", done, task.count)
+        done = min(done + 1, len(task.names))
+        task.report("poses, images", done, len(task.names))
 
-    return count
+    told()  # the second one of the first pair is told by COLMAP
+    found = pycolmap.incremental_mapping(
+        task.database, task.images, folder, _options(), initial_image_pair_callback=told, next_image_callback=told
+    )
+    return _most_images(found.values())
 
 
-def _incremental_options(task: MappingTask) -> pycolmap.IncrementalPipelineOptions:
-    import pycolmap
-
-    mapping = pycolmap.IncrementalPipelineOptions()
-    mapping.num_threads = _THREADS
-    mapping.random_seed = mapping.mapper.random_seed = mapping.triangulation.random_seed = task.seed
+def _options() -> pycolmap.IncrementalPipelineOptions:
+    mapping = incremental_options(_THREADS)
     mapping.min_model_size = 3
     mapping.mapper.init_min_num_inliers = 50
-    mapping.ba_use_gpu = False
     return mapping

@@ -21,13 +21,7 @@ _MOST_FITTED_PAIRS = 2000
 
 
 def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
-    """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit the poses.
-
-    Args:
-        model: poses and cameras.
-        database: COLMAP's, with verified matches.
-        longest_side: of the images, in pixels.
-    """
+    """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit the poses."""
     import pycolmap
 
     posed = {key: image for key, image in model.images.items() if image.has_pose}
@@ -42,21 +36,22 @@ def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int)
                 if key not in rays:
                     places = np.asarray(opened.read_keypoints(key))[:, :2].astype(np.float64)
                     camera = model.cameras[posed[key].camera_id]
-                    flat = np.asarray(camera.cam_from_img(places), np.float64)
-                    rays[key] = flat
+                    rays[key] = np.asarray(camera.cam_from_img(places), np.float64)
             b_from_a = posed[b].cam_from_world() * posed[a].cam_from_world().inverse()
-            distances = _sampson(_essential(b_from_a), rays[a][matches[:, 0]], rays[b][matches[:, 1]])
+            x, y, z = b_from_a.translation / max(float(np.linalg.norm(b_from_a.translation)), 1e-12)
+            essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a.rotation.matrix()
+            distances = _sampson(essential, rays[a][matches[:, 0]], rays[b][matches[:, 1]])
             focal = model.cameras[posed[a].camera_id].mean_focal_length()
             fits.append(np.nanmedian(distances) * focal <= _FITS_PX * max(longest_side, 1000) / 1000)
     return float(np.mean(fits)) if fits else 1.0
 
 
-def angles_deg(model: pycolmap.Reconstruction, most: int = 2000) -> np.ndarray:
-    """Return the largest angle under which each of up to ``most`` points is seen from two images, in degrees."""
+def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Return the largest angle under which each of some 2,000 points is seen from two images, in degrees."""
     centres = {i: image.projection_center() for i, image in model.images.items() if image.has_pose}
     angles = []
     ids = sorted(model.points3D)
-    for key in ids[:: max(len(ids) // most, 1)]:
+    for key in ids[:: max(len(ids) // 2000, 1)]:
         point = model.points3D[key]
         rays = np.array([centres[element.image_id] for element in point.track.elements]) - point.xyz
         rays /= np.linalg.norm(rays, axis=1, keepdims=True) + 1e-12
@@ -73,12 +68,6 @@ def turning_fraction(database: Path) -> float:
     with pycolmap.Database.open(database) as opened:
         found = [int(g.config) for g in opened.read_two_view_geometries()[1] if len(g.inlier_matches) >= _WELL]
     return sum(kind in flat for kind in found) / len(found) if found else 0.0
-
-
-def _essential(b_from_a: pycolmap.Rigid3d) -> np.ndarray:
-    """Return the (3, 3) essential matrix of a relative pose."""
-    x, y, z = b_from_a.translation / max(float(np.linalg.norm(b_from_a.translation)), 1e-12)
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a.rotation.matrix()
 
 
 _MOST_PAIRS, _MOST_MATCHES = 120, 200
@@ -109,13 +98,7 @@ class Parallax(Enum):
 
 @dataclass(frozen=True)
 class SeenParallax:
-    """Parallax of a set of images.
-
-    Attributes:
-        fraction: of the longest side of an image.
-        kind: what that says about the camera.
-        covered: median over pairs of the fraction of an image, as far as it has features, in which some match.
-    """
+    """Parallax as a fraction of the longest side, what it says, and ``MatchedPair.covered`` (median over pairs)."""
 
     fraction: float
     kind: Parallax
@@ -123,10 +106,7 @@ class SeenParallax:
 
     @property
     def may_follow_a_mover(self) -> bool:
-        """Whether so little of the images matches that it may be a thing that moves.
-
-        Hand-held clips and photos at hand have 62 to 94 %, one with a mover over a third of each frame 35 %.
-        """
+        """Whether so little of the images matches that it may be a thing that moves: clips at hand have 62 to 94 %."""
         return self.covered < _COVERED
 
 
@@ -151,18 +131,19 @@ def parallax_of(pairs: list[MatchedPair], longest_side: int) -> SeenParallax:
     that explains them best, with the focal length, common to all, that leaves least. It is that of noise where the
     camera only rotated, however far, and about the focal length times the shift over the depth where it moved.
     Without pairs nothing is known, and it is 1. Nor is it where matches cover less than half of the images: what
-    else is in them may be elsewhere in the other ones, and the matches those of a thing that moves.
-
-    Args:
-        pairs: well matched ones.
-        longest_side: of an image, in pixels: noise of the matches is about half a pixel.
+    else is in them may be elsewhere in the other ones, and the matches those of a thing that moves. Noise of matches is
+    about half a pixel.
     """
     if not pairs:
         return SeenParallax(1.0, Parallax.ENOUGH)
-    coarse = np.array([_left_of(pairs, focal) for focal in _FOCALS])
+
+    def left_with(focals: np.ndarray) -> np.ndarray:
+        return np.array([[_left(pair, focal) for pair in pairs] for focal in focals])
+
+    coarse = left_with(_FOCALS)
     best = int(coarse.mean(1).argmin())
     low, high = _FOCALS[max(best - 1, 0)], _FOCALS[min(best + 1, len(_FOCALS) - 1)]
-    fine = np.array([_left_of(pairs, focal) for focal in np.linspace(low, high, _FINE)])
+    fine = left_with(np.linspace(low, high, _FINE))
     fraction = float(np.percentile(fine[fine.mean(1).argmin()], _WIDEST))
     covered = float(np.median([pair.covered for pair in pairs]))
     if covered < _COVERED:
@@ -203,10 +184,6 @@ def _cells(places: np.ndarray) -> int:
     return len(np.unique(np.floor(places * _CELLS).astype(int), axis=0))
 
 
-def _left_of(pairs: list[MatchedPair], focal: float) -> list[float]:
-    return [_left(pair, focal) for pair in pairs]
-
-
 def _left(pair: MatchedPair, focal: float) -> float:
     """Return the distance that three quarters of the matches stay below after the best turn."""
     first, second = (np.c_[xy / focal, np.ones(len(xy))] for xy in (pair.first, pair.second))
@@ -235,10 +212,6 @@ def without_movers(database: Path, longest_side: int) -> float:
     Each match of two images agrees or disagrees with the epipolar geometry of most of their matches. A feature moves
     if it disagrees in more than ``_MOST_OUTSIDE`` of its pairs (three at least). A thing that fills most of *some*
     pairs wins these, and loses them once its features are known to move by the others.
-
-    Args:
-        database: COLMAP's, changed in place.
-        longest_side: of the images, in pixels.
     """
     import pycolmap
 
@@ -262,20 +235,15 @@ def without_movers(database: Path, longest_side: int) -> float:
         }
         for (a, b), geometry in zip(pairs, geometries, strict=True):
             inliers = np.asarray(geometry.inlier_matches)
-            if len(inliers) == 0:
-                continue
-            stays = ~(moves[a][inliers[:, 0]] | moves[b][inliers[:, 1]])
-            geometry.inlier_matches = inliers[stays]
-            opened.update_two_view_geometry(a, b, geometry)
+            if len(inliers):
+                geometry.inlier_matches = inliers[~(moves[a][inliers[:, 0]] | moves[b][inliers[:, 1]])]
+                opened.update_two_view_geometry(a, b, geometry)
     matched = sum(int((count > 0).sum()) for count in seen.values())
     return sum(int(move.sum()) for move in moves.values()) / max(matched, 1)
 
 
 def _distances(first: np.ndarray, second: np.ndarray, limit_px: float) -> np.ndarray:
-    """Return the Sampson distances, in pixels, of matches (M, 2) to the fundamental matrix that most agree with.
-
-    Zeros where none is found.
-    """
+    """Return the Sampson distances, px, of matches (M, 2) to the matrix that most agree with; zeros without one."""
     import pycolmap
 
     options = pycolmap.RANSACOptions()

@@ -1,28 +1,34 @@
-"""Structure from motion: options, result, report, and the folder to work in, which the next try finds again."""
+"""Structure from motion: options, the images laid out for COLMAP, its calls, and the folder to work in."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import TYPE_CHECKING, BinaryIO, Literal
 
+from dyngs.capture.photos import Photo
+from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
 from dyngs.files.containment import MAX_MEGAPIXELS
 from dyngs.files.write import write_text
+
+if TYPE_CHECKING:
+    import pycolmap
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None
 
-
-REPORT_FILE = "sfm_report.json"
-_SHOWN = 5
+LENS = "SIMPLE_RADIAL"
+"""COLMAP's name of the lens model that is fitted."""
+LONGEST_SIDE, MAX_FEATURES = 1600, 8192
+"""Images are shrunk to so many px for finding so many SIFT features at most; poses refer to the full size."""
+SEED = 0
 
 
 @dataclass(frozen=True)
@@ -30,132 +36,105 @@ class SfmOptions:
     """Options of pose estimation.
 
     Attributes:
-        camera_model: COLMAP's name of the lens model to fit.
-        single_camera: one camera took all images, so they share its lens; None = yes for a video, and for photos that
-            agree in size, camera model and focal length (EXIF); else every photo has a lens of its own.
-        matching: which pairs are compared; auto = all pairs up to 60 photos or 24 frames, beyond that neighbours by
-            name (some far ones, too) and those that look alike; sequential = the same without what looks alike.
-        overlap: neighbours on either side in sequential matching; None = near ones densely, far ones sparsely.
-        mapper: COLMAP's mapping; auto = global, and incremental where that finds less.
-        max_features: SIFT features per image.
-        longest_side: images are shrunk to this, in pixels, for finding features (poses refer to the full size).
-        num_frames: images to take from a video, by motion seen and sharpness.
+        matching: pairs that are compared; auto = all of up to 60 photos or 24 frames, beyond that neighbours by name
+            (some far ones, too) and those that look alike; sequential = the same without what looks alike.
+        mapper: COLMAP's mapping; auto = global for a video, incremental for photos, the other where that finds less.
+        num_frames: images to take at most from a video, None = 100; of several videos time steps, None =
+            ``times.MOST_STEPS``, fewer for many cameras.
         masks: folder of masks of the photos, named as in captures; white = keep. None without.
-        seed: of everything random.
+        starts: of several videos: camera to the second at which its video begins; None: as in ``videos.json``, else
+            found.
         num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is always the same.
-        follow_links: photos may be links that lead out of their folder.
+        follow_links: photos and videos may be links that lead out of their folder.
         max_megapixels: larger images and videos are refused.
     """
 
-    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
-        "SIMPLE_RADIAL"
-    )
-    single_camera: bool | None = None
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    overlap: int | None = None
     mapper: Literal["auto", "global", "incremental"] = "auto"
-    max_features: int = 8192
-    longest_side: int = 1600
-    num_frames: int = 100
+    num_frames: int | None = None
     masks: Path | None = None
-    seed: int = 0
+    starts: Mapping[str, float] | None = None
     num_threads: int = 0
     follow_links: bool = False
     max_megapixels: float = MAX_MEGAPIXELS
 
 
 @dataclass(frozen=True)
-class SfmResult:
-    """Result of pose estimation.
+class SfmTask:
+    """Images laid out for COLMAP.
 
     Attributes:
-        root: the capture folder in COLMAP's layout, to be trained on.
-        num_images: images given.
-        num_registered: images with a pose.
-        unregistered: names of the others.
-        num_points: sparse points.
-        mean_error_px: mean reprojection error.
-        mean_track: images in which a point is seen, on average.
-        mapper: "global" or "incremental".
-        seconds: of each stage, by name.
-        notes: lines about choices, and about what to film or photograph better.
-    """
-
-    root: Path
-    num_images: int
-    num_registered: int
-    unregistered: tuple[str, ...]
-    num_points: int
-    mean_error_px: float
-    mean_track: float = 0.0
-    mapper: str = ""
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-
-    def summary(self) -> str:
-        """The result as lines of text."""
-        lines = [
-            f"{self.num_registered} of {self.num_images} images registered, {self.num_points} points, "
-            f"mean error {self.mean_error_px:.2f} px: {self.root}"
-        ]
-        if self.mapper:
-            stages = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
-            lines.append(f"a point is seen in {self.mean_track:.1f} images on average; {self.mapper} mapping; {stages}")
-        if self.unregistered:
-            lines.append("no pose for " + listed(self.unregistered))
-        return "\n".join((*lines, *self.notes))
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return the first names in a line."""
-    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
-
-
-def write_report(folder: Path, result: SfmResult) -> None:
-    """Write the result, without its folder, to ``sfm_report.json``."""
-    fields = {
-        "images": result.num_images,
-        "registered": result.num_registered,
-        "unregistered": list(result.unregistered),
-        "points": result.num_points,
-        "mean_reprojection_error_px": round(result.mean_error_px, 4),
-        "mean_track_length": round(result.mean_track, 2),
-        "mapper": result.mapper,
-        "seconds": {name: round(seconds, 1) for name, seconds in result.seconds.items()},
-        "notes": list(result.notes),
-    }
-    write_text(folder / REPORT_FILE, json.dumps(fields, indent=1) + "\n")
-
-
-def advice(
-    unregistered: Sequence[str], lonely: Sequence[str], blurred: Sequence[str], is_video: bool
-) -> tuple[str, ...]:
-    """Return lines about what to film better.
-
-    Args:
-        unregistered: names of images without a pose.
-        lonely: those of all images that match fewer than three others.
-        blurred: those of all that are much less sharp than the others.
+        database: COLMAP's; made where it is missing.
+        images: folder of upright images.
+        names: of the images in it, in order.
+        photos: the same ones, with their tags.
+        options: matching, mapping, threads.
+        report: is told of what is done.
         is_video: they are frames of a video.
+        masks: folder of masks ``NAME.png``, white = keep; None without.
     """
-    lines = []
-    lost, without = set(unregistered), set(lonely)
-    apart = [name for name in unregistered if name in without]
-    if apart:
-        more = "move slower there" if is_video else "take more photos around them"
-        lines.append(f"{len(apart)} images without a pose match fewer than three others: {more}")
-    if lost and len(apart) < len(lost):
-        lines.append(
-            f"{len(lost) - len(apart)} images without a pose match others, but fit no common scene: things that "
-            "move fill them, or the camera only rotated there"
-        )
-    if blurred:
-        more = "more light or a slower hand" if is_video else "take them again"
-        lines.append(f"{len(blurred)} images are much less sharp than the others ({listed(blurred)}): {more}")
-    return tuple(lines)
+
+    database: Path
+    images: Path
+    names: Sequence[str]
+    photos: Sequence[Photo]
+    options: SfmOptions
+    report: ReportProgress = report_nothing
+    is_video: bool = False
+    masks: Path | None = None
+
+    @property
+    def side(self) -> int:
+        """Longest side of an image, in pixels."""
+        return max((max(photo.header.size) for photo in self.photos), default=0)
+
+    @property
+    def has_one_lens(self) -> bool:
+        """Whether all images share a lens: of a video, or of the same size, camera model and focal length (EXIF)."""
+        kinds = {(p.header.upright_size, p.header.tags.model, p.header.tags.focal_px) for p in self.photos}
+        return self.is_video or len(kinds) == 1
 
 
-_KEY, _LOCK = "task.txt", "lock"
+def feature_options(num_threads: int, side: int, count: int) -> pycolmap.FeatureExtractionOptions:
+    """Return COLMAP's options for up to ``count`` SIFT features in images of up to ``side`` px, on the CPU."""
+    import pycolmap
+
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, num_threads or -1, side
+    extraction.sift.max_num_features = count
+    return extraction
+
+
+def matching_options(num_threads: int) -> tuple[pycolmap.FeatureMatchingOptions, pycolmap.TwoViewGeometryOptions]:
+    """Return COLMAP's options for matching on the CPU, and for verification."""
+    import pycolmap
+
+    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching.use_gpu, matching.num_threads = False, num_threads or -1
+    verification.ransac.random_seed = SEED
+    return matching, verification
+
+
+def match_listed(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], num_threads: int) -> None:
+    """Match pairs of images, given by their places among the names, and verify them; those of before are left."""
+    import pycolmap
+
+    matching, verification = matching_options(num_threads)
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = database.with_name("pairs.txt")
+    write_text(Path(pairing.match_list_path), "".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
+    pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
+
+
+def incremental_options(num_threads: int, seed: int = SEED) -> pycolmap.IncrementalPipelineOptions:
+    """Return COLMAP's options for incremental mapping on the CPU."""
+    import pycolmap
+
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.num_threads = num_threads or -1
+    mapping.random_seed = mapping.mapper.random_seed = mapping.triangulation.random_seed = seed
+    mapping.ba_use_gpu = False
+    return mapping
 
 
 class ColmapError(DyngsError):
@@ -163,12 +142,12 @@ class ColmapError(DyngsError):
 
 
 @contextmanager
-def quiet_colmap(seed: int) -> Iterator[None]:
+def quiet_colmap() -> Iterator[None]:
     """Keep COLMAP's log out of the terminal, and make it start from a seed; its errors in the block are ours."""
     import pycolmap
 
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, pycolmap.logging.Level.FATAL.value
-    pycolmap.set_random_seed(seed)
+    pycolmap.set_random_seed(SEED)
     try:
         yield
     except (RuntimeError, ValueError) as error:
@@ -180,14 +159,12 @@ def quiet_colmap(seed: int) -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-def work_folder_of(out: Path) -> Path:
-    """Return the hidden folder beside ``out`` that holds what a stopped run has done."""
-    return out.parent / f".{out.name}.sfm"
+_KEY, _LOCK = "task.txt", "lock"
 
 
 @contextmanager
-def working(out: Path, task: str) -> Iterator[tuple[Path, bool]]:
-    """Yield the work folder for ``out``, and whether it holds the beginnings of the same task.
+def working(out: Path, task: str) -> Iterator[Path]:
+    """Yield the hidden work folder beside ``out``, which holds what a stopped run of the same task has done.
 
     It is removed when the block ends, and when it raises an error of ours: what failed once fails again. It stays
     where the user or the system stops the program.
@@ -199,7 +176,7 @@ def working(out: Path, task: str) -> Iterator[tuple[Path, bool]]:
     Raises:
         DyngsError: another process works there; it cannot be made.
     """
-    work = work_folder_of(out)
+    work = out.parent / f".{out.name}.sfm"
     if work.is_symlink():
         raise DyngsError(f"{work}: is a link; remove it")
     try:
@@ -211,12 +188,11 @@ def working(out: Path, task: str) -> Iterator[tuple[Path, bool]]:
     with lock:
         _take(lock, out)
         key = work / _KEY
-        goes_on = key.is_file() and key.read_text(encoding="utf-8") == task
         try:
-            if not goes_on:
+            if not key.is_file() or key.read_text(encoding="utf-8") != task:
                 _empty(work)
                 write_text(key, task)
-            yield work, goes_on
+            yield work
         except (DyngsError, OSError):
             shutil.rmtree(work, ignore_errors=True)
             raise

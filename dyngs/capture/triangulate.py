@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from dyngs.capture.sfm_work import ColmapError, quiet_colmap
+from dyngs.capture.sfm_work import ColmapError, feature_options, match_listed, matching_options, quiet_colmap
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
 from dyngs.data.geometry import projected
@@ -65,14 +65,10 @@ def views_of_a_time_step(views: Sequence[View], limit: int) -> list[View]:
 
 
 def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:
-    """Return points that several views see, in order of their coordinates; None where there are hardly any.
+    """Return points that several views of a time step see, in order of their coordinates; None for hardly any.
 
-    SIFT features in images of at most ``LONGEST_SIDE`` px, matched between all pairs, triangulated from the given
+    SIFT features in images of at most ``LONGEST_SIDE`` px, matched between all pairs, triangulated by the views'
     poses. One thread, so that the same images give the same points.
-
-    Args:
-        views: of one time step, with poses.
-        options: of the capture; its image sizes do not matter here.
     """
     return _points_of(views, options, None)
 
@@ -82,10 +78,6 @@ def points_over_clip(views: Sequence[View], options: DataConfig) -> PointCloud |
 
     As ``triangulated_points``, of at most ``CLIP_IMAGES`` images and matched between the pairs of ``clip_pairs``;
     tracks over three images or more that do not agree with the poses, as those of what moves, are left out.
-
-    Args:
-        views: with times and poses.
-        options: of the capture; its image sizes do not matter here.
     """
     in_order = sorted(views, key=lambda view: (view.time or 0.0, view.name))
     chosen = [in_order[i] for i in evenly_spaced(len(in_order), CLIP_IMAGES)]
@@ -119,14 +111,14 @@ def _points_of(
     full_size = options.model_copy(update={"downscale": 1.0, "longest_side": LONGEST_SIDE, "cache_mb": 0.0})
     images = ImageLoader(views, full_size)
     try:
-        with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder, quiet_colmap(0):
+        with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder, quiet_colmap():
             return _triangulated(Path(folder), [images[i] for i in range(len(images))], pairs)
     except (ColmapError, OSError):
         return None
 
 
 def _triangulated(folder: Path, images: Sequence[Image], pairs: Sequence[tuple[int, int]] | None) -> PointCloud | None:
-    """Return the points of tracks over enough images, matched between all pairs or the given ones."""
+    """Return the points of tracks over enough images, matched between all pairs or these."""
     import pycolmap
 
     files, database, model = folder / "images", folder / "database.db", folder / "model"
@@ -137,7 +129,17 @@ def _triangulated(folder: Path, images: Sequence[Image], pairs: Sequence[tuple[i
         grey = image.rgb_premultiplied.new_full((3,), GREY)
         rgb = (image.composite(grey).clamp(0, 1) * 255).round().to(torch.uint8)
         write_image(files / name, rgb.numpy())
-    _find_and_match(database, files, names, pairs)
+    extraction = feature_options(1, LONGEST_SIDE, MAX_FEATURES)
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
+    device, mode = pycolmap.Device.cpu, pycolmap.CameraMode.PER_IMAGE
+    pycolmap.extract_features(
+        database, files, names, camera_mode=mode, reader_options=reader, extraction_options=extraction, device=device
+    )
+    if pairs is None:
+        matching, verification = matching_options(1)
+        pycolmap.match_exhaustive(database, matching, verification_options=verification, device=device)
+    else:
+        match_listed(database, names, pairs, 1)
     posed = _posed(database, dict(zip(names, images, strict=True)))
     found = pycolmap.triangulate_points(posed, database, files, model, clear_points=True)
     side = max(max(image.cameras.width, image.cameras.height) for image in images)
@@ -150,32 +152,6 @@ def _triangulated(folder: Path, images: Sequence[Image], pairs: Sequence[tuple[i
     rgb = np.array([point.color for point in points], dtype=np.uint8)
     order = np.lexsort(xyz.T)
     return PointCloud(xyz[order], rgb[order])
-
-
-def _find_and_match(database: Path, images: Path, names: list[str], pairs: Sequence[tuple[int, int]] | None) -> None:
-    """Write features of all images, and matches of all pairs or the given ones, to ``database``."""
-    import pycolmap
-
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, 1, LONGEST_SIDE
-    extraction.sift.max_num_features = MAX_FEATURES
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
-    device, mode = pycolmap.Device.cpu, pycolmap.CameraMode.PER_IMAGE
-    pycolmap.extract_features(
-        database, images, names, camera_mode=mode, reader_options=reader, extraction_options=extraction, device=device
-    )
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu, matching.num_threads = False, 1
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0
-    if pairs is None:
-        pycolmap.match_exhaustive(database, matching, verification_options=verification, device=device)
-        return
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = database.with_name("pairs.txt")
-    pairing.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
-    pycolmap.match_image_pairs(database, matching, pairing, verification, device)
 
 
 def _posed(path: Path, images: dict[str, Image]) -> pycolmap.Reconstruction:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from dyngs.capture.multi_video.estimate import VideosOptions, poses_of_videos
+from dyngs.capture.multi_video.estimate import poses_of_videos
 from dyngs.capture.multi_video.films import VIDEOS_FILE, videos_in
 from dyngs.capture.photos import digest_of, photos_below
 from dyngs.capture.sfm import estimate_poses
@@ -14,7 +14,7 @@ from dyngs.capture.sfm_work import SfmOptions
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES
-from dyngs.data.read import FORMATS
+from dyngs.data.read import is_capture
 from dyngs.errors import DyngsError, as_word, reading
 from dyngs.files.outputs import note_sources
 from dyngs.files.temporary import cache_folder
@@ -29,7 +29,7 @@ def with_poses(
     say: Callable[[str], None] = print,
     report: ReportProgress = report_nothing,
 ) -> DataConfig:
-    """Return the options with a capture that has poses as their folder: the given one, unless it has none.
+    """Return the options with a capture that has poses as their folder: the same one, unless it has none.
 
     Photos and videos without poses go through structure from motion once; the same ones are found in the user's cache
     from then on. Of a folder that holds ``images``, those are the photos: masks and maps next to them are not.
@@ -66,11 +66,10 @@ def with_poses(
         note_sources(folder, data.root)
         return data.model_copy(update={"root": folder})
     say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
+    options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
     if videos:
-        several = VideosOptions(follow_links=data.follow_links, max_megapixels=data.max_megapixels)
-        say(poses_of_videos(source, folder, several, report).summary())
+        say(poses_of_videos(source, folder, options, report))
     else:
-        options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
         say(estimate_poses(source, folder, options, report).summary())
     note_sources(folder, data.root)
     return data.model_copy(update={"root": folder})
@@ -85,11 +84,8 @@ def is_unposed(data: DataConfig) -> bool:
     root = data.root
     if root.is_file():
         return root.suffix.lower() in VIDEO_SUFFIXES
-    if data.format != "auto" or not root.is_dir():
+    if data.format != "auto" or not root.is_dir() or is_capture(root):
         return False
-    with reading(root, "choose another folder or change its permissions"):
-        if any(format.recognise(root) for format in FORMATS):
-            return False
     if _holds_photos(root):
         return True
     videos = videos_in(root)
@@ -107,9 +103,7 @@ def is_videos(source: Path) -> bool:
     """Whether ``source`` is a video file, or a folder of videos that is no capture and holds no photos."""
     if source.is_file():
         return source.suffix.lower() in VIDEO_SUFFIXES
-    if not source.is_dir() or any(format.recognise(source) for format in FORMATS):
-        return False
-    return not _holds_photos(source) and bool(videos_in(source))
+    return source.is_dir() and not is_capture(source) and not _holds_photos(source) and bool(videos_in(source))
 
 
 def _holds_photos(folder: Path) -> bool:

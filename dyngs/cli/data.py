@@ -12,7 +12,6 @@ from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
-    from dyngs.config import DataConfig
     from dyngs.human.motion.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "human")
@@ -170,35 +169,40 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
 
 def run_sfm(arguments: argparse.Namespace) -> int:
     """Estimate poses and print the next commands."""
-    from dyngs.capture.sfm import SfmOptions, estimate_poses
+    from dyngs.capture.multi_video.estimate import poses_of_videos
+    from dyngs.capture.sfm import estimate_poses
+    from dyngs.capture.sfm_work import SfmOptions
     from dyngs.capture.unposed import is_several_videos
 
-    limits = data_section(arguments.overrides)
-    if is_several_videos(arguments.images):
-        return _run_sfm_of_videos(arguments, limits)
-    if arguments.start:
-        raise DyngsError(f"{arguments.images}: --start is for a folder of several videos")
+    limits, images, out = data_section(arguments.overrides), arguments.images, arguments.out
+    several = is_several_videos(images)
+    if several:
+        _require_options_of_videos(arguments)
+    elif arguments.start:
+        raise DyngsError(f"{images}: --start is for a folder of several videos")
     options = SfmOptions(
         matching=arguments.matching,
         mapper=arguments.mapper,
+        num_frames=arguments.frames,
         masks=arguments.masks,
-        num_frames=arguments.frames or SfmOptions.num_frames,
+        starts=_starts(arguments.start),
         num_threads=arguments.threads,
         follow_links=limits.follow_links,
         max_megapixels=limits.max_megapixels,
     )
     with ProgressBar() as report:
-        result = estimate_poses(arguments.images, arguments.out, options, report)
-    print(result.summary())
-    print(f"next: dyngs data inspect {result.root} --image cameras.png")
-    print(f"      dyngs train static data.root={result.root}")
+        if several:
+            said = poses_of_videos(images, out, options, report)
+        else:
+            said = estimate_poses(images, out, options, report).summary()
+    print(said)
+    print(f"next: dyngs data inspect {out} --image cameras.png")
+    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={out}")
     return 0
 
 
-def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int:
-    """Estimate the poses of several cameras and print the next commands."""
-    from dyngs.capture.multi_video.estimate import VideosOptions, poses_of_videos
-
+def _require_options_of_videos(arguments: argparse.Namespace) -> None:
+    """Refuse options that several videos do not have."""
     for option, given in (
         ("--matching", arguments.matching != "auto"),
         ("--mapper", arguments.mapper != "auto"),
@@ -210,19 +214,6 @@ def _run_sfm_of_videos(arguments: argparse.Namespace, limits: DataConfig) -> int
             )
     if arguments.frames is not None and arguments.frames < 2:
         raise DyngsError("--frames must be at least 2")
-    options = VideosOptions(
-        num_steps=arguments.frames,
-        starts=_starts(arguments.start),
-        num_threads=arguments.threads,
-        follow_links=limits.follow_links,
-        max_megapixels=limits.max_megapixels,
-    )
-    with ProgressBar() as report:
-        result = poses_of_videos(arguments.images, arguments.out, options, report)
-    print(result.summary())
-    print(f"next: dyngs data inspect {result.root} --image cameras.png")
-    print(f"      dyngs train dynamic data.root={result.root}")
-    return 0
 
 
 def _starts(words: list[str]) -> dict[str, float] | None:

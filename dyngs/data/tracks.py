@@ -18,7 +18,7 @@ _LARGEST = 1e6
 
 
 @dataclass(frozen=True)
-class Tracks:
+class ImageTracks:
     """Tracks of P points in F images.
 
     Attributes:
@@ -39,7 +39,7 @@ class Tracks:
         return {name: row for name, row in found.items() if row is not None}
 
 
-def read_tracks(path: Path) -> Tracks:
+def read_tracks(path: Path) -> ImageTracks:
     """Read tracks from a ``.npz`` with ``xy`` (F, P, 2), ``visible`` (F, P) and ``names`` (F,), text.
 
     Positions that are not finite are taken as not visible.
@@ -59,7 +59,7 @@ def read_tracks(path: Path) -> Tracks:
         raise DyngsError(f"{path}: names holds one name more than once; give one row per image")
     xy = xy.astype(np.float64)
     good = np.all(np.abs(xy) < _LARGEST, axis=-1)  # phrased so that NaN fails it
-    return Tracks(listed, np.where(good[..., None], xy, 0.0).astype(np.float32), (visible > 0) & good)
+    return ImageTracks(listed, np.where(good[..., None], xy, 0.0).astype(np.float32), (visible > 0) & good)
 
 
 def _plain(name: str) -> str:

@@ -11,7 +11,8 @@ import pycolmap
 import pytest
 from skimage.transform import resize_local_mean
 
-from dyngs.capture.sfm import SfmOptions, SfmResult, estimate_poses
+from dyngs.capture.sfm import SfmResult, estimate_poses
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.data.capture import all_views
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
@@ -19,7 +20,7 @@ from dyngs.errors import DyngsError
 from dyngs.export.video import VideoWriter
 from dyngs.files.write import write_image
 
-FAST = SfmOptions(max_features=2000, num_threads=1)
+FAST = SfmOptions(num_threads=1)
 
 
 def _still_arc(count: int) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -51,7 +52,7 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
             video.add(blurred)
             video.add(rgb)
     out = tmp_path / "capture"
-    options = SfmOptions(max_features=2000, num_threads=1, num_frames=8, camera_model="SIMPLE_PINHOLE")
+    options = SfmOptions(num_threads=1, num_frames=8)
     told: dict[str, tuple[int, int]] = {}
     result = estimate_poses(
         tmp_path / "arc.mp4", out, options, lambda what, done, total: told.update({what: (done, total)})

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dyngs.capture.sfm_work import work_folder_of, working
+from dyngs.capture.sfm_work import working
 from dyngs.errors import DyngsError
 
 
 def _stopped(out: Path, task: str) -> None:
     def work_until_stopped() -> None:
-        with working(out, task) as (work, _):
+        with working(out, task) as work:
             (work / "database.db").write_text(task)
             raise KeyboardInterrupt
 
@@ -28,13 +28,11 @@ def _stopped(out: Path, task: str) -> None:
 def test_a_stopped_run_is_found_again_by_the_same_task_only(tmp_path: Path) -> None:
     out = tmp_path / "capture"
     _stopped(out, "first")
-    with working(out, "first") as (work, goes_on):
-        assert goes_on
+    with working(out, "first") as work:
         assert (work / "database.db").read_text() == "first"
-    assert not work_folder_of(out).exists()
+    assert not work.exists()
     _stopped(out, "first")
-    with working(out, "second") as (work, goes_on):
-        assert not goes_on
+    with working(out, "second") as work:
         assert not (work / "database.db").exists()
     assert list(tmp_path.iterdir()) == []
 

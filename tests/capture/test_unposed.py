@@ -9,8 +9,8 @@ import pytest
 from tiny_captures import write_colmap
 
 from dyngs.capture import unposed
-from dyngs.capture.multi_video.estimate import VideosOptions, VideosResult
-from dyngs.capture.sfm_work import SfmOptions, SfmResult
+from dyngs.capture.sfm import SfmResult
+from dyngs.capture.sfm_work import SfmOptions
 from dyngs.capture.unposed import with_poses
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig
@@ -30,12 +30,12 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     def estimate(source: Path, out: Path, options: SfmOptions, report: object) -> SfmResult:
         sources.append(source)
         write_colmap(out)
-        return SfmResult(out, 3, 3, (), 8, 0.5)
+        return SfmResult(out, 3, 3, (), 8, 0.5, 3.0, "global", {}, ())
 
-    def several(source: Path, out: Path, options: VideosOptions, report: object) -> VideosResult:
+    def several(source: Path, out: Path, options: SfmOptions, report: object) -> str:
         sources.append(source)
         write_colmap(out)
-        return VideosResult(out, ())
+        return "4 of 4 cameras have a pose"
 
     monkeypatch.setattr(unposed, "estimate_poses", estimate)
     monkeypatch.setattr(unposed, "poses_of_videos", several)

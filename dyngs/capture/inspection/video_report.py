@@ -18,7 +18,7 @@ from dyngs.capture.multi_video.films import (
     videos_in,
 )
 from dyngs.capture.multi_video.lags import motion_of
-from dyngs.capture.multi_video.steadiness import Steadiness, displacement, steadiness
+from dyngs.capture.multi_video.steadiness import STANDS, displaced_by, displacement
 from dyngs.data.images.video import opened_video, orientation_of, read_frames
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import as_word, counted, reading
@@ -39,13 +39,7 @@ _PAIRS = 40
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """Facts about a video.
-
-    Attributes:
-        film: the video.
-        facts: (name, value) pairs for people, in order.
-        stands: the camera stands still.
-    """
+    """Facts about a video, (name, value) pairs for people, in order, and whether its camera stands still."""
 
     film: Film
     facts: tuple[tuple[str, str], ...]
@@ -73,7 +67,7 @@ def video_facts(path: Path) -> VideoFacts:
     """Return what there is to know about a video; its frames are decoded once."""
     film = open_film(inside(path))
     small, sharpness = _look(film)
-    steady = steadiness(small.grey)
+    displaced = displaced_by(small.grey)
     shown, sound = _streams(path)
     seconds = film.seconds
     facts = (
@@ -81,9 +75,9 @@ def video_facts(path: Path) -> VideoFacts:
         ("frames", f"{len(seconds)} in {seconds[-1] + 1 / film.rate:.2f} s, {_rate(film)}"),
         ("sound", sound),
         ("sharpness", _sharpness(sharpness)),
-        ("camera", _camera(small, steady)),
+        ("camera", _camera(small, displaced)),
     )
-    return VideoFacts(film, facts, steady.stands)
+    return VideoFacts(film, facts, displaced <= STANDS)
 
 
 def _look(film: Film) -> tuple[SmallImages, np.ndarray]:
@@ -136,19 +130,19 @@ def _sharpness(sharpness: np.ndarray) -> str:
     return f"{low:.2f} to {high:.2f} of the typical frame; {found}"
 
 
-def _camera(small: SmallImages, steady: Steadiness) -> str:
-    if steady.stands:
+def _camera(small: SmallImages, displaced: float) -> str:
+    if displaced <= STANDS:
         changed = float((motion_of(small) > 0).mean()) if len(small.grey) > 1 else 0.0
         return f"stands still; {changed:.1%} of the image changes at a time"
     starts = evenly_spaced(len(small.grey) - 1, _PAIRS)
     steps = [displacement(small.grey[i].astype(float), small.grey[i + 1].astype(float)) for i in starts]
     known = [step for step in steps if np.isfinite(step)]
-    far = "far" if np.isinf(steady.displaced) else f"by up to {steady.displaced:.1%} of its width"
+    far = "far" if np.isinf(displaced) else f"by up to {displaced:.1%} of its width"
     if not known:
         return f"moves {far}; too fast or too blurred to follow from frame to frame"
     median = float(np.median(known))
     fast = "; fast: film slower, or at more frames per second" if median > FAST else ""
-    fast = "; hardly at all, which shows little depth" if steady.displaced < LITTLE else fast
+    fast = "; hardly at all, which shows little depth" if displaced < LITTLE else fast
     return f"moves {far}, {median:.2%} of its width from frame to frame{fast}"
 
 

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.multi_video.films import Film
-from dyngs.capture.sfm_work import SfmOptions, quiet_colmap
+from dyngs.capture.sfm_work import (
+    LENS,
+    LONGEST_SIDE,
+    MAX_FEATURES,
+    SEED,
+    feature_options,
+    incremental_options,
+    matching_options,
+    quiet_colmap,
+)
 from dyngs.conventions import ReportProgress
 from dyngs.data.images.video import read_numbered_frames
 from dyngs.data.times import evenly_spaced
@@ -36,19 +45,11 @@ LONE_LENSES = 1.0
 """Mean reprojection error in px above which cameras of one size are also tried with a lens each."""
 _LESS = 0.7
 """Lenses of their own are kept if they lower the error to this, or find more cameras."""
-_SIDE = 1600
-_FEATURES = 8192
 
 
 @dataclass(frozen=True)
 class FixedModel:
-    """Poses, lenses and points.
-
-    Attributes:
-        model: with one image for each camera, called as the camera, with the suffix ``.png``.
-        shared: cameras with images of one size have one lens.
-        tries: what was tried, in words: features, and how often.
-    """
+    """A model with an image ``CAMERA.png`` for each camera; ``shared``: those of one size have one lens."""
 
     model: pycolmap.Reconstruction
     shared: bool
@@ -61,12 +62,7 @@ class FixedModel:
 
 
 def image_without_movers(film: Film, num_frames: int) -> np.ndarray:
-    """Return the (H, W, 3) uint8 median of frames over the clip: what moves is not in it, and noise is weaker.
-
-    Args:
-        film: of a fixed camera.
-        num_frames: frames that count, from the first one on.
-    """
+    """Return the (H, W, 3) uint8 median of the first frames of a fixed camera: without what moves, with less noise."""
     most = max(MEDIAN_BYTES // max(film.info.width * film.info.height * 3, 1), 3)
     wanted = evenly_spaced(num_frames, min(MOMENTS, most))
     frames = np.stack([rgb for _, rgb in read_numbered_frames(film.path, wanted)])
@@ -77,35 +73,29 @@ def image_without_movers(film: Film, num_frames: int) -> np.ndarray:
 
 
 def fixed_model(
-    films: Sequence[Film], images: Sequence[np.ndarray], work: Path, options: SfmOptions, report: ReportProgress
+    films: Sequence[Film], images: Sequence[np.ndarray], work: Path, num_threads: int, report: ReportProgress
 ) -> FixedModel | None:
-    """Return the poses of fixed cameras, None where no two cameras match.
+    """Return the poses of fixed cameras by an image (H, W, 3) uint8 of each, None where no two cameras match.
 
     SIFT features, all pairs matched, incremental mapping from several random seeds; of the models, that with most
     cameras, then with most observations. Where a camera or observations are missing, features are also found with
     affine shapes and matched under guidance, which works over wider angles. Cameras of one size share a lens unless
-    that fits badly.
-
-    Args:
-        images: (H, W, 3) uint8 of each.
-        work: a folder for COLMAP's files.
-        options: of which lens model, seed and threads count.
+    that fits badly. ``work`` is a folder for COLMAP's files.
     """
-
     folder = work / "fixed"
     for film, rgb in zip(films, images, strict=True):
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"  # a folder has one lens where lenses are shared
         write_image(folder / size / f"{film.name}.png", rgb)
     attempts = [("usual", True), ("affine", True), ("affine", False), ("usual", False)]
     best: FixedModel | None = None
-    with quiet_colmap(options.seed):
+    with quiet_colmap():
         for number, (features, shared) in enumerate(attempts):
             if not _worth_trying(best, features, shared, len(films)):
                 continue
-            found = _attempt(work / f"{features}_{shared}", folder, features == "affine", shared, options)
+            found = _attempt(work / f"{features}_{shared}", folder, features == "affine", shared, num_threads)
             report("poses of the cameras, attempts", number + 1, len(attempts))
             if found is not None:
-                _refine(found, options.num_threads)
+                _refine(found, num_threads)
                 tried = FixedModel(found, shared, f"{features} features")
                 best = tried if best is None or _is_better(tried, best) else best
         report("poses of the cameras, attempts", len(attempts), len(attempts))
@@ -134,37 +124,33 @@ def _is_better(one: FixedModel, other: FixedModel) -> bool:
     return one.model.compute_num_observations() > other.model.compute_num_observations()
 
 
-def _attempt(
-    work: Path, images: Path, affine: bool, shared: bool, options: SfmOptions
-) -> pycolmap.Reconstruction | None:
+def _attempt(work: Path, images: Path, affine: bool, shared: bool, num_threads: int) -> pycolmap.Reconstruction | None:
     """Return the best model of one kind of features, None without any."""
     import pycolmap
 
     work.mkdir(parents=True)
-    database = work / "database.db"
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, options.num_threads or -1, _SIDE
-    extraction.sift.max_num_features = _FEATURES
+    database, device = work / "database.db", pycolmap.Device.cpu
+    extraction = feature_options(num_threads, LONGEST_SIDE, MAX_FEATURES)
     extraction.sift.peak_threshold = 0.002
     extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = affine
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = options.camera_model
+    reader = pycolmap.ImageReaderOptions(camera_model=LENS)
     mode = pycolmap.CameraMode.PER_FOLDER if shared else pycolmap.CameraMode.PER_IMAGE
-    device = pycolmap.Device.cpu
     pycolmap.extract_features(
         database, images, camera_mode=mode, reader_options=reader, extraction_options=extraction, device=device
     )
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu, matching.num_threads, matching.guided_matching = False, options.num_threads or -1, affine
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
+    matching, verification = matching_options(num_threads)
+    matching.guided_matching = affine
     pycolmap.match_exhaustive(database, matching, verification_options=verification, device=device)
     best: pycolmap.Reconstruction | None = None
     for start in STARTS:
         folder = work / f"models_{start}"
         folder.mkdir()
-        models = pycolmap.incremental_mapping(database, images, folder, _mapping(options, options.seed + start))
-        for model in models.values():
+        mapping = incremental_options(num_threads, SEED + start)
+        mapping.min_model_size = 2
+        mapping.mapper.init_min_num_inliers = 40
+        mapping.mapper.abs_pose_min_num_inliers = 20
+        mapping.triangulation.ignore_two_view_tracks = False
+        for model in pycolmap.incremental_mapping(database, images, folder, mapping).values():
             if best is None or _extent(model) > _extent(best):
                 best = model
         shutil.rmtree(folder)
@@ -214,17 +200,3 @@ def _drop_poor_points(model: pycolmap.Reconstruction) -> None:
 
 def _extent(model: pycolmap.Reconstruction) -> tuple[int, int]:
     return model.num_reg_images(), model.compute_num_observations()
-
-
-def _mapping(options: SfmOptions, seed: int) -> pycolmap.IncrementalPipelineOptions:
-    import pycolmap
-
-    mapping = pycolmap.IncrementalPipelineOptions()
-    mapping.num_threads = options.num_threads or -1
-    mapping.random_seed = mapping.mapper.random_seed = mapping.triangulation.random_seed = seed
-    mapping.min_model_size = 2
-    mapping.mapper.init_min_num_inliers = 40
-    mapping.mapper.abs_pose_min_num_inliers = 20
-    mapping.triangulation.ignore_two_view_tracks = False
-    mapping.ba_use_gpu = False
-    return mapping

@@ -5,31 +5,26 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyngs.capture.multi_video.camera_poses import (
-    FixedModel,
-    camera_name,
-    fixed_model,
-    image_without_movers,
-)
+from dyngs.capture.multi_video.camera_poses import FixedModel, camera_name, fixed_model, image_without_movers
 from dyngs.capture.multi_video.films import (
     VIDEOS_FILE,
     Film,
     SmallImages,
     checked_starts,
-    open_films,
+    open_film,
     read_given,
     small_images,
+    videos_in,
 )
 from dyngs.capture.multi_video.lags import Watcher, motion_of
 from dyngs.capture.multi_video.starts import found_starts, given_starts
-from dyngs.capture.multi_video.steadiness import STANDS, steadiness
+from dyngs.capture.multi_video.steadiness import STANDS, displaced_by
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import read_numbered_frames
@@ -37,7 +32,7 @@ from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import Taken, taken_frames, write_seconds
 from dyngs.errors import DyngsError
-from dyngs.files.containment import MAX_MEGAPIXELS, images_up_to, staying_within
+from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.fields import first_few
 from dyngs.files.outputs import require_new_folder
 from dyngs.files.temporary import temporary_folder_beside
@@ -47,130 +42,18 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-def write_images(root: Path, films: Sequence[Film], taken: Sequence[Taken], report: ReportProgress) -> list[list[str]]:
-    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below ``images`` by camera."""
-    total, done = sum(len(frames.numbers) for frames in taken), 0
-    names: list[list[str]] = []
-    for film, frames in zip(films, taken, strict=True):
-        own = []
-        for number, rgb in read_numbered_frames(film.path, [int(number) for number in frames.numbers]):
-            own.append(f"{film.name}/frame_{number:05d}.png")
-            write_image(root / "images" / own[-1], rgb)
-            done += 1
-            report("frames of the videos", done, total)
-        names.append(own)
-    return names
-
-
-def write_model(
-    root: Path, films: Sequence[Film], names: Sequence[Sequence[str]], standing: pycolmap.Reconstruction
-) -> None:
-    """Write ``root/sparse/0``: a lens for each camera, its one pose for all its images, and the points.
-
-    The first image of each camera has the observations of the points.
-
-    Args:
-        names: images of each.
-        standing: poses, one image for each camera.
-    """
-    import pycolmap
-
-    whole = pycolmap.Reconstruction()
-    posed = {camera_name(image): image for image in standing.images.values() if image.has_pose}
-    first_ids: dict[int, int] = {}
-    image_id = 0
-    for number, (film, own) in enumerate(zip(films, names, strict=True)):
-        image = posed[film.name]
-        lens = standing.cameras[image.camera_id]
-        camera = pycolmap.Camera(
-            camera_id=number + 1, model=lens.model, width=lens.width, height=lens.height, params=lens.params
-        )
-        whole.add_camera_with_trivial_rig(camera)
-        places = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
-        for place, name in enumerate(own):
-            image_id += 1
-            seen = places if place == 0 else np.zeros((0, 2))
-            new = pycolmap.Image(name=name, keypoints=seen, camera_id=number + 1, image_id=image_id)
-            whole.add_image_with_trivial_frame(new, image.cam_from_world())
-        first_ids[image.image_id] = image_id - len(own) + 1
-    for number in sorted(standing.points3D):
-        point = standing.points3D[number]
-        track = pycolmap.Track()
-        for element in point.track.elements:
-            if element.image_id in first_ids:
-                track.add_element(first_ids[element.image_id], element.point2D_idx)
-        whole.add_point3D(point.xyz, track, point.color)
-    whole.update_point_3d_errors()
-    folder = root / "sparse" / "0"
-    folder.mkdir(parents=True)
-    whole.write(folder)
-
-
-def write_facts(root: Path, seconds: Mapping[str, float], starts: Mapping[str, float], test: Sequence[str]) -> None:
-    """Write the seconds of the images, which of them are for testing, and when each video begins.
-
-    Args:
-        seconds: image below ``images`` to the second at which it was taken, in the clock of all videos.
-        starts: camera to the second at which its video begins.
-        test: cameras that are held out.
-    """
-    write_seconds(root, {name: round(second, 6) for name, second in seconds.items()})
-    held_out = [name for name in seconds if name.partition("/")[0] in test]
-    if held_out:
-        write_text(root / "sparse" / "0" / TEST_LIST, "".join(f"{name}\n" for name in held_out))
-    rounded = {name: round(start, 6) for name, start in starts.items()}
-    write_text(root / VIDEOS_FILE, json.dumps({"starts": rounded, "test": list(test)}, indent=1) + "\n")
-
-
-@dataclass(frozen=True)
-class VideosOptions:
-    """Options for several videos.
-
-    Attributes:
-        num_steps: time steps to take at most, evenly spaced; None: ``times.MOST_STEPS``, fewer for many cameras.
-        starts: camera to the second at which its video begins; None: as in ``videos.json``, else found.
-        seed: of everything random.
-        num_threads: 0 = all cores.
-        follow_links: videos may be links that lead out of their folder.
-        max_megapixels: larger videos are refused.
-    """
-
-    num_steps: int | None = None
-    starts: dict[str, float] | None = None
-    seed: int = 0
-    num_threads: int = 0
-    follow_links: bool = False
-    max_megapixels: float = MAX_MEGAPIXELS
-
-
-@dataclass(frozen=True)
-class VideosResult:
-    """Result for several videos.
-
-    Attributes:
-        root: the capture folder in COLMAP's layout with ``times.json``, to be trained on.
-        lines: what was found, a line each.
-    """
-
-    root: Path
-    lines: tuple[str, ...]
-
-    def summary(self) -> str:
-        """The result as lines of text."""
-        return "\n".join(self.lines)
-
-
 def poses_of_videos(
-    source: Path, out: Path, options: VideosOptions = VideosOptions(), report: ReportProgress = report_nothing
-) -> VideosResult:
-    """Make a capture of a folder of videos that ran at once, of fixed cameras.
+    source: Path, out: Path, options: SfmOptions = SfmOptions(), report: ReportProgress = report_nothing
+) -> str:
+    """Make a capture of a folder of videos that ran at once, of fixed cameras; return what was found, as lines.
 
-    All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is whole or absent.
+    All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is complete or absent. It is in
+    COLMAP's layout, with ``times.json``, and ready to be trained on.
 
     Args:
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
-        options: time steps, offsets, effort.
+        options: time steps, offsets, threads.
 
     Raises:
         DyngsError: a camera that moves, poses or offsets that cannot be found, with what to do; an ``out`` in use.
@@ -188,12 +71,12 @@ def poses_of_videos(
         raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return VideosResult(out, (*lines, f"written: {out}"))
+    return "\n".join((*lines, f"written: {out}"))
 
 
-def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportProgress) -> list[str]:
+def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgress) -> list[str]:
     """Write the capture in the folder ``work`` and return what was found."""
-    films = open_films(source)
+    films = [open_film(inside(path)) for path in videos_in(source)]
     if len(films) < 2:
         raise DyngsError(
             f"{source}: holds {len(films)} videos, two or more are needed; give one video as the file itself"
@@ -210,29 +93,91 @@ def _made_in(work: Path, source: Path, options: VideosOptions, report: ReportPro
     begun, line = found_starts(films, watchers) if starts is None else given_starts(films, starts)
     lines.append(line)
     clocks = [film.seconds + start for film, start in zip(films, begun, strict=True)]
-    taken, line = taken_frames(source, clocks, [film.rate for film in films], options.num_steps)
+    taken, line = taken_frames(source, clocks, [film.rate for film in films], options.num_frames)
     lines.append(line)
-    names = write_images(work, films, taken, report)
-    write_model(work, films, names, found.model)
-    test = _held_out(films, given.test)
+    names = _write_images(work, films, taken, report)
+    _write_model(work, films, names, found.model)
+    if given.test is not None:
+        test = [film.name for film in films if film.name in given.test]
+    else:
+        test = [films[0].name] if len(films) >= MIN_CAMERAS_TO_HOLD_OUT else []
     seconds = {
-        name: float(second)
+        name: round(float(second), 6)
         for own, frames in zip(names, taken, strict=True)
         for name, second in zip(own, frames.seconds, strict=True)
     }
-    write_facts(work, seconds, {film.name: float(x) for film, x in zip(films, begun, strict=True)}, test)
+    write_seconds(work, seconds)
     if test:
+        held_out = [name for name in seconds if name.partition("/")[0] in test]
+        write_text(work / "sparse" / "0" / TEST_LIST, "".join(f"{name}\n" for name in held_out))
         lines.append(f"held out for testing: {first_few(test)}")
+    rounded = {film.name: round(float(start), 6) for film, start in zip(films, begun, strict=True)}
+    write_text(work / VIDEOS_FILE, json.dumps({"starts": rounded, "test": test}, indent=1) + "\n")
     return lines
+
+
+def _write_images(root: Path, films: Sequence[Film], taken: Sequence[Taken], report: ReportProgress) -> list[list[str]]:
+    """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return their names below ``images`` by camera."""
+    total, done = sum(len(frames.numbers) for frames in taken), 0
+    names: list[list[str]] = []
+    for film, frames in zip(films, taken, strict=True):
+        own = []
+        for number, rgb in read_numbered_frames(film.path, [int(number) for number in frames.numbers]):
+            own.append(f"{film.name}/frame_{number:05d}.png")
+            write_image(root / "images" / own[-1], rgb)
+            done += 1
+            report("frames of the videos", done, total)
+        names.append(own)
+    return names
+
+
+def _write_model(
+    root: Path, films: Sequence[Film], names: Sequence[Sequence[str]], standing: pycolmap.Reconstruction
+) -> None:
+    """Write ``root/sparse/0``: a lens for each camera, its one pose for all its images, and the points.
+
+    The first image of each camera has the observations of the points.
+    """
+    import pycolmap
+
+    full = pycolmap.Reconstruction()
+    posed = {camera_name(image): image for image in standing.images.values() if image.has_pose}
+    first_ids: dict[int, int] = {}
+    image_id = 0
+    for number, (film, own) in enumerate(zip(films, names, strict=True)):
+        image = posed[film.name]
+        lens = standing.cameras[image.camera_id]
+        camera = pycolmap.Camera(
+            camera_id=number + 1, model=lens.model, width=lens.width, height=lens.height, params=lens.params
+        )
+        full.add_camera_with_trivial_rig(camera)
+        places = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+        for place, name in enumerate(own):
+            image_id += 1
+            seen = places if place == 0 else np.zeros((0, 2))
+            new = pycolmap.Image(name=name, keypoints=seen, camera_id=number + 1, image_id=image_id)
+            full.add_image_with_trivial_frame(new, image.cam_from_world())
+        first_ids[image.image_id] = image_id - len(own) + 1
+    for number in sorted(standing.points3D):
+        point = standing.points3D[number]
+        track = pycolmap.Track()
+        for element in point.track.elements:
+            if element.image_id in first_ids:
+                track.add_element(first_ids[element.image_id], element.point2D_idx)
+        full.add_point3D(point.xyz, track, point.color)
+    full.update_point_3d_errors()
+    folder = root / "sparse" / "0"
+    folder.mkdir(parents=True)
+    full.write(folder)
 
 
 def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[SmallImages]) -> str:
     """Return a line that says that all cameras stand."""
-    found = [steadiness(images.grey) for images in small]
+    found = [displaced_by(images.grey) for images in small]
     moving = [
-        f"{film.name} ({'far' if np.isinf(steady.displaced) else f'up to {steady.displaced:.1%} of its width'})"
-        for film, steady in zip(films, found, strict=True)
-        if not steady.stands
+        f"{film.name} ({'far' if np.isinf(displaced) else f'up to {displaced:.1%} of its width'})"
+        for film, displaced in zip(films, found, strict=True)
+        if displaced > STANDS
     ]
     if moving:
         raise DyngsError(
@@ -240,13 +185,14 @@ def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[SmallIma
             f"{'moves' if len(moving) == 1 else 'move'}; remove {'it' if len(moving) == 1 else 'them'}, stabilise what "
             "only shakes, or train on one moving camera's video alone"
         )
-    most = max(steady.displaced for steady in found)
-    allowed = f"{STANDS:.1%} allowed"
-    return f"{len(films)} cameras stand still (images displaced by {most:.2%} of their width at most, {allowed})"
+    return (
+        f"{len(films)} cameras stand still (images displaced by {max(found):.2%} of their width at most, {STANDS:.1%} "
+        "allowed)"
+    )
 
 
 def _posed(
-    work: Path, films: list[Film], small: list[SmallImages], options: VideosOptions, report: ReportProgress
+    work: Path, films: list[Film], small: list[SmallImages], options: SfmOptions, report: ReportProgress
 ) -> tuple[list[Film], list[SmallImages], FixedModel, str]:
     """Return the cameras that have a pose, with their small images, the poses, and a line on them."""
     images = []
@@ -254,7 +200,7 @@ def _posed(
         images.append(image_without_movers(film, len(shown.grey)))
         report("what stands, cameras", len(images), len(films))
     folder = work / "colmap"
-    found = fixed_model(films, images, folder, SfmOptions(seed=options.seed, num_threads=options.num_threads), report)
+    found = fixed_model(films, images, folder, options.num_threads, report)
     shutil.rmtree(folder)
     names = set() if found is None else {camera_name(image) for image in found.model.images.values() if image.has_pose}
     if found is None or len(names) < 2:
@@ -289,11 +235,3 @@ def _watcher(film: Film, images: SmallImages, model: pycolmap.Reconstruction) ->
     rays = np.nan_to_num(directions) @ rotation
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
     return Watcher(np.asarray(image.projection_center()), rays, motion_of(images), images.seconds)
-
-
-def _held_out(films: Sequence[Film], given: tuple[str, ...] | None) -> list[str]:
-    """Return the cameras for testing: those given, else the first one where there are enough."""
-    names = [film.name for film in films]
-    if given is not None:
-        return [name for name in names if name in given]
-    return names[:1] if len(names) >= MIN_CAMERAS_TO_HOLD_OUT else []

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ import numpy as np
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo, frame_seconds, probe_video, read_frames
 from dyngs.errors import DyngsError, reading
-from dyngs.files.containment import inside
 from dyngs.files.fields import first_few, is_number, read_json_object
 
 SMALL_SIDE = 160
@@ -23,14 +23,7 @@ SMALL_BYTES = 400_000_000
 
 @dataclass(frozen=True)
 class Film:
-    """A video of one camera.
-
-    Attributes:
-        name: of the camera: the file's name without its suffix.
-        path: the file.
-        info: size, length, frame rate.
-        seconds: (F,) when each frame is shown, the first one at 0.
-    """
+    """A video of the camera ``name``, with ``seconds`` (F,) when each frame is shown, the first one at 0."""
 
     name: str
     path: Path
@@ -46,12 +39,7 @@ class Film:
 
 @dataclass(frozen=True)
 class SmallImages:
-    """Small grey images of the beginning of a video.
-
-    Attributes:
-        grey: (F, H, W) uint8.
-        seconds: (F,) as in ``Film``.
-    """
+    """Small images ``grey`` (F, H, W) uint8 of the beginning of a video; ``seconds`` (F,) as in ``Film``."""
 
     grey: np.ndarray
     seconds: np.ndarray
@@ -76,11 +64,6 @@ def videos_in(folder: Path) -> list[Path]:
     return videos
 
 
-def open_films(folder: Path) -> list[Film]:
-    """Return the videos of a folder, by name."""
-    return [open_film(inside(path)) for path in videos_in(folder)]
-
-
 def open_film(path: Path) -> Film:
     """Return a video."""
     info = probe_video(path)
@@ -92,26 +75,19 @@ def small_images(films: Sequence[Film], report: ReportProgress = report_nothing)
     limit = SMALL_BYTES // max(len(films) * SMALL_SIDE * SMALL_SIDE, 1)
     images = []
     for number, film in enumerate(films):
-        shown = [shrunk_grey(rgb) for rgb in _first(read_frames(film.path), limit)]
+        shown = [shrunk_grey(rgb) for rgb in islice(read_frames(film.path), limit)]
         grey = np.stack(shown[: len(film.seconds)]) if shown else np.zeros((0, 1, 1), np.uint8)
         images.append(SmallImages(grey, film.seconds[: len(grey)]))
         report("videos looked at", number + 1, len(films))
     return images
 
 
-def shrunk_grey(rgb: np.ndarray, side: int = SMALL_SIDE) -> np.ndarray:
-    """Return (h, w) uint8: means of the green of (H, W, 3) uint8 over square blocks, ``side`` px long at most."""
-    step = max(math.ceil(max(rgb.shape[:2]) / side), 1)
+def shrunk_grey(rgb: np.ndarray) -> np.ndarray:
+    """Return (h, w) uint8: means of the green of (H, W, 3) uint8 over square blocks, ``SMALL_SIDE`` px long at most."""
+    step = max(math.ceil(max(rgb.shape[:2]) / SMALL_SIDE), 1)
     height, width = (max(size // step, 1) for size in rgb.shape[:2])
     blocks = rgb[: height * step, : width * step, 1].reshape(height, min(step, rgb.shape[0]), width, -1)
     return np.round(blocks.sum(axis=(1, 3), dtype=np.uint32) / (blocks.shape[1] * blocks.shape[3])).astype(np.uint8)
-
-
-def _first(frames: Iterator[np.ndarray], count: int) -> Iterator[np.ndarray]:
-    for number, rgb in enumerate(frames):
-        if number >= count:
-            return
-        yield rgb
 
 
 VIDEOS_FILE = "videos.json"
@@ -120,12 +96,7 @@ MAX_SECONDS = 86_400.0
 
 @dataclass(frozen=True)
 class Given:
-    """What is known of several videos beforehand.
-
-    Attributes:
-        starts: camera to the second, in one clock, at which its first frame was taken; None: to be found.
-        test: cameras that are held out; None: the usual rule.
-    """
+    """Camera to the second, in one clock, at which its video begins; cameras held out for testing; None: not known."""
 
     starts: dict[str, float] | None = None
     test: tuple[str, ...] | None = None
@@ -135,10 +106,6 @@ def read_given(folder: Path, names: Sequence[str]) -> Given:
     """Read ``videos.json``: ``{"starts": {"cam00": 0, "cam01": 1.25}, "test": ["cam00"]}``; all keys are optional.
 
     ``"starts": 0`` says that all videos begin at once.
-
-    Args:
-        folder: the videos' folder.
-        names: of all cameras.
 
     Raises:
         DyngsError: a camera that is not there or missing, or something that is no number.
@@ -168,10 +135,6 @@ def read_given(folder: Path, names: Sequence[str]) -> Given:
 def checked_starts(starts: Mapping[str, object], names: Sequence[str], where: str) -> dict[str, float]:
     """Return the seconds at which the videos begin, for every camera.
 
-    Args:
-        starts: camera to seconds, as given.
-        names: of all cameras.
-
     Raises:
         DyngsError: a camera that is not there or missing, or something that is no number of at most a day.
     """
@@ -181,7 +144,9 @@ def checked_starts(starts: Mapping[str, object], names: Sequence[str], where: st
         raise DyngsError(f"{where}: no video is called {first_few(unknown)}; there are {first_few(sorted(names))}")
     if missing:
         raise DyngsError(f"{where}: says nothing on {first_few(missing)}; give the second at which every video begins")
+    seconds: dict[str, float] = {}
     for name, second in starts.items():
         if not (is_number(second) and math.isfinite(second) and abs(second) <= MAX_SECONDS):
             raise DyngsError(f"{where}: the start of {name} must be a number of seconds, got {second!r:.40}")
-    return {name: float(second) for name, second in starts.items() if is_number(second)}
+        seconds[name] = float(second)
+    return seconds

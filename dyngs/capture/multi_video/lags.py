@@ -33,11 +33,9 @@ _ROUNDS = 20
 
 @dataclass(frozen=True)
 class Correlation:
-    """Correlation of two signals at whole shifts.
+    """Correlation of two signals: ``values`` (L,) in [-1, 1] at the whole shifts, in samples, from ``first`` on.
 
-    Attributes:
-        first: shift of the first value, in samples: time of the second signal plus the shift is time of the first one.
-        values: (L,) in [-1, 1], one for each shift from ``first`` on.
+    Time of the second signal plus the shift is time of the first one.
     """
 
     first: int
@@ -56,19 +54,24 @@ class Correlation:
     @property
     def is_clear(self) -> bool:
         """Whether the highest correlation is high, and alone."""
-        place = peak_place(self.values)
         peak = float(self.values.max())
-        return peak >= MIN_PEAK and rival_of(self.values, place) <= RIVAL * peak
+        return peak >= MIN_PEAK and self._rival() <= RIVAL * peak
 
     @property
     def is_certain(self) -> bool:
         """Whether the highest correlation can be relied on by itself."""
-        place, peak = peak_place(self.values), float(self.values.max())
-        rival = rival_of(self.values, place)
-        far = np.abs(np.arange(len(self.values)) - place) > PEAK_WIDTH
+        peak = float(self.values.max())
+        far = np.abs(np.arange(len(self.values)) - peak_place(self.values)) > PEAK_WIDTH
         deviation = float(np.sqrt(np.mean(self.values[far] ** 2))) if far.any() else 1.0
         stands_out = peak >= CERTAIN_DEVIATIONS * deviation
-        return self.is_clear and (stands_out or (peak >= CERTAIN_PEAK and rival <= CERTAIN_RIVAL * peak))
+        return self.is_clear and (stands_out or (peak >= CERTAIN_PEAK and self._rival() <= CERTAIN_RIVAL * peak))
+
+    def _rival(self) -> float:
+        """Return the highest local maximum that does not belong to the highest peak, 0 without any."""
+        values, inner = self.values, self.values[1:-1]
+        is_top = (inner >= values[:-2]) & (inner >= values[2:])
+        far = np.abs(np.arange(1, len(values) - 1) - peak_place(values)) > PEAK_WIDTH
+        return float(max(inner[is_top & far].max(initial=0.0), 0.0))
 
 
 @dataclass(frozen=True)
@@ -77,18 +80,14 @@ class Alignment:
 
     Attributes:
         shifts: (C,) samples, to be added to a recording's own time; the first one is 0.
-        agreeing: pairs whose own best shift is this one, to a sample.
-        compared: pairs with a clear peak of their own.
-        pairs: all pairs.
-        correlation: mean over all pairs at these shifts.
-        together: mean over all pairs if nothing is shifted.
+        agreeing: pairs whose own best shift is this one, to a sample; of so many ``pairs``.
+        correlation: mean over all pairs at these shifts; ``together``: if nothing is shifted.
         holds: whether the shifts may be relied on: pairs that agree join all recordings, and of the pairs beyond those
             that it takes to join them, which agree by themselves, half agree, too. Without such pairs, each is certain.
     """
 
     shifts: np.ndarray
     agreeing: int
-    compared: int
     pairs: int
     correlation: float
     together: float
@@ -96,12 +95,9 @@ class Alignment:
 
 
 def correlate(a: np.ndarray, b: np.ndarray) -> Correlation | None:
-    """Return the correlation of two signals over whole shifts; None where they are too short to be compared.
+    """Return the correlation of two signals (T, B), of one rate, over whole shifts; None where they are too short.
 
     Each column is taken relative to its mean. At every shift the energy of what overlaps is the norm.
-
-    Args:
-        a, b: (T, B) values of B bins at even times, with the same rate.
     """
     a, b = (x - x.mean(axis=0) for x in (a.astype(np.float64), b.astype(np.float64)))
     least = max(int(np.ceil(MIN_OVERLAP * min(len(a), len(b)))), MIN_SAMPLES)
@@ -137,9 +133,9 @@ def align(pairs: Mapping[tuple[int, int], Correlation], count: int, near: np.nda
             shifts[i] = _best_shift(i, shifts, pairs, None if near is None else float(near[i]))
         if np.abs(shifts - before).max() < 1e-3:
             break
-    own = {pair: found.best for pair, found in pairs.items()}
-    clear = {pair for pair, found in pairs.items() if found.is_clear}
-    agree = {(i, j) for i, j in clear if abs(own[i, j] - (shifts[j] - shifts[i])) <= 1.0}
+    agree = {
+        (i, j) for (i, j), found in pairs.items() if found.is_clear and abs(found.best - (shifts[j] - shifts[i])) <= 1.0
+    }
     mean, none = (
         float(np.mean([found.at(at[j] - at[i]) for (i, j), found in pairs.items()])) if pairs else 0.0
         for at in (shifts, np.zeros(count))
@@ -149,7 +145,7 @@ def align(pairs: Mapping[tuple[int, int], Correlation], count: int, near: np.nda
         2 * (len(agree) - (count - 1)) >= beyond if beyond > 0 else all(pairs[pair].is_certain for pair in agree)
     )
     holds = len(_reached(agree, count)) == count and confirmed
-    return Alignment(shifts - shifts[0], len(agree), len(clear), len(pairs), mean, none, holds)
+    return Alignment(shifts - shifts[0], len(agree), len(pairs), mean, none, holds)
 
 
 def peak_place(values: np.ndarray) -> float:
@@ -160,14 +156,6 @@ def peak_place(values: np.ndarray) -> float:
     before, peak, after = values[top - 1 : top + 2]
     bend = before - 2 * peak + after
     return top + (0.5 * float((before - after) / bend) if bend < 0 else 0.0)
-
-
-def rival_of(values: np.ndarray, place: float) -> float:
-    """Return the highest local maximum that does not belong to the peak at ``place``, 0 without any."""
-    inner = values[1:-1]
-    is_top = (inner >= values[:-2]) & (inner >= values[2:])
-    far = np.abs(np.arange(1, len(values) - 1) - place) > PEAK_WIDTH
-    return float(max(inner[is_top & far].max(initial=0.0), 0.0))
 
 
 def _spanning(pairs: Mapping[tuple[int, int], Correlation], count: int) -> np.ndarray:
@@ -226,13 +214,11 @@ _MIN_BASELINE = 1e-6
 
 @dataclass(frozen=True)
 class Watcher:
-    """A fixed camera, with the motion that it sees.
+    """A fixed camera at ``center`` (3,), with the motion that it sees.
 
     Attributes:
-        center: (3,) in the world.
         rays: (P, 3) unit vectors in the world, of the P pixels of the small images, row by row.
-        motion: (F, P) grey levels of change against what stands.
-        seconds: (F,) of its own clock.
+        motion: (F, P) grey levels of change against what stands, at ``seconds`` (F,) of its own clock.
     """
 
     center: np.ndarray
@@ -254,43 +240,16 @@ def motion_of(images: SmallImages) -> np.ndarray:
     return motion
 
 
-def even_rate(values: np.ndarray, seconds: np.ndarray, rate: float) -> np.ndarray:
-    """Return (T, B) values at even times from 0 on, linear between those of (F,) ``seconds``."""
-    times = np.arange(int(np.floor(seconds[-1] * rate + 1e-6)) + 1) / rate
-    return np.stack([np.interp(times, seconds, own) for own in values.T], axis=1)
-
-
-def correlated_motion(a: Watcher, b: Watcher, rate: float, blur: float) -> Correlation | None:
-    """Return how alike the motion of two cameras is at every shift; None where they share no planes.
-
-    Args:
-        a, b: fixed cameras.
-        rate: samples per second of the shifts.
-        blur: standard deviation in samples by which motion is blurred in time: what moves by more than its size from
-            frame to frame is not alike otherwise.
-    """
-    bins = _bins_of(a, b)
-    if bins is None:
-        return None
-    signals = [
-        even_rate(_binned(watcher.motion, own), watcher.seconds, rate)
-        for watcher, own in zip((a, b), bins, strict=True)
-    ]
-    if blur > 0:
-        signals = [gaussian_filter1d(signal, blur, axis=0, mode="nearest", truncate=3.0) for signal in signals]
-    return correlate(signals[0], signals[1])
-
-
 def correlations(
     watchers: Sequence[Watcher], rate: float, most: int, blur: float
 ) -> dict[tuple[int, int], Correlation]:
-    """Return the correlation of each camera with at most ``most`` others, those that look at it most alike.
+    """Return the correlation of the motion of each camera with that of the ``most`` others that look most alike.
 
     Args:
-        watchers: fixed cameras.
+        watchers: fixed cameras; pairs that share no planes are left out.
         rate: samples per second of the shifts.
-        most: others per camera.
-        blur: in time, see ``correlated_motion``.
+        blur: standard deviation in samples by which motion is blurred in time: what moves by more than its size from
+            frame to frame is not alike otherwise.
     """
     axes = np.stack([watcher.rays.mean(axis=0) for watcher in watchers])
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-9)
@@ -298,8 +257,24 @@ def correlations(
     for i, likeness in enumerate(axes @ axes.T):
         nearest = [int(j) for j in np.argsort(-likeness, kind="stable") if j != i][:most]
         pairs |= {(min(i, j), max(i, j)) for j in nearest}
-    found = {pair: correlated_motion(watchers[pair[0]], watchers[pair[1]], rate, blur) for pair in sorted(pairs)}
+    found = {(i, j): _correlated(watchers[i], watchers[j], rate, blur) for i, j in sorted(pairs)}
     return {pair: value for pair, value in found.items() if value is not None}
+
+
+def _correlated(a: Watcher, b: Watcher, rate: float, blur: float) -> Correlation | None:
+    """Return how alike the motion of two cameras is at every shift; None where they share no planes."""
+    bins = _bins_of(a, b)
+    if bins is None:
+        return None
+    signals = []
+    for watcher, own in zip((a, b), bins, strict=True):
+        times = np.arange(int(np.floor(watcher.seconds[-1] * rate + 1e-6)) + 1) / rate
+        binned = _binned(watcher.motion, own)
+        signal = np.stack([np.interp(times, watcher.seconds, values) for values in binned.T], axis=1)
+        if blur > 0:
+            signal = gaussian_filter1d(signal, blur, axis=0, mode="nearest", truncate=3.0)
+        signals.append(signal)
+    return correlate(signals[0], signals[1])
 
 
 def _bins_of(a: Watcher, b: Watcher) -> tuple[np.ndarray, np.ndarray] | None:

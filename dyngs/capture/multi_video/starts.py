@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -40,8 +40,7 @@ def onsets(path: Path) -> np.ndarray | None:
     for begin in range(0, len(starts), 4096):  # bounded memory
         windows = samples[starts[begin : begin + 4096, None] + np.arange(_WINDOW)] * np.hanning(_WINDOW)
         power = np.abs(np.fft.rfft(windows, axis=1)) ** 2
-        bands = np.add.reduceat(power, edges, axis=1)[:, :-1]
-        loudness[begin : begin + 4096] = bands
+        loudness[begin : begin + 4096] = np.add.reduceat(power, edges, axis=1)[:, :-1]
     floor = 1e-3 * loudness.mean(axis=0) + 1e-9
     rises = np.maximum(np.diff(np.log(loudness + floor), axis=0, prepend=np.log(loudness[:1] + floor)), 0.0)
     return np.minimum(rises, 5.0)
@@ -93,7 +92,7 @@ Starts = tuple[np.ndarray, str]
 """Seconds (C,) at which the videos begin in one clock, the earliest at 0, and a line on how they were found."""
 
 
-def given_starts(films: Sequence[Film], starts: dict[str, float]) -> Starts:
+def given_starts(films: Sequence[Film], starts: Mapping[str, float]) -> Starts:
     """Return the starts that a person gave, for those of the videos that are left."""
     seconds = np.array([starts[film.name] for film in films])
     seconds = seconds - seconds.min()
@@ -102,9 +101,6 @@ def given_starts(films: Sequence[Film], starts: dict[str, float]) -> Starts:
 
 def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
     """Return the starts by the sound if all videos have some that tells, else by the motion that they show.
-
-    Args:
-        watchers: one for each, with poses.
 
     Raises:
         DyngsError: neither sound nor motion tells; says what to give.
@@ -128,7 +124,8 @@ def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
     frames = found.shifts / hertz * rate
     if found.together >= TOGETHER * found.correlation or np.abs(frames).max() <= WHOLE:
         return np.zeros(len(films)), f"the videos begin together, by {what} ({sure})"
-    if _same_rate(films) and np.abs(frames - np.round(frames)).max() <= WHOLE:
+    rates = [film.rate for film in films]
+    if max(rates) <= 1.01 * min(rates) and np.abs(frames - np.round(frames)).max() <= WHOLE:
         frames = np.round(frames)
         sure += ", whole frames"
     seconds = (frames - frames.min()) / rate
@@ -148,11 +145,6 @@ def _by_sound(films: Sequence[Film]) -> tuple[Alignment | None, str]:
     if aligned.holds:
         return aligned, ""
     return None, f"the sound agrees for {aligned.agreeing} of {aligned.pairs} pairs only"
-
-
-def _same_rate(films: Sequence[Film]) -> bool:
-    rates = [film.rate for film in films]
-    return max(rates) <= 1.01 * min(rates)
 
 
 def _listed(films: Sequence[Film], seconds: np.ndarray) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import map_coordinates
 
@@ -24,49 +22,28 @@ _FITS = 12.0
 """Grey levels within which they fit."""
 
 
-@dataclass(frozen=True)
-class Steadiness:
-    """How a camera moves.
+def displaced_by(grey: np.ndarray) -> float:
+    """Return how far the images (F, H, W) uint8 of a video are displaced against their median; see ``STANDS``.
 
-    Attributes:
-        displaced: largest displacement of the image over the clip, in fractions of its longer side; infinite where the
-            images have too little in common to tell.
-        stands: the camera stands still.
-    """
-
-    displaced: float
-    stands: bool
-
-
-def steadiness(grey: np.ndarray) -> Steadiness:
-    """Return how far the images of a video are displaced against their median.
-
-    An affine displacement and a change of brightness are fitted to what most pixels show (iterated least squares with
-    Cauchy weights), so that what moves before a fixed camera does not count. A camera that jumps far leaves
-    no sharp median, and does not fit.
-
-    Args:
-        grey: (F, H, W) uint8.
+    In fractions of the longer side; infinite where they have too little in common to tell. An affine displacement and
+    a change of brightness are fitted to what most pixels show (iterated least squares with Cauchy weights), so that
+    what moves before a fixed camera does not count. A camera that jumps far leaves no sharp median, and does not fit.
     """
     if len(grey) < 2:
-        return Steadiness(0.0, True)
+        return 0.0
     chosen = [grey[i].astype(np.float64) for i in evenly_spaced(len(grey), SAMPLES)]
     typical = np.median(chosen, axis=0)
-    if _gradients_are_flat(typical):
-        return Steadiness(0.0, True)
+    if float(np.hypot(*np.gradient(typical)).max(initial=0.0)) < 2.0:  # nothing could tell a displacement
+        return 0.0
     moved = [displacement(typical, image) for image in chosen]
     # A single image may be spoiled, by a flash or a hand before the lens.
-    largest = float(np.quantile(moved, 0.95, method="lower"))
-    return Steadiness(largest, largest <= STANDS)
+    return float(np.quantile(moved, 0.95, method="lower"))
 
 
 def displacement(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the largest displacement of a corner between two images, in fractions of the longer side.
+    """Return the largest displacement of a corner between two images (H, W), in fractions of the longer side.
 
     Infinite where fewer than half of the pixels that tell fit it.
-
-    Args:
-        one, other: (H, W) grey levels.
     """
     height, width = one.shape
     rows, columns = np.mgrid[0:height, 0:width]
@@ -101,11 +78,6 @@ def displacement(one: np.ndarray, other: np.ndarray) -> float:
     )
     flow_x, flow_y = _flow(parameters, at_x, at_y)
     return float(np.hypot(flow_x, flow_y).max() / max(width, height))
-
-
-def _gradients_are_flat(image: np.ndarray) -> bool:
-    """Whether nothing in the image could tell a displacement."""
-    return float(np.hypot(*np.gradient(image)).max(initial=0.0)) < 2.0
 
 
 def _flow(parameters: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

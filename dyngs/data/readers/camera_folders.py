@@ -15,7 +15,7 @@ from dyngs.data.geometry import OPENGL_FROM_OPENCV, checked_pose, match_size, op
 from dyngs.data.images.frame_cache import VideoFrames, planned_frames
 from dyngs.data.images.images import SUFFIXES
 from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo
-from dyngs.data.readers.transforms import MAX_FPS, Frame, FrameFile, read_views
+from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.fields import first_few, is_number, matrix_of, read_json_object
 from dyngs.files.numpy_files import read_npy
@@ -105,7 +105,7 @@ def sequence_views(
             times = {"frame": number, "time": (number - numbers[0]) / span}
             fields = {**own, **times, "file_path": str(image), "camera": index}
             video = None if camera.video is None else VideoFrame(camera.video.source, number)
-            frames.append(Frame(where, fields, {}, image, video))
+            frames.append(FrameEntry(where, fields, {}, image, video))
         read, notes = read_views(FrameFile(path, {}, tuple(frames)))
         views[camera.name], more = tuple(read.values()), []
         if camera.video is not None:

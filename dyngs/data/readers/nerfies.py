@@ -11,7 +11,7 @@ import numpy as np
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud, Splits
 from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, header_if_readable
-from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.fields import is_number, read_json_object
 from dyngs.files.numpy_files import read_npy
@@ -60,7 +60,7 @@ def read_nerfies(root: Path) -> Capture:
         own = _camera(root / "camera" / f"{name}.json", scene, images, name, skewed)
         camera = metadata[name].get("camera_id")
         frames.append(
-            Frame(str(root / "camera" / f"{name}.json"), {**own, "time": times.get(name), "camera": camera}, {})
+            FrameEntry(str(root / "camera" / f"{name}.json"), {**own, "time": times.get(name), "camera": camera}, {})
         )
     read, warnings = read_views(FrameFile(root / "dataset.json", {}, tuple(frames)))
     views = {

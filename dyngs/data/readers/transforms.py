@@ -35,7 +35,7 @@ _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameEntry:
     """One entry of ``frames``; keys that it lacks are looked up at the file's top level.
 
     Attributes:
@@ -77,7 +77,7 @@ class FrameFile:
 
     path: Path
     fields: dict[str, object]
-    frames: tuple[Frame, ...]
+    frames: tuple[FrameEntry, ...]
 
     @property
     def fps(self) -> float | None:
@@ -102,7 +102,7 @@ def read_frame_file(path: Path) -> FrameFile:
             raise DyngsError(f"{where}: must be an object with file_path and transform_matrix")
         if isinstance(own.get("file_path"), str):
             where += f" ({own['file_path']:.200})"
-        frames.append(Frame(where, own, fields))
+        frames.append(FrameEntry(where, own, fields))
     return FrameFile(path, fields, tuple(frames))
 
 
@@ -149,7 +149,7 @@ def view_name(path: Path, root: Path) -> str:
 
 
 def _view(
-    frame: Frame, root: Path, path: Path, stored: tuple[int, int] | None, common: tuple[int, int] | None
+    frame: FrameEntry, root: Path, path: Path, stored: tuple[int, int] | None, common: tuple[int, int] | None
 ) -> tuple[View, float, bool]:
     """Return a view, by how much its rotation was repaired, and whether its intrinsics were rescaled."""
     described = _described_size(frame) or stored or common
@@ -191,7 +191,7 @@ def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
     return {key: replace(view, flow_to=following.get(key)) for key, view in views.items()}
 
 
-def _named_file(root: Path, frame: Frame, key: str) -> Path | None:
+def _named_file(root: Path, frame: FrameEntry, key: str) -> Path | None:
     """Return the file that a frame names at ``key``, None where it names none."""
     written = frame.text(key)
     return _below(root, written, frame.where) if written else None
@@ -212,7 +212,7 @@ def _below(root: Path, written: str, where: str) -> Path:
     return path
 
 
-def _image_path(root: Path, frame: Frame) -> Path:
+def _image_path(root: Path, frame: FrameEntry) -> Path:
     """The image's file; extensions are tried where none is written, PNG first."""
     if frame.image is not None:
         return frame.image
@@ -226,7 +226,7 @@ def _image_path(root: Path, frame: Frame) -> Path:
     return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
 
 
-def _described_size(frame: Frame) -> tuple[int, int] | None:
+def _described_size(frame: FrameEntry) -> tuple[int, int] | None:
     width, height = frame.number("w"), frame.number("h")
     if width is None or height is None:
         return None
@@ -251,7 +251,7 @@ def _common_size(file: FrameFile, paths: list[Path], headers: list[ImageHeader |
     return next(iter(sizes), None)
 
 
-def _intrinsics(frame: Frame, width: int, height: int) -> np.ndarray:
+def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
     source = frame.own if any(key in frame.own for key in _FOCAL_KEYS) else frame.shared
     focal_x = _focal(source, "x", width, frame.where)
     focal_y = _focal(source, "y", height, frame.where)
@@ -282,7 +282,7 @@ def _focal(source: dict[str, object], axis: str, size: int, where: str) -> float
     return focal
 
 
-def _lens(frame: Frame) -> Lens:
+def _lens(frame: FrameEntry) -> Lens:
     model = (frame.text("camera_model") or "OPENCV").upper()
     k1, k2, k3, k4, k5, k6, p1, p2 = (
         frame.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -301,7 +301,7 @@ def _lens(frame: Frame) -> Lens:
     return Lens("opencv", params) if any(params) else Lens()
 
 
-def _matrix(frame: Frame) -> np.ndarray:
+def _matrix(frame: FrameEntry) -> np.ndarray:
     value = frame.own.get("transform_matrix")
     if value is None:
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")

@@ -13,7 +13,7 @@ from dyngs.data.body_frames import body_frames, of_one_clip, rows_of
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
 from dyngs.data.geometry import checked_pose, opengl_from_cam
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
-from dyngs.data.readers.transforms import Frame, FrameFile, read_views
+from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, first_few, numbers_of
@@ -183,7 +183,7 @@ def _views(path: Path, shots: Sequence[_Shot]) -> tuple[list[View], list[str]]:
     for shot in shots:
         times = {"frame": shot.frame, "time": (shot.frame - first) / max(last - first, 1)}
         frames.append(
-            Frame(shot.where, {**shot.calibration, **times, "file_path": shot.file, "camera": shot.camera}, {})
+            FrameEntry(shot.where, {**shot.calibration, **times, "file_path": shot.file, "camera": shot.camera}, {})
         )
     views, warnings = read_views(FrameFile(path, {}, tuple(frames)))
     return list(views.values()), warnings
@@ -210,7 +210,7 @@ def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
 
 
 def _frame_number(path: Path, name: str) -> int:
-    """Frame number of ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
+    """FrameEntry number of ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
     stem = PurePosixPath(name.replace("\\", "/")).name
     found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem)
     if not found:

@@ -11,7 +11,7 @@ from dyngs.config import Config
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.images.lens import undistorted_points
 from dyngs.data.loader import ImageLoader
-from dyngs.data.tracks import Tracks, read_tracks
+from dyngs.data.tracks import ImageTracks, read_tracks
 from dyngs.models.views import training_cameras
 from dyngs.training.priors.agreement import (
     Agreement,
@@ -128,7 +128,7 @@ def _judged_flow(config: Config, capture: Capture, images: ImageLoader) -> tuple
     return flow_to, flow_agreement(pairs)
 
 
-def _judged_tracks(config: Config, tracks: Tracks, images: ImageLoader) -> tuple[PointTracks, Agreement]:
+def _judged_tracks(config: Config, tracks: ImageTracks, images: ImageLoader) -> tuple[PointTracks, Agreement]:
     points = _point_tracks(config, tracks, images.views)
     pairs = []
     order = sorted(range(len(images)), key=lambda i: (points.glances[i].time, i))
@@ -152,7 +152,7 @@ def _shared_pairs(points: PointTracks, seen: Sequence[int]) -> list[tuple[int, i
     return pairs
 
 
-def _point_tracks(config: Config, tracks: Tracks, views: Sequence[View]) -> PointTracks:
+def _point_tracks(config: Config, tracks: ImageTracks, views: Sequence[View]) -> PointTracks:
     """Return tracks in the px of training images, undistorted; what cannot be undistorted is not visible."""
     rows, (_, count) = tracks.rows_of(views), tracks.visible.shape
     xy = torch.zeros(len(views), count, 2, device="cpu")
