@@ -14,7 +14,7 @@ import torch
 from scipy import ndimage
 
 from dyngs.capture.multi_video.steadiness import STANDS, displaced_by
-from dyngs.data.capture import Capture, Silhouette, View, all_views
+from dyngs.data.capture import Capture, Silhouette, View, all_views, each_view
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced
@@ -238,10 +238,7 @@ def with_background_masks(
             f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
             f"images, the person differs by {worst.contrast:.0f} times the noise and covers {worst.area:.1%} of them"
         )
-    splits = {
-        name: tuple(replace(view, silhouette=silhouettes[view.name]) for view in views)
-        for name, views in capture.splits.items()
-    }
+    splits = each_view(capture.splits, lambda view: replace(view, silhouette=silhouettes[view.name]))
     return capture.replace(splits=splits, has_alpha=True)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
-from dyngs.data.images.images import SUFFIXES, read_header
+from dyngs.data.images.images import SUFFIXES, files_in, read_header
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
 from dyngs.errors import DyngsError, reading
@@ -131,16 +131,8 @@ def _frames_of(source: Path) -> _Frames:
 
 def _images_of(folder: Path) -> list[Path]:
     """Return the images directly in a folder, or else in ``images`` below it, 9 before 10."""
-    for place in (folder, folder / "images"):
-        if place.is_dir():
-            found = [
-                path
-                for path in place.iterdir()
-                if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
-            ]
-            if found:
-                return sorted(found, key=lambda path: natural_order(path.name))
-    return []
+    found = files_in(folder, SUFFIXES) or files_in(folder / "images", SUFFIXES)
+    return sorted(found, key=lambda path: natural_order(path.name))
 
 
 def _chosen(options: DataConfig, count: int) -> list[int]:

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dyngs.capture.multi_video.estimate import poses_of_videos
-from dyngs.capture.multi_video.films import VIDEOS_FILE, videos_in
+from dyngs.capture.multi_video.films import VIDEOS_FILE
 from dyngs.capture.photos import digest_of, photos_below
 from dyngs.capture.sfm import estimate_poses
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.images.video import VIDEO_SUFFIXES
+from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
 from dyngs.errors import DyngsError, as_word, reading
 from dyngs.files.outputs import note_sources

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.data.capture import BODY_KINDS, BodyFrames, Capture, Split, Splits, View, all_views
+from dyngs.data.capture import BODY_KINDS, BodyFrames, Capture, Split, Splits, View, all_views, each_view
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import staying_within
 from dyngs.files.fields import LARGEST, first_few, float_array, numbers_of
@@ -27,18 +27,14 @@ def body_frames(
     betas: object,
     scale: object = 1.0,
     turns: object = None,
-    pelvis: object = None,
 ) -> BodyFrames:
     """Return checked body parameters, sorted by frame; arrays may have any shape with one row per frame.
 
     Args:
         frames: F distinct numbers.
-        poses: F rows of 72, 156 or 165 numbers.
-        trans: F rows of 3.
+        poses: F rows of 72, 156 or 165 numbers; ``trans`` and ``turns``: of 3.
         betas: (B,), or one such row per frame, of which the mean is taken.
         scale: one number, or one per frame.
-        turns: F rows of 3, or None.
-        pelvis: (3,) or None.
 
     Raises:
         DyngsError: counts that differ, another width, NaN, a scale that is not positive, a frame twice.
@@ -65,7 +61,6 @@ def body_frames(
         betas=_mean_row(where, "betas", betas, frames),
         scale=scales[order, 0],
         turns=None if turns is None else _rows(where, "turns", turns, frames, 3)[order],
-        pelvis=None if pelvis is None else numbers_of(f"{where}: 'pelvis'", pelvis, (3,)),
     )
 
 
@@ -96,11 +91,7 @@ def moved(body: BodyFrames, offset: np.ndarray) -> BodyFrames:
 
 
 def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
-    """(V,) index of the row of ``body`` for each view, by frame number.
-
-    Raises:
-        DyngsError: a view without a frame number, or whose frame has no parameters.
-    """
+    """Return (V,) the row of ``body`` for each view, by frame number; each must have one with parameters."""
     rows = {number: row for row, number in enumerate(body.frames)}
     found = []
     for view in views:
@@ -194,4 +185,4 @@ def numbered(splits: Splits) -> Splits:
     if all(view.frame is not None for view in views):
         return splits
     order = {time: i for i, time in enumerate(sorted({view.time or 0.0 for view in views}))}
-    return {name: tuple(replace(view, frame=order[view.time or 0.0]) for view in own) for name, own in splits.items()}
+    return each_view(splits, lambda view: replace(view, frame=order[view.time or 0.0]))

@@ -60,7 +60,7 @@ class Silhouette:
 
 @dataclass(frozen=True)
 class View:
-    """One image and its camera.
+    """One image and its camera; what a capture does not have is None.
 
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
@@ -69,18 +69,15 @@ class View:
         intrinsics: (3, 3) float64 in pixels of the *stored* image size.
         width, height: stored image size in pixels.
         camera_id: index of the physical camera.
-        mask_path: white = keep, black = ignore; None without a mask.
+        mask_path: white = keep, black = ignore.
         time: in [0, 1], or None for a static scene.
-        frame: frame number of a sequence, or None.
-        video: the video frame that ``image_path`` is decoded from, None where it is a file of the capture.
-        silhouette: mask of the person, which becomes the image's alpha; None where nobody is cut out.
-        depth_path: depth map, in any unit, see ``images.depth``; None without one.
-        motion_mask_path: white = moves; None without one.
-        motion_mask_labels: the mask holds labels instead: all but 0 moves.
-        flow_path: optical flow to the view ``flow_to``, see ``images.flow``; None without one.
-        flow_to: name of the next view of this camera in its file, None for the last one.
-        exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one capture; None
-            where the file does not say.
+        frame: frame number of a sequence.
+        video: the video frame that ``image_path`` is decoded from.
+        silhouette: mask of the person, which becomes the image's alpha.
+        depth_path: depth map, in any unit, see ``images.maps``.
+        motion_mask_path: white = moves; if ``motion_mask_labels``, all but 0 does.
+        flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
+        exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one capture.
     """
 
     name: str
@@ -111,6 +108,11 @@ Splits = dict[Split, tuple[View, ...]]
 def all_views(splits: Mapping[Split, tuple[View, ...]]) -> list[View]:
     """The views of all splits, one split after the other."""
     return [view for views in splits.values() for view in views]
+
+
+def each_view(splits: Splits, change: Callable[[View], View]) -> Splits:
+    """Return the splits with ``change`` of each view."""
+    return {name: tuple(map(change, views)) for name, views in splits.items()}
 
 
 @dataclass(frozen=True)
@@ -161,19 +163,19 @@ class Capture:
 
     Attributes:
         root: the folder.
-        format: name of the reader, as ``data.format`` has it.
+        format: as ``data.format`` has it.
         splits: split name to views, each tuple sorted by name; train is never empty.
         points: sparse points or None.
         points_file: the .ply that the points are from, which is not known to fit the cameras; None for other points.
         world_offset: (3,) float64, added to recentred coordinates gives those of the files; zero unless the scene lies
             far from its origin.
         has_alpha: images carry straight alpha that means "transparent here".
-        body: body parameters of each split, by frame number, for captures of people, else None.
-        fps: frames per second of the recording, None where the capture does not say.
-        span: first and last time as written in the files, which are 0 and 1 in the views; None without times.
+        body: body parameters of each split, by frame number, for captures of people.
+        fps: frames per second of the recording.
+        span: first and last time as written in the files, which are 0 and 1 in the views.
         in_seconds: times in the files are seconds.
-        seconds: from time 0 to time 1, None where it is not known.
-        tracks_path: 2D tracks, see ``data.tracks``; None without any.
+        seconds: from time 0 to time 1.
+        tracks_path: 2D tracks, see ``data.tracks``.
         warnings: suspicious findings of the reader, one line each.
     """
 
@@ -202,7 +204,6 @@ class CaptureFormat:
     """A capture format: how a folder of this format is recognised and read.
 
     Attributes:
-        name: as in ``data.format`` and ``Capture.format``.
         files: the files by which it is recognised, for messages.
         recognise: whether a folder holds these files; opens none of them.
         read: reads the folder; ``dyngs.data.read`` then finishes splits and times.

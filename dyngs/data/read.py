@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import with_fitted_body
-from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View, all_views
+from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View, all_views, each_view
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
@@ -118,14 +118,6 @@ def is_capture(root: Path) -> bool:
         return root.is_dir() and any(format.recognise(root) for format in FORMATS)
 
 
-def hold_out(views: tuple[View, ...], test_every: int) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """Split ``views`` into training and test views: indices 0, n, 2n, .. are for testing, none if n = 0."""
-    if test_every == 0:
-        return views, ()
-    test = views[::test_every]
-    return tuple(view for index, view in enumerate(views) if index % test_every), test
-
-
 def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFormat:
     """The format that ``options.format`` names, with "auto" the first one that was ``found`` in the folder."""
     if options.format == "auto":
@@ -133,8 +125,8 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
             known = command_for(options.root, captures=False)
             if known is not None:
                 raise DyngsError(f"{options.root}: no capture found; {known}")
-            wanted = "; ".join(f"{format.name}: {format.files}" for format in FORMATS)
-            raise DyngsError(f"{options.root}: no capture found; looked for {wanted}")
+            looked_for = "; ".join(f"{format.name}: {format.files}" for format in FORMATS)
+            raise DyngsError(f"{options.root}: no capture found; looked for {looked_for}")
         return found[0]
     chosen = next(format for format in FORMATS if format.name == options.format)
     if chosen not in found:
@@ -164,28 +156,38 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
             f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
         )
     written = splits
-    splits, notes = _timed(capture, splits, options.frames)
+    # People move by frame number: of their captures, times within [0, 1] are left as they are.
+    splits, notes = unit_times(capture.root, splits, stretch=capture.body is None)
+    if options.frames is not None:
+        splits = select_frames(capture.root, splits, options.frames)
+    splits, constant = still_if_constant(splits)
+    notes += [*constant, *sequence_warnings(splits)]
     if options.pose_frames is not None:
         capture, splits, new_poses = _with_poses_held_out(capture, splits, new_poses, options.pose_frames)
     span = span_in_files(written, splits)
     seconds = span[1] - span[0] if capture.in_seconds and span else clip_seconds(splits, capture.fps)
     if "test" not in splits:
-        splits["train"], splits["test"] = hold_out(splits["train"], options.test_every)
+        views, every = splits["train"], options.test_every
+        splits["test"] = views[::every] if every else ()
+        splits["train"] = tuple(view for i, view in enumerate(views) if not every or i % every)
         if not splits["train"]:
             raise DyngsError(f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it")
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
     if options.undistort == "wide":
-        splits = {name: _wide(views) for name, views in splits.items()}
+        splits = _wide(splits)
     for view in all_views(splits):
         _check_places(view)
     splits, tracks, absent = _present_priors(splits, capture.tracks_path)
     if decode_videos:
         frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
         decode_frames(capture.root, frames, options.frame_cache_mb)
-    warnings = [*capture.warnings, *_check_names(capture.root, splits), *_missing_images(splits)]
+    seen = all_views(splits)
+    missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
+    lacking = [f"{len(missing)} of {len(seen)} images are missing, first {missing[0]}"] if missing else []
     points, more = _finite_points(capture.points)
+    warnings = [*capture.warnings, *_check_names(capture.root, splits)]
     capture = replace(
         capture,
         splits=splits,
@@ -195,21 +197,22 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         has_alpha=_first_has_alpha(splits["train"]),
         span=span,
         seconds=seconds,
-        warnings=(*warnings, *by_name, *notes, *more, *absent),
+        warnings=(*warnings, *lacking, *by_name, *notes, *more, *absent),
     )
     return recenter(capture if options.body is None else with_fitted_body(capture, options.body))
 
 
-def _wide(views: tuple[View, ...]) -> tuple[View, ...]:
+def _wide(splits: Splits) -> Splits:
     """Return views whose pinholes show all that their lenses saw."""
     known: dict[Hashable, tuple[Lens, np.ndarray]] = {}
-    wide: list[View] = []
-    for view in views:
+
+    def wide(view: View) -> View:
         key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
         if key not in known:
             known[key] = wide_pinhole(view.lens, view.intrinsics, view.width, view.height)
-        wide.append(replace(view, lens=known[key][0], intrinsics=known[key][1]))
-    return tuple(wide)
+        return replace(view, lens=known[key][0], intrinsics=known[key][1])
+
+    return each_view(splits, wide)
 
 
 def _with_poses_held_out(
@@ -247,12 +250,6 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
     return [f"{len(leaked)} test images are also training images, first {leaked[0]}"] if leaked else []
 
 
-def _missing_images(splits: Splits) -> list[str]:
-    seen = all_views(splits)
-    missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
-    return [f"{len(missing)} of {len(seen)} images are missing, first {missing[0]}"] if missing else []
-
-
 def _first_has_alpha(views: tuple[View, ...]) -> bool:
     for view in views:
         if view.silhouette is not None:
@@ -262,18 +259,6 @@ def _first_has_alpha(views: tuple[View, ...]) -> bool:
         except DyngsError:
             continue
     return False
-
-
-def _timed(capture: Capture, splits: Splits, frames: str | None) -> tuple[Splits, list[str]]:
-    """Return the splits with final times, without views of frames that are not selected, and warnings.
-
-    People move by frame number: of their captures, times within [0, 1] are left as they are.
-    """
-    splits, notes = unit_times(capture.root, splits, stretch=capture.body is None)
-    if frames is not None:
-        splits = select_frames(capture.root, splits, frames)
-    splits, more = still_if_constant(splits)
-    return splits, [*notes, *more, *sequence_warnings(splits)]
 
 
 def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[str]]:
@@ -295,10 +280,9 @@ def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path |
         if not missing:
             continue
         notes.append(f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}")
-        splits = {
-            name: tuple(replace(v, **{field: None}) if getattr(v, field) in missing else v for v in views)
-            for name, views in splits.items()
-        }
+        splits = each_view(
+            splits, lambda v, at=field, no=missing: replace(v, **{at: None}) if getattr(v, at) in no else v
+        )
     if tracks is not None and not inside(tracks).is_file():
         return splits, None, [*notes, f"the tracks {tracks} are missing and are not used"]
     return splits, tracks, notes

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dyngs.data.body_frames import moved
-from dyngs.data.capture import Capture, PointCloud, View, all_views
+from dyngs.data.capture import Capture, PointCloud, View, all_views, each_view
 from dyngs.data.geometry import camera_center, focus_point, fraction_in_front, inverse_rigid, times_seen
 from dyngs.data.times import evenly_spaced
 
@@ -44,13 +44,10 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
 
 
 def points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return candidates for random points: places (P, 3), and in how many of up to ``COUNTED_VIEWS`` views each lies.
+    """Return candidates (P, 3) for random points, and in how many of up to ``COUNTED_VIEWS`` views each lies.
 
-    Each lies at a random place of the image of a random view; its inverse depth is uniform between ``depth_bounds``.
-
-    Args:
-        views: one or more.
-        unit: (P, 4) float64, uniform in [0, 1): the view, the place across and down, the depth.
+    Each lies anywhere in the image of a random view; its inverse depth is uniform between ``depth_bounds``. ``unit``
+    (P, 4) float64, uniform in [0, 1), says the view, the position across and down, the depth.
     """
     near, far = depth_bounds(views)
     depth = 1 / (1 / far + unit[:, 3] * (1 / near - 1 / far))
@@ -69,11 +66,7 @@ def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
     """Return why the scene cannot lie in the cube around the origin, in a few words; None where it may.
 
     It does not where the point that the cameras look at is outside, or where two cameras (one, if there is one) see
-    less than ``MIN_CUBE_SEEN`` of the cube.
-
-    Args:
-        views: of training, one or more.
-        half_extent: half the cube's side, world units.
+    less than ``MIN_CUBE_SEEN`` of the cube. Half its side is ``half_extent``.
     """
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     focus = focus_point(poses)
@@ -109,14 +102,14 @@ def recenter(capture: Capture) -> Capture:
 
 def shifted(capture: Capture, offset: np.ndarray) -> Capture:
     """Return the capture with ``offset`` (3,) subtracted from all positions and added to ``world_offset``."""
-    splits = {name: tuple(_shifted_view(view, offset) for view in views) for name, views in capture.splits.items()}
+
+    def moved_view(view: View) -> View:
+        pose = view.cam_from_world.copy()
+        # Through the centre: R @ offset + t would first round both terms at the size of the offset.
+        pose[:3, 3] = -pose[:3, :3] @ (camera_center(pose) - offset)
+        return replace(view, cam_from_world=pose)
+
+    splits = each_view(capture.splits, moved_view)
     points = capture.points and PointCloud(capture.points.xyz - offset, capture.points.rgb)
     body = capture.body and {name: moved(body, offset) for name, body in capture.body.items()}
     return replace(capture, splits=splits, points=points, body=body, world_offset=capture.world_offset + offset)
-
-
-def _shifted_view(view: View, offset: np.ndarray) -> View:
-    pose = view.cam_from_world.copy()
-    # Through the centre: R @ offset + t would first round both terms at the size of the offset.
-    pose[:3, 3] = -pose[:3, :3] @ (camera_center(pose) - offset)
-    return replace(view, cam_from_world=pose)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.capture import Split, Splits, View, all_views
+from dyngs.data.capture import Splits, View, all_views, each_view
 from dyngs.data.geometry import inverse_rigid
 from dyngs.errors import DyngsError, printable
 from dyngs.files.fields import is_number, read_json_object
@@ -48,9 +48,6 @@ def evenly_spaced(length: int, count: int) -> list[int]:
     return [i * length // count for i in range(count)]
 
 
-# Where times are from
-
-
 def write_seconds(root: Path, seconds: Mapping[str, float]) -> None:
     """Write the second of each image, by its path below ``root/images``."""
     write_text(root / SECONDS_FILE, json.dumps({"seconds": dict(seconds)}, indent=1) + "\n")
@@ -75,11 +72,8 @@ def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -
 
     Where the name of every image ends in a number, and no two of a folder in the same, that number is the time: frames
     that are missing leave gaps. Otherwise times are positions in the order of the names, numbers in them read as
-    numbers. Each folder is a camera; the same numbers, or positions, in another one are the same times.
-
-    Args:
-        splits: views; times that they have are replaced.
-        per_second: numbers, or positions, in a second: times become seconds; None leaves them as they are.
+    numbers. Each folder is a camera; the same numbers, or positions, in another one are the same times. With
+    ``per_second``, so many of them are a second.
 
     Raises:
         DyngsError: fewer than two images, or folders with different numbers of images and names without numbers.
@@ -109,11 +103,7 @@ def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -
     if per_second is not None:
         length = (max(times.values()) - min(times.values())) / per_second
         line += f" at {per_second:g} per second: {length:.4g} s"
-    timed: Splits = {
-        split: tuple(replace(view, time=times[view.name] / (per_second or 1.0)) for view in kept)
-        for split, kept in splits.items()
-    }
-    return timed, line + ")"
+    return each_view(splits, lambda view: replace(view, time=times[view.name] / (per_second or 1.0))), line + ")"
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
@@ -126,31 +116,22 @@ def times_of_frames(splits: Splits) -> Splits:
 
     The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its own.
     """
-    timed: Splits = dict(splits)
-    clips: list[list[Split]] = [[], []]
-    for name in splits:
-        clips[name == "pose"].append(name)
-    for clip in clips:
-        views = [view for name in clip for view in splits[name]]
-        frames = {view.frame for view in views if view.frame is not None and view.time is None}
+    timed: Splits = {}
+    for is_pose in (False, True):
+        own: Splits = {name: kept for name, kept in splits.items() if (name == "pose") == is_pose}
+        views = all_views(own)
+        frames = {view.frame for view in views if view.frame is not None}
         if len(frames) > 1 and all(view.frame is not None and view.time is None for view in views):
             first, span = min(frames), max(frames) - min(frames)
-            for name in clip:
-                timed[name] = tuple(replace(v, time=((v.frame or 0) - first) / span) for v in splits[name])
+            own = each_view(own, lambda v, at=first, of=span: replace(v, time=((v.frame or 0) - at) / of))
+        timed |= own
     return timed
-
-
-# On the scale of [0, 1]
 
 
 def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
     """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for all splits.
 
-    Times that are all equal are left as they are, see ``still_if_constant``.
-
-    Args:
-        splits: views with times as in the files, or all without.
-        stretch: scale times that lie within [0, 1], too; otherwise only those that do not.
+    Times that are all equal are left as they are, see ``still_if_constant``; without ``stretch`` all within [0, 1] are.
 
     Raises:
         DyngsError: a time that is no finite number, or some views with and some without a time; names the view.
@@ -169,10 +150,7 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     within = first >= 0 and last <= 1
     if first == last or (within and (not stretch or (first, last) == (0, 1) or last - first <= SAME_TIME)):
         return splits, []
-    scaled: Splits = {
-        name: tuple(replace(view, time=((view.time or 0.0) - first) / (last - first)) for view in kept)
-        for name, kept in splits.items()
-    }
+    scaled = each_view(splits, lambda view: replace(view, time=((view.time or 0.0) - first) / (last - first)))
     if within and max(first, 1 - last) < MENTIONED_CHANGE:
         return scaled, []
     return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
@@ -184,11 +162,11 @@ def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
     times = {view.time for view in views}
     if len(times) != 1 or times == {None}:
         return splits, []
-    only, lines = times.pop() or 0.0, []
-    time = only if 0 <= only <= 1 else 0.0
+    only = times.pop() or 0.0
     if len(views) > 1:
-        time, lines = None, [f"all images have time {only:g}: treated as a static scene"]
-    return {name: tuple(replace(view, time=time) for view in kept) for name, kept in splits.items()}, lines
+        line = f"all images have time {only:g}: treated as a static scene"
+        return each_view(splits, lambda view: replace(view, time=None)), [line]
+    return each_view(splits, lambda view: replace(view, time=only if 0 <= only <= 1 else 0.0)), []
 
 
 def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
@@ -199,13 +177,9 @@ def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
 
 
 def clip_seconds(splits: Splits, fps: float | None) -> float | None:
-    """Return the seconds from time 0 to time 1, None where they are not known.
+    """Return the seconds from time 0 to time 1 at ``fps`` frames per second, None where they are not known.
 
     From the frame numbers where all views have one, else from the number of times where these are evenly spaced.
-
-    Args:
-        splits: views with times in [0, 1].
-        fps: frames per second of the recording.
     """
     views = all_views(splits)
     times = sorted(set(distinct_times(views).values()))
@@ -232,9 +206,6 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
     return distinct
 
 
-# Selection: data.frames, data.pose_frames, data.train_cameras
-
-
 def parse_frames(text: str, key: str = "data.frames") -> slice:
     """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at ``key``.
 
@@ -255,10 +226,6 @@ def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
 
     The first selected time becomes 0 and the last one 1; a single one becomes 0.
 
-    Args:
-        splits: views with times in [0, 1], or all without.
-        frames: see ``parse_frames``.
-
     Raises:
         DyngsError: a bad slice, one that selects no time or no training view, or views without times.
     """
@@ -276,7 +243,7 @@ def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tu
     """Return the splits without the times that the slice ``frames`` selects, and the views at these times.
 
     Where some cameras only have test views, the second are those of these cameras; otherwise those of all splits. Times
-    of both parts are scaled to [0, 1], as two clips. Arguments as ``select_frames``.
+    of both parts are scaled to [0, 1], as two clips.
 
     Raises:
         DyngsError: a bad slice, one that selects no time or all times with training views, or views without times.
@@ -315,7 +282,6 @@ def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Split
 
 
 def _picked_times(root: Path, splits: Splits, frames: str, key: str) -> tuple[dict[float, float], list[float]]:
-    """Return the distinct time of each time of the views, and those of them that the slice ``frames`` selects."""
     part = parse_frames(frames, key)
     views = all_views(splits)
     if any(view.time is None for view in views):
@@ -333,13 +299,7 @@ def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[
     span = picked[-1] - picked[0] if picked else 0.0
     new = {time: (time - picked[0]) / span if span else 0.0 for time in picked}
     unit = {written: new[time] for written, time in distinct.items() if time in new}
-    return {
-        name: tuple(replace(view, time=unit[view.time]) for view in kept if view.time in unit)
-        for name, kept in splits.items()
-    }
-
-
-# Cameras over time
+    return {name: tuple(replace(v, time=unit[v.time]) for v in kept if v.time in unit) for name, kept in splits.items()}
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
@@ -378,13 +338,12 @@ def videos(views: Sequence[View]) -> list[list[int]]:
 
 
 def sequence_warnings(splits: Splits) -> list[str]:
-    """Warn of images with the same camera, pose and time, and of cameras with different numbers of frames."""
+    """Return warnings of images with one camera, pose and time, and of cameras with different numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
     return [*_repeated(views), *_frame_counts(views)]
 
 
 def _repeated(views: list[View]) -> list[str]:
-    """Warn of several images with one camera, pose and time."""
     images: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
     for view in views:
         images[view.camera_id, view.time, view.cam_from_world.round(9).tobytes()].setdefault(view.image_path, view)
@@ -426,9 +385,6 @@ def _camera_labels(cameras: dict[int, list[View]]) -> dict[int, str]:
     }
 
 
-# Time steps of several videos
-
-
 @dataclass(frozen=True)
 class Taken:
     """Frames taken of one video: their ``numbers`` (K,), ascending, and ``seconds`` (K,) in the clock of all videos."""
@@ -446,8 +402,7 @@ def taken_frames(
     time if that differs.
 
     Args:
-        clocks: of each video the seconds (F,) of its frames, in one clock.
-        rates: frames per second.
+        clocks: of each video the seconds (F,) of its frames, in one clock; ``rates``: frames per second.
         most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many cameras.
 
     Raises:

@@ -15,11 +15,10 @@ from dyngs.capture.multi_video.films import (
     open_film,
     read_given,
     shrunk_grey,
-    videos_in,
 )
 from dyngs.capture.multi_video.lags import motion_of
 from dyngs.capture.multi_video.steadiness import STANDS, displaced_by, displacement
-from dyngs.data.images.video import opened_video, orientation_of, read_frames
+from dyngs.data.images.video import opened_video, orientation_of, read_frames, videos_in
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import as_word, counted, reading
 from dyngs.files.containment import inside

@@ -20,14 +20,13 @@ from dyngs.capture.multi_video.films import (
     open_film,
     read_given,
     small_images,
-    videos_in,
 )
 from dyngs.capture.multi_video.lags import Watcher, motion_of
 from dyngs.capture.multi_video.starts import found_starts, given_starts
 from dyngs.capture.multi_video.steadiness import STANDS, displaced_by
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.images.video import read_numbered_frames
+from dyngs.data.images.video import read_numbered_frames, videos_in
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import Taken, taken_frames, write_seconds

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo, frame_seconds, probe_video, read_frames
-from dyngs.errors import DyngsError, reading
+from dyngs.data.images.video import VideoInfo, frame_seconds, probe_video, read_frames
+from dyngs.errors import DyngsError
 from dyngs.files.fields import first_few, is_number, read_json_object
 
 SMALL_SIDE = 160
@@ -43,25 +43,6 @@ class SmallImages:
 
     grey: np.ndarray
     seconds: np.ndarray
-
-
-def videos_in(folder: Path) -> list[Path]:
-    """Return the videos directly in a folder, by name; hidden files are left out.
-
-    Raises:
-        DyngsError: two with the same name but for the suffix.
-    """
-    with reading(folder, "choose another folder or change its permissions"):
-        videos = sorted(
-            path
-            for path in folder.iterdir()
-            if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and not path.name.startswith(".")
-        )
-    names: dict[str, Path] = {}
-    for path in videos:
-        if names.setdefault(path.stem, path) != path:
-            raise DyngsError(f"{folder}: {names[path.stem].name} and {path.name} are one camera; remove one of them")
-    return videos
 
 
 def open_film(path: Path) -> Film:

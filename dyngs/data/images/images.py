@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,6 +68,14 @@ class ImageHeader:
         wide, tall = described
         lies = (wide > tall) != (self.width > self.height) and wide != tall
         return self.upright_size if lies else self.size
+
+
+def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """Return the files directly in a folder that end in one of the suffixes, by name; hidden files are left out."""
+    found = folder.iterdir() if folder.is_dir() else ()
+    return sorted(
+        path for path in found if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
+    )
 
 
 def read_header(path: Path) -> ImageHeader:

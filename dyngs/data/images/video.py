@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from dyngs.data.images.exif import rotated_upright
+from dyngs.data.images.images import files_in
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import check_size
 from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES
@@ -41,6 +42,21 @@ class VideoInfo:
     height: int
     num_frames: int
     fps: float
+
+
+def videos_in(folder: Path) -> list[Path]:
+    """Return the videos directly in a folder, by name; hidden files are left out.
+
+    Raises:
+        DyngsError: two with the same name but for the suffix.
+    """
+    with reading(folder, "choose another folder or change its permissions"):
+        videos = files_in(folder, VIDEO_SUFFIXES)
+    names: dict[str, Path] = {}
+    for path in videos:
+        if names.setdefault(path.stem, path) != path:
+            raise DyngsError(f"{folder}: {names[path.stem].name} and {path.name} are one camera; remove one of them")
+    return videos
 
 
 def read_frames(path: Path) -> Iterator[np.ndarray]:

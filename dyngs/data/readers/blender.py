@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
 
 from dyngs.data.body_frames import read_body_file, rows_of
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Split, Splits, View
-from dyngs.data.readers.transforms import (
-    FoundPoints,
-    FrameFile,
-    find_points,
-    read_frame_file,
-    read_views,
-    tracks_path_of,
-)
+from dyngs.data.readers.transforms import SPLITS, FrameFile, find_points, read_frame_file, read_views, tracks_path_of
 from dyngs.errors import DyngsError
 
 
@@ -26,25 +18,24 @@ def read_blender(root: Path) -> Capture:
     """
     splits: Splits = {}
     warnings: list[str] = []
-    fps, found, tracks = None, FoundPoints(), None
-    names: tuple[Split, ...] = ("train", "val", "test")
-    for name in names:
+    train = read_frame_file(root / "transforms_train.json")
+    for name in SPLITS:
         path = root / f"transforms_{name}.json"
         if name != "train" and not path.is_file():
             continue
-        file = read_frame_file(path)
-        views, notes = read_views(file)
-        if name == "train":
-            fps, found, tracks = file.fps, find_points(file), tracks_path_of(file)
+        views, notes = read_views(train if name == "train" else read_frame_file(path))
         splits[name] = tuple(views.values())
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
             warnings.append(f"{path.name}: lists no frames")
-    warnings += found.warnings
-    place, lines = found.path, tuple(warnings)
-    return Capture(
-        root, "blender", splits, found.points, fps=fps, points_file=place, tracks_path=tracks, warnings=lines
-    )
+    return _capture_of(root, "blender", train, splits, warnings)
+
+
+def _capture_of(root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]) -> Capture:
+    """Return the capture with the points, frame rate and tracks of a transforms file."""
+    points, path, notes = find_points(file)
+    tracks, lines = tracks_path_of(file), (*warnings, *notes)
+    return Capture(root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines)
 
 
 FORMAT = CaptureFormat(
@@ -62,28 +53,17 @@ def read_nerfstudio(root: Path) -> Capture:
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
     splits, notes = _nerfstudio_splits(file, views)
-    found = find_points(file)
-    return Capture(
-        root,
-        "nerfstudio",
-        splits,
-        found.points,
-        fps=file.fps,
-        points_file=found.path,
-        tracks_path=tracks_path_of(file),
-        warnings=(*warnings, *notes, *found.warnings),
-    )
+    return _capture_of(root, "nerfstudio", file, splits, [*warnings, *notes])
 
 
 def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:
     """Splits by the lists in the file, all views for training where it has none; and warnings."""
-    names: tuple[Split, ...] = ("train", "val", "test")
-    listed = {name: file.fields.get(f"{name}_filenames") for name in names}
+    listed = {name: file.fields.get(f"{name}_filenames") for name in SPLITS}
     if all(value is None for value in listed.values()):
         return {"train": tuple(views.values())}, []
     splits: Splits = {}
     unknown: list[str] = []
-    for name in names:
+    for name in SPLITS:
         value = listed[name]
         if value is None:
             continue
@@ -107,10 +87,6 @@ NERFSTUDIO_FORMAT = CaptureFormat(
 )
 
 
-_TRAIN = "body_train.npz"
-_NEW_POSES = cast(Split, "pose")
-
-
 def read_body_json(root: Path) -> Capture:
     """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first file are optional.
 
@@ -125,9 +101,9 @@ def read_body_json(root: Path) -> Capture:
     path = root / "transforms_pose.json"
     if path.is_file():
         views, notes = read_views(read_frame_file(path))
-        splits[_NEW_POSES] = tuple(views.values())
+        splits["pose"] = tuple(views.values())
         warnings = (*warnings, *(f"{path.name}: {note}" for note in notes))
-    train = read_body_file(root / _TRAIN)
+    train = read_body_file(root / "body_train.npz")
     body: dict[Split, BodyFrames] = {name: _body_of(root, name, views, train) for name, views in splits.items()}
     return capture.replace(
         format="body_json",
@@ -141,12 +117,12 @@ def read_body_json(root: Path) -> Capture:
 
 def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrames) -> BodyFrames:
     path = root / f"body_{split}.npz"
-    if not path.is_file() and split == _NEW_POSES:
+    if not path.is_file() and split == "pose":
         raise DyngsError(
             f"{path}: no such file; transforms_pose.json shows another clip, which needs its own parameters"
         )
     body = read_body_file(path) if path.is_file() and split != "train" else train
-    rows_of(path if path.is_file() else root / _TRAIN, body, views)
+    rows_of(path if path.is_file() else root / "body_train.npz", body, views)
     return body
 
 

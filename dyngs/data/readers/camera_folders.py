@@ -13,8 +13,8 @@ import numpy as np
 from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, checked_pose, match_size, opengl_from_cam, rescale_warning
 from dyngs.data.images.frame_cache import VideoFrames, planned_frames
-from dyngs.data.images.images import SUFFIXES
-from dyngs.data.images.video import VIDEO_SUFFIXES, VideoInfo
+from dyngs.data.images.images import SUFFIXES, files_in
+from dyngs.data.images.video import VideoInfo, videos_in
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.fields import first_few, is_number, matrix_of, read_json_object
@@ -26,13 +26,7 @@ MIN_CAMERAS_TO_HOLD_OUT = 3
 
 @dataclass(frozen=True)
 class CameraSource:
-    """The images of one camera.
-
-    Attributes:
-        name: name of its folder, or of its video without the suffix.
-        images: frame number to file; frames of a video may have to be decoded first.
-        video: frames of the video, None for a folder.
-    """
+    """Frame number to image file of the camera ``name``; those of a ``video`` may have to be decoded first."""
 
     name: str
     images: dict[int, Path]
@@ -47,15 +41,10 @@ def find_cameras(root: Path) -> dict[str, Path]:
     Raises:
         DyngsError: two videos for one camera.
     """
-    found: dict[str, Path] = {}
-    for path in sorted(root.iterdir()):
-        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() and not path.name.startswith("."):
-            if path.stem in found:
-                raise DyngsError(f"{root}: {found[path.stem].name} and {path.name} are one camera; remove one of them")
-            found[path.stem] = path
+    found = {path.stem: path for path in videos_in(root)}
     for path in sorted(root.iterdir()):
         if path.is_dir() and not path.name.startswith("."):
-            folder = next((f for f in (path, path / "images") if _images(f)), None)
+            folder = next((f for f in (path, path / "images") if files_in(f, SUFFIXES)), None)
             if folder is not None:
                 found[path.name] = folder
     return dict(sorted(found.items()))
@@ -71,7 +60,7 @@ def open_camera(name: str, path: Path) -> CameraSource:
         planned = planned_frames(path)
         return CameraSource(name, dict(enumerate(planned.paths)), planned)
     images: dict[int, Path] = {}
-    for image in _images(path):
+    for image in files_in(path, SUFFIXES):
         digits = re.findall(r"\d+", image.stem)
         if not digits:
             raise DyngsError(f"{image}: no frame number in its name; call it frame_0000{image.suffix} or the like")
@@ -105,19 +94,19 @@ def sequence_views(
             times = {"frame": number, "time": (number - numbers[0]) / span}
             fields = {**own, **times, "file_path": str(image), "camera": index}
             video = None if camera.video is None else VideoFrame(camera.video.source, number)
-            frames.append(FrameEntry(where, fields, {}, image, video))
-        read, notes = read_views(FrameFile(path, {}, tuple(frames)))
-        views[camera.name], more = tuple(read.values()), []
+            frames.append(FrameEntry(where, fields, image=image, video=video))
+        read, notes = read_views(FrameFile(path, frames))
+        views[camera.name] = tuple(read.values())
         if camera.video is not None:
             views[camera.name], more = _at_video_size(camera.name, camera.video.info, views[camera.name], where)
-        warnings += [*notes, *more]
+            notes += more
+        warnings += notes
     return views, warnings
 
 
 def video_fps(cameras: Sequence[CameraSource]) -> float | None:
     """Return the frame rate of the first video that has one, None if none has."""
-    rates = (camera.video.info.fps for camera in cameras if camera.video is not None)
-    return next((fps for fps in rates if fps > 0), None)
+    return next((camera.video.info.fps for camera in cameras if camera.video and camera.video.info.fps > 0), None)
 
 
 def _at_video_size(
@@ -135,11 +124,7 @@ def _at_video_size(
 
 
 def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
-    videos = [
-        (camera.name, camera.video.info.fps)
-        for camera in cameras
-        if camera.video is not None and camera.video.info.fps > 0
-    ]
+    videos = [(x.name, x.video.info.fps) for x in cameras if x.video is not None and x.video.info.fps > 0]
     odd = [(name, fps) for name, fps in videos if not math.isclose(fps, videos[0][1], rel_tol=0.01)]
     if not odd:
         return []
@@ -148,12 +133,6 @@ def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
         f"{first[0]} has {first[1]:g} frames per second, {name} {fps:g}: frames of one number are taken for "
         "simultaneous; convert the videos to one rate"
     ]
-
-
-def _images(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
 
 
 CALIBRATION = "cameras.json"
@@ -229,10 +208,14 @@ def _splits(path: Path, test: object, views: dict[str, tuple[View, ...]]) -> tup
     unknown = sorted(set(test) - views.keys())
     if unknown:
         raise DyngsError(f"{path}: 'test' names {first_few(unknown)}, but the cameras are {first_few(sorted(views))}")
+    return _held_out(views, test), notes
+
+
+def _held_out(views: dict[str, tuple[View, ...]], test: Sequence[str]) -> Splits:
     return {
         "train": tuple(view for name, kept in views.items() if name not in test for view in kept),
         "test": tuple(view for name, kept in views.items() if name in test for view in kept),
-    }, notes
+    }
 
 
 FORMAT = CaptureFormat("camera_folders", CALIBRATION, lambda root: (root / CALIBRATION).is_file(), read_camera_folders)
@@ -270,7 +253,8 @@ def read_llff(root: Path) -> Capture:
     numbers = [int(digits) for name in names for digits in re.findall(r"\d+$", name)]
     if numbers != sorted(numbers):
         notes.append(f"{path.name}: its rows are matched with cameras in the order {', '.join(names[:4])}, .. by name")
-    return Capture(root, "llff", _llff_splits(views, names), fps=video_fps(cameras), warnings=tuple(notes))
+    splits = _held_out(views, names[:1] if len(names) > 1 else [])
+    return Capture(root, "llff", splits, fps=video_fps(cameras), warnings=tuple(notes))
 
 
 def _read_rows(path: Path) -> np.ndarray:
@@ -295,15 +279,6 @@ def _llff_calibration(row: np.ndarray) -> dict[str, object]:
         "w": float(width),
         "h": float(height),
         "transform_matrix": (world_from_cam @ OPENGL_FROM_OPENCV).tolist(),
-    }
-
-
-def _llff_splits(views: dict[str, tuple[View, ...]], names: list[str]) -> Splits:
-    """Hold out the first camera for testing if there is another one to train on."""
-    test = names[:1] if len(names) > 1 else []
-    return {
-        "train": tuple(view for name in names[len(test) :] for view in views[name]),
-        "test": tuple(view for name in test for view in views[name]),
     }
 
 

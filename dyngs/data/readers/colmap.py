@@ -5,7 +5,8 @@ pycolmap trusts the counts in binary files: a truncated file can hang or abort t
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -37,18 +38,11 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 _EXTENSIONS = (".bin", ".txt")
 # Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as OpenCV does.
 _LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
-    "SIMPLE_PINHOLE": (1, "none"),
-    "PINHOLE": (2, "none"),
-    "SIMPLE_RADIAL": (1, "opencv"),
-    "RADIAL": (1, "opencv"),
-    "OPENCV": (2, "opencv"),
-    "FULL_OPENCV": (2, "opencv"),
-    "SIMPLE_FISHEYE": (1, "fisheye"),
-    "FISHEYE": (2, "fisheye"),
-    "SIMPLE_RADIAL_FISHEYE": (1, "fisheye"),
-    "RADIAL_FISHEYE": (1, "fisheye"),
-    "OPENCV_FISHEYE": (2, "fisheye"),
-}
+    "SIMPLE_PINHOLE": (1, "none"), "PINHOLE": (2, "none"),
+    "SIMPLE_RADIAL": (1, "opencv"), "RADIAL": (1, "opencv"), "OPENCV": (2, "opencv"), "FULL_OPENCV": (2, "opencv"),
+    "SIMPLE_FISHEYE": (1, "fisheye"), "FISHEYE": (2, "fisheye"), "SIMPLE_RADIAL_FISHEYE": (1, "fisheye"),
+    "RADIAL_FISHEYE": (1, "fisheye"), "OPENCV_FISHEYE": (2, "fisheye"),
+}  # fmt: skip
 
 
 def find_model(root: Path) -> Path | None:
@@ -97,33 +91,20 @@ def read_colmap(root: Path) -> Capture:
         intrinsics, size, changed = match_size(intrinsics, (camera.width, camera.height), stored, where)
         if changed:
             rescaled.append(where)
-        name, mask = view_name(path, root / "images"), mask_of(image.name, masks)
-        second = seconds.get(image.name)
+        view = View(view_name(path, root / "images"), path, pose, intrinsics, *size, lens, int(image.camera_id))
         exposure = None if header is None else header.tags.exposure
-        views.append(
-            View(
-                name, path, pose, intrinsics, *size, lens, int(image.camera_id), mask_path=mask, time=second,
-                exposure=exposure,
-            )
-        )  # fmt: skip
+        mask, second = mask_of(image.name, masks), seconds.get(image.name)
+        views.append(replace(view, mask_path=mask, time=second, exposure=exposure))
     warnings = repair_warning(repaired) + rescale_warning(rescaled) + _warnings(folder, model, views, bool(masks))
     splits, notes = _splits(folder, [image.name for image in posed], views)
-    return Capture(
-        root,
-        "colmap",
-        splits,
-        _points(model),
-        in_seconds=bool(seconds),
-        warnings=(*warnings, *notes),
-    )
+    points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
+    cloud = PointCloud(np.array([p.xyz for p in points]), np.array([p.color for p in points], np.uint8))
+    lines = (*warnings, *notes)
+    return Capture(root, "colmap", splits, cloud if points else None, in_seconds=bool(seconds), warnings=lines)
 
 
 def pinhole_and_lens(camera: pycolmap.Camera, where: str) -> tuple[np.ndarray, Lens]:
-    """Return the (3, 3) matrix and the lens distortion of a COLMAP camera.
-
-    Raises:
-        DyngsError: the camera model is not one that OpenCV's formulas express, or a parameter is not usable.
-    """
+    """Return the (3, 3) matrix and the lens of a COLMAP camera, whose model OpenCV's formulas must express."""
     model = camera.model.name
     values = tuple(float(value) for value in camera.params)
     if model not in _LENSES:
@@ -162,13 +143,13 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     with reading(path, "it must list names of images, a line each; repair or remove it"):
         text = inside(path).read_bytes()[:MAX_LIST_BYTES].decode()
     listed = {line.strip() for line in text.splitlines() if line.strip()}
-    test = tuple(view for name, view in zip(names, views, strict=True) if name in listed)
     unknown = sorted(listed - set(names))
     notes = [f"{path}: {len(unknown)} listed images have no pose, first {unknown[0]:.80}"] if unknown else []
-    if not test:
-        return {"train": tuple(views)}, notes
-    train = tuple(view for name, view in zip(names, views, strict=True) if name not in listed)
-    return {"train": train, "test": test}, notes
+    train, test = (
+        tuple(view for name, view in zip(names, views, strict=True) if (name in listed) == wanted)
+        for wanted in (False, True)
+    )
+    return ({"train": train, "test": test} if test else {"train": train}), notes
 
 
 def find_masks(folder: Path) -> dict[str, Path]:
@@ -186,14 +167,6 @@ def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
     """Find the mask of ``a/b.jpg``: ``a/b.jpg.png``, else ``a/b.jpg``, else ``a/b`` with any image extension."""
     stem = image_name.rpartition(".")[0]
     return masks.get(f"{image_name}.png") or masks.get(image_name) or masks.get(stem)
-
-
-def _points(model: pycolmap.Reconstruction) -> PointCloud | None:
-    """Points in the order of their ids, None where there are none."""
-    points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
-    if not points:
-        return None
-    return PointCloud(np.array([p.xyz for p in points]), np.array([p.color for p in points], dtype=np.uint8))
 
 
 def _warnings(folder: Path, model: pycolmap.Reconstruction, views: list[View], has_masks: bool) -> list[str]:
@@ -214,34 +187,13 @@ FORMAT = CaptureFormat("colmap", f"cameras.bin or cameras.txt in {', '.join(MODE
 # Number of parameters by camera model id, in COLMAP's numbering.
 _NUM_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 _TEXT_FIELDS = {"cameras": 5, "images": 10, "points3D": 8}
-
-
-class _Bytes:
-    """Bytes of a file with a read position; running out of bytes is an error that names the file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.data = path.read_bytes()
-        self.at = 0
-
-    def take(self, layout: struct.Struct) -> tuple[int, ...]:
-        begin = self.at
-        self.skip(layout.size)
-        return layout.unpack_from(self.data, begin)
-
-    def skip(self, size: int) -> None:
-        self.at += size
-        if self.at > len(self.data):
-            self.fail()
-
-    def skip_string(self) -> None:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            self.fail()
-        self.at = end + 1
-
-    def fail(self) -> None:
-        raise DyngsError(f"{self.path}: the COLMAP file is truncated ({len(self.data)} bytes); copy or export it again")
+_POSE_BYTES = 7 * 8
+_RECORDS = {
+    "images": (4 + _POSE_BYTES + 4, "<Q", 24),
+    "points3D": (8 + 3 * 8 + 3 + 8, "<Q", 8),
+    "frames": (8 + _POSE_BYTES, "<I", 16),
+}
+"""Bytes of a record, then of images a name, then a count and the bytes of each item that it counts."""
 
 
 def check_model_file(path: Path) -> None:
@@ -255,85 +207,63 @@ def check_model_file(path: Path) -> None:
     if path.suffix == ".txt":
         _check_text(path)
         return
-    source = _Bytes(path)
-    for _ in range(source.take(_COUNT)[0]):
-        {"cameras": _skip_camera, "rigs": _skip_rig}.get(path.stem, _skip_record)(source)
-    if source.at != len(source.data):
-        extra = len(source.data) - source.at
+    data = path.read_bytes()
+    try:
+        extra = len(data) - _end_of_records(path, data)
+    except (struct.error, ValueError, OverflowError):
+        extra = -1
+    if extra < 0:
+        raise DyngsError(f"{path}: the COLMAP file is truncated ({len(data)} bytes); copy or export it again")
+    if extra:
         raise DyngsError(f"{path}: {extra} bytes follow the end of the COLMAP file; copy or export it again")
 
 
-_COUNT = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")
-_RIG = struct.Struct("<II")
-_SENSOR = struct.Struct("<iIB")
-_SENSORS = struct.Struct("<I")
-_POSE_BYTES = 7 * 8
-_RECORDS = {
-    "images": (4 + _POSE_BYTES + 4, _COUNT, 24),
-    "points3D": (8 + 3 * 8 + 3 + 8, _COUNT, 8),
-    "frames": (8 + _POSE_BYTES, _SENSORS, 16),
-}
-"""Bytes of a record, then of images a name, then a count and the bytes of each item that it counts."""
-
-
-def _skip_camera(source: _Bytes) -> None:
-    camera, model, _, _ = source.take(_CAMERA)
-    if not 0 <= model < len(_NUM_PARAMS):
-        raise DyngsError(f"{source.path}: camera {camera} has the unknown model id {model}; undistort with COLMAP")
-    source.skip(8 * _NUM_PARAMS[model])
-
-
-def _skip_rig(source: _Bytes) -> None:
-    _, sensors = source.take(_RIG)
-    source.skip(8 if sensors else 0)
-    for _ in range(sensors - 1):
-        has_pose = source.take(_SENSOR)[2]
-        source.skip(_POSE_BYTES if has_pose else 0)
-
-
-def _skip_record(source: _Bytes) -> None:
-    size, count, item_size = _RECORDS[source.path.stem]
-    source.skip(size)
-    if source.path.stem == "images":
-        source.skip_string()
-    source.skip(item_size * source.take(count)[0])
+def _end_of_records(path: Path, data: bytes) -> int:
+    """Return where the records end; raises an error where the bytes do before."""
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        if path.stem == "cameras":
+            camera, model, _, _ = struct.unpack_from("<IiQQ", data, at)
+            if not 0 <= model < len(_NUM_PARAMS):
+                raise DyngsError(f"{path}: camera {camera} has the unknown model id {model}; undistort with COLMAP")
+            at += 24 + 8 * _NUM_PARAMS[model]
+        elif path.stem == "rigs":
+            _, sensors = struct.unpack_from("<II", data, at)
+            at += 16 if sensors else 8
+            for _ in range(sensors - 1):
+                has_pose = struct.unpack_from("<iIB", data, at)[2]
+                at += 9 + (_POSE_BYTES if has_pose else 0)
+        else:
+            size, layout, item_size = _RECORDS[path.stem]
+            at += size
+            if path.stem == "images":
+                at = data.index(b"\0", at) + 1
+            at += struct.calcsize(layout) + item_size * struct.unpack_from(layout, data, at)[0]
+    return at
 
 
 def _check_text(path: Path) -> None:
-    """Check that there are as many entries as the header says, if it does, and that each has all its fields."""
+    """Check that there are as many entries as the header says, if it does, and that each has all its fields.
+
+    The header: ``# Number of images: N, mean ...``. In images.txt each entry has a second line, perhaps empty.
+    """
     if path.stem not in _TEXT_FIELDS:
         return
-    announced, entries = None, 0
-    for number, line in _entry_lines(path):
-        if line.startswith("#"):
-            announced = _announced_count(line) if announced is None else announced
-            continue
-        entries += 1
-        if len(line.split()) < _TEXT_FIELDS[path.stem]:
-            raise DyngsError(f"{path}, line {number}: the line is truncated; copy or export the file again")
-    if announced is not None and entries < announced:
-        raise DyngsError(f"{path}: truncated, holds {entries} of {announced} entries; copy or export the file again")
-
-
-def _entry_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield numbered comments and first lines of entries; in images.txt each entry has a second line, perhaps empty."""
+    announced, entries, skip_next = None, 0, False
     try:
         with path.open(encoding="utf-8") as file:
-            skip_next = False
-            for number, line in enumerate(file, start=1):
-                line = line.strip()
-                if skip_next:
+            for number, line in enumerate(map(str.strip, file), start=1):
+                if skip_next or not line:
                     skip_next = False
-                elif line:
-                    skip_next = path.stem == "images" and not line.startswith("#")
-                    yield number, line
+                elif line.startswith("#"):
+                    digits = line.partition(":")[2].strip().split(",")[0].strip()
+                    if announced is None and "Number of" in line.partition(":")[0] and digits.isdigit():
+                        announced = int(digits)
+                else:
+                    entries, skip_next = entries + 1, path.stem == "images"
+                    if len(line.split()) < _TEXT_FIELDS[path.stem]:
+                        raise DyngsError(f"{path}, line {number}: the line is truncated; copy or export the file again")
     except (OSError, UnicodeDecodeError) as error:
         raise DyngsError(f"{path}: cannot be read ({error})") from None
-
-
-def _announced_count(comment: str) -> int | None:
-    """Return N of a comment like ``# Number of images: N, mean ...``."""
-    head, _, tail = comment.partition(":")
-    digits = tail.strip().split(",")[0].strip()
-    return int(digits) if "Number of" in head and digits.isdigit() else None
+    if announced is not None and entries < announced:
+        raise DyngsError(f"{path}: truncated, holds {entries} of {announced} entries; copy or export the file again")

@@ -58,15 +58,13 @@ def read_nerfies(root: Path) -> Capture:
     frames = []
     for name in used:
         own = _camera(root / "camera" / f"{name}.json", scene, images, name, skewed)
-        camera = metadata[name].get("camera_id")
-        frames.append(
-            FrameEntry(str(root / "camera" / f"{name}.json"), {**own, "time": times.get(name), "camera": camera}, {})
-        )
-    read, warnings = read_views(FrameFile(root / "dataset.json", {}, tuple(frames)))
-    views = {
-        name: replace(view, name=name, frame=_frame(metadata[name]))
-        for name, view in zip(used, read.values(), strict=True)
-    }
+        own |= {"time": times.get(name), "camera": metadata[name].get("camera_id")}
+        frames.append(FrameEntry(str(root / "camera" / f"{name}.json"), own))
+    read, warnings = read_views(FrameFile(root / "dataset.json", frames))
+    views = {}
+    for name, view in zip(used, read.values(), strict=True):
+        number = _warp_id(metadata[name])
+        views[name] = replace(view, name=name, frame=int(number) if is_number(number) else None)
     if skewed:
         warnings.append(f"{len(skewed)} cameras have skew, which is ignored; first {skewed[0]}")
     splits: Splits = {"train": tuple(views[name] for name in train)}
@@ -77,14 +75,13 @@ def read_nerfies(root: Path) -> Capture:
 
 def _ids(root: Path, dataset: dict[str, object], key: str) -> list[str]:
     value = dataset.get(key, [])
-    if not isinstance(value, list) or not all(isinstance(item, str) and _is_plain(item) for item in value):
+    # names of files, without folders
+    plain = isinstance(value, list) and all(
+        isinstance(x, str) and x not in ("", ".", "..") and not set(x) & {"/", "\\"} for x in value
+    )
+    if not isinstance(value, list) or not plain:
         raise DyngsError(f"{root / 'dataset.json'}: '{key}' must be a list of image names")
     return list(dict.fromkeys(value))
-
-
-def _is_plain(name: str) -> bool:
-    """Whether it is the name of a file, without folders."""
-    return bool(name) and not set(name) & {"/", "\\"} and name not in (".", "..")
 
 
 def _metadata(root: Path, names: list[str]) -> dict[str, dict[str, object]]:
@@ -103,7 +100,7 @@ def _times(root: Path, metadata: dict[str, dict[str, object]]) -> dict[str, floa
     """Time of each image that has one: its number divided by the largest number."""
     numbers: dict[str, int] = {}
     for name, own in metadata.items():
-        value = own.get("warp_id", own.get("time_id"))
+        value = _warp_id(own)
         if value is None:
             continue
         if not is_number(value) or value % 1 or value < 0:
@@ -115,13 +112,12 @@ def _times(root: Path, metadata: dict[str, dict[str, object]]) -> dict[str, floa
     return {name: number / max(last, 1) for name, number in numbers.items()}
 
 
-def _frame(own: dict[str, object]) -> int | None:
-    value = own.get("warp_id", own.get("time_id"))
-    return int(value) if is_number(value) else None
+def _warp_id(own: dict[str, object]) -> object:
+    return own.get("warp_id", own.get("time_id"))
 
 
 def _numbers(path: Path, fields: dict[str, object], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the finite float64 numbers at ``key`` of exactly the given shape."""
+    """Return the finite float64 numbers at ``key`` of exactly this shape."""
     try:
         value = np.array(fields[key], dtype=np.float64)
     except KeyError:

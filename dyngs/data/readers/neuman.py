@@ -10,9 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Split, Splits, View
+from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
 from dyngs.data.geometry import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
+from dyngs.data.readers.transforms import SPLITS
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import entry, first_few, numbers_of
@@ -92,7 +93,6 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
 
 
 def _per_image(path: Path, key: str, value: object, count: int) -> np.ndarray:
-    """Return ``value`` as (count, width), one row per posed image."""
     rows = len(value) if isinstance(value, np.ndarray) and value.ndim else 0
     if rows != count or not isinstance(value, np.ndarray):
         raise DyngsError(
@@ -112,8 +112,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
     """Splits by the lists of names, all views for training where there are none; and warnings."""
     splits: Splits = {}
     unposed: list[str] = []
-    names: tuple[Split, ...] = ("train", "val", "test")
-    for split in names:
+    for split in SPLITS:
         path = root / f"{split}_split.txt"
         if not path.is_file():
             continue

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette
 from dyngs.data.geometry import opengl_from_cam
+from dyngs.data.images.images import files_in
 from dyngs.data.images.maps import MASKS
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.readers.camera_folders import open_camera, sequence_views, video_fps
@@ -53,13 +54,13 @@ def read_people_snapshot(root: Path) -> Capture:
     lost = len(camera.images) - len(images)
     if lost:
         warnings.append(f"{video.name}: {lost} of {len(camera.images)} frames lack a mask or a pose and are left out")
-    capture = Capture(root, "people_snapshot", {"train": people}, fps=video_fps([camera]), warnings=tuple(warnings))
-    return capture.replace(body=of_one_clip(body))
+    own, fps, lines = of_one_clip(body), video_fps([camera]), tuple(warnings)
+    return Capture(root, "people_snapshot", {"train": people}, fps=fps, body=own, warnings=lines)
 
 
 def _video(root: Path) -> Path:
     """Find the only video of the folder, or the one named like the folder."""
-    found = sorted(p for p in root.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and not p.name.startswith("."))
+    found = files_in(root, VIDEO_SUFFIXES)
     named = [path for path in found if path.stem == root.resolve().name] or found
     if len(named) != 1:
         what = f"{len(found)} videos" if found else "no video"
@@ -70,26 +71,24 @@ def _video(root: Path) -> Path:
 def _calibration(path: Path) -> dict[str, object]:
     """Return the camera as the fields of a frame in a transforms file."""
     fields = read_pickle(inside(path))
-    fx, fy = numbers_of(f"{path}: 'camera_f'", entry(path, fields, "camera_f"), (2,)).tolist()
-    cx, cy = numbers_of(f"{path}: 'camera_c'", entry(path, fields, "camera_c"), (2,)).tolist()
-    lens = numbers_of(f"{path}: 'camera_k'", entry(path, fields, "camera_k"), (5,)).tolist()
+
+    def numbers(key: str, count: int) -> np.ndarray:
+        return numbers_of(f"{path}: '{key}'", entry(path, fields, key), (count,))
+
     pose = np.eye(4)
-    turn = numbers_of(f"{path}: 'camera_rt'", entry(path, fields, "camera_rt"), (3,))
-    pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    pose[:3, 3] = numbers_of(f"{path}: 'camera_t'", entry(path, fields, "camera_t"), (3,))
-    size = {
-        name: float(numbers_of(f"{path}: '{key}'", entry(path, fields, key), (1,))[0])
-        for name, key in (("w", "width"), ("h", "height"))
-    }
-    return {
-        **size,
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
-        **dict(zip(("k1", "k2", "p1", "p2", "k3"), lens, strict=True)),
-        "transform_matrix": opengl_from_cam(pose).tolist(),
-    }
+    pose[:3, :3] = Rotation.from_rotvec(numbers("camera_rt", 3)).as_matrix()
+    pose[:3, 3] = numbers("camera_t", 3)
+    values = np.concatenate(
+        [
+            numbers("camera_f", 2),
+            numbers("camera_c", 2),
+            numbers("camera_k", 5),
+            numbers("width", 1),
+            numbers("height", 1),
+        ]
+    )
+    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "w", "h")
+    return {**dict(zip(keys, values.tolist(), strict=True)), "transform_matrix": opengl_from_cam(pose).tolist()}
 
 
 def _body(path: Path) -> BodyFrames:

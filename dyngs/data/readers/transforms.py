@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from dyngs.data.capture import Lens, PointCloud, VideoFrame, View
+from dyngs.data.capture import Lens, PointCloud, Split, VideoFrame, View
 from dyngs.data.geometry import (
     MAX_SIDE,
     cam_from_opengl,
@@ -27,6 +28,7 @@ from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import inside
 from dyngs.files.fields import is_number, matrix_of, read_json_object
 
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
 MAX_FPS = 1e6
 """Higher frame rates are taken for mistakes."""
 _LARGEST = 1e300
@@ -36,19 +38,17 @@ _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One entry of ``frames``; keys that it lacks are looked up at the file's top level.
+    """One entry of ``frames``: its ``own`` fields; keys that it lacks are looked up in those of the file, ``shared``.
 
     Attributes:
         where: file and index, for messages.
-        own: the frame's fields.
-        shared: the file's fields.
         image: the image if ``file_path`` does not name it.
         video: the video frame that the image is decoded from, if any.
     """
 
     where: str
     own: dict[str, object]
-    shared: dict[str, object]
+    shared: Mapping[str, object] = field(default_factory=dict)
     image: Path | None = None
     video: VideoFrame | None = None
 
@@ -73,19 +73,17 @@ class FrameEntry:
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A parsed transforms file: its path, all its fields, and its frames."""
+    """A transforms file: its path, its frames, and all its fields."""
 
     path: Path
-    fields: dict[str, object]
-    frames: tuple[FrameEntry, ...]
+    frames: Sequence[FrameEntry]
+    fields: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def fps(self) -> float | None:
         """Frames per second as the file says, None where it does not."""
         fps = self.fields.get("fps")
-        if not is_number(fps) or not 0 < fps < MAX_FPS:
-            return None
-        return float(fps)
+        return float(fps) if is_number(fps) and 0 < fps < MAX_FPS else None
 
 
 def read_frame_file(path: Path) -> FrameFile:
@@ -103,7 +101,7 @@ def read_frame_file(path: Path) -> FrameFile:
         if isinstance(own.get("file_path"), str):
             where += f" ({own['file_path']:.200})"
         frames.append(FrameEntry(where, own, fields))
-    return FrameFile(path, fields, tuple(frames))
+    return FrameFile(path, frames, fields)
 
 
 def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
@@ -126,11 +124,9 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     rescaled: list[str] = []
     views = {}
     for frame, path, header in zip(file.frames, paths, headers, strict=True):
-        described = _described_size(frame)
-        stored = header.size_for(described) if header else None
-        view, repaired[frame.where], is_rescaled = _view(frame, root, path, stored, common)
+        view, repaired[frame.where], is_rescaled = _view(frame, root, path, header, common)
         rescaled += [frame.where] if is_rescaled else []
-        views[str(frame.own["file_path"])] = replace(view, exposure=header.tags.exposure if header else None)
+        views[str(frame.own["file_path"])] = view
     return _with_flow_targets(views), repair_warning(repaired) + rescale_warning(rescaled)
 
 
@@ -149,14 +145,19 @@ def view_name(path: Path, root: Path) -> str:
 
 
 def _view(
-    frame: FrameEntry, root: Path, path: Path, stored: tuple[int, int] | None, common: tuple[int, int] | None
+    frame: FrameEntry, root: Path, path: Path, header: ImageHeader | None, common: tuple[int, int] | None
 ) -> tuple[View, float, bool]:
     """Return a view, by how much its rotation was repaired, and whether its intrinsics were rescaled."""
-    described = _described_size(frame) or stored or common
+    described = _described_size(frame)
+    stored = header.size_for(described) if header else None
+    described = described or stored or common
     if described is None:
         described = read_header(path).upright_size  # raises the error
     intrinsics, size, rescaled = match_size(_intrinsics(frame, *described), described, stored, frame.where)
-    pose, error = checked_pose(_matrix(frame), frame.where)
+    if frame.own.get("transform_matrix") is None:
+        raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
+    matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
+    pose, error = checked_pose(matrix, frame.where)
     masks = [_named_file(root, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
     camera = frame.integer("camera")
     view = View(
@@ -176,6 +177,7 @@ def _view(
         motion_mask_path=masks[0] or masks[1],
         motion_mask_labels=masks[0] is None and masks[1] is not None,
         flow_path=_named_file(root, frame, "flow_file_path"),
+        exposure=header.tags.exposure if header else None,
     )
     return view, error, rescaled
 
@@ -266,7 +268,7 @@ def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
     )
 
 
-def _focal(source: dict[str, object], axis: str, size: int, where: str) -> float | None:
+def _focal(source: Mapping[str, object], axis: str, size: int, where: str) -> float | None:
     """Focal length in pixels along one axis, None where the source does not give it."""
     focal = _number(source.get(f"fl_{axis}"), f"fl_{axis}", where)
     # An angle beside an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
@@ -301,29 +303,13 @@ def _lens(frame: FrameEntry) -> Lens:
     return Lens("opencv", params) if any(params) else Lens()
 
 
-def _matrix(frame: FrameEntry) -> np.ndarray:
-    value = frame.own.get("transform_matrix")
-    if value is None:
-        raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
-    return matrix_of(frame.where, "transform_matrix", value)
-
-
 USUAL_NAMES = ("points3d.ply", "points3D.ply", "fused.ply", "points.ply")
 """Names that 4DGaussians, COLMAP and nerfstudio give to first points, in the order in which they are looked for."""
 KEY = "ply_file_path"
 
 
-@dataclass(frozen=True)
-class FoundPoints:
-    """Points next to a transforms file: the file that they are from, and warnings; None where there are none."""
-
-    points: PointCloud | None = None
-    path: Path | None = None
-    warnings: tuple[str, ...] = ()
-
-
-def find_points(file: FrameFile) -> FoundPoints:
-    """Return the points that belong to a transforms file.
+def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[str]]:
+    """Return the points that belong to a transforms file, the file that they are from, and warnings.
 
     Those of its key ``ply_file_path``; else of the first of ``USUAL_NAMES`` that is in its folder; else of the only
     ``.ply`` there. A file that is named nowhere and cannot be read is left out, with a warning.
@@ -334,22 +320,17 @@ def find_points(file: FrameFile) -> FoundPoints:
     root, written = file.path.parent, file.fields.get(KEY)
     if isinstance(written, str) and written:
         path = inside(root / written)
-        return FoundPoints(read_points(path), path)
+        return read_points(path), path, []
     usual = [root / name for name in USUAL_NAMES if (root / name).is_file()]
-    path = usual[0] if usual else _only_ply(root)
-    if path is None:
-        return FoundPoints()
+    there = [path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file()]
+    if not usual and len(there) != 1:
+        return None, None, []
+    path = (usual or there)[0]
     try:
         points = read_points(inside(path))
     except DyngsError as error:
-        return FoundPoints(warnings=(f"not used as points: {error}",))
-    return FoundPoints(points, path) if len(points.xyz) else FoundPoints()
-
-
-def _only_ply(root: Path) -> Path | None:
-    """Return the only file of the folder that ends in .ply, None where there are none or several."""
-    found = [path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file()]
-    return found[0] if len(found) == 1 else None
+        return None, None, [f"not used as points: {error}"]
+    return (points, path, []) if len(points.xyz) else (None, None, [])
 
 
 def read_points(path: Path) -> PointCloud:

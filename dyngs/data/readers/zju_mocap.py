@@ -30,15 +30,7 @@ _NUM_JOINTS = 24
 
 @dataclass(frozen=True)
 class _Shot:
-    """One image of one camera.
-
-    Attributes:
-        file: path below the capture's folder, with or without extension.
-        camera: camera index.
-        frame: frame number.
-        calibration: fields of a frame in a transforms file.
-        where: file and entry of the calibration, for messages.
-    """
+    """One image, ``file`` below the capture's folder, of a camera calibrated by fields of a transforms file."""
 
     file: str
     camera: int
@@ -78,7 +70,7 @@ def read_zju_mocap(root: Path) -> Capture:
     if without:
         warnings.append(f"{len(without)} images have no mask in {' or '.join(folders)}, first {without[0]}")
     splits, notes = _splits(people)
-    return Capture(root, "zju_mocap", splits, warnings=(*warnings, *notes)).replace(body=of_one_clip(body))
+    return Capture(root, "zju_mocap", splits, body=of_one_clip(body), warnings=(*warnings, *notes))
 
 
 def _annotated_shots(path: Path) -> list[_Shot]:
@@ -135,8 +127,7 @@ def _params_per_file(root: Path, frames: Iterable[int]) -> tuple[Path, BodyFrame
         )
     paths = [folder / f"{number}.npy" for number in numbers]
     files = [(str(path), read_pickled_array(inside(path))) for path in paths]
-    poses, trans, turns = (_column(files, key, width) for key, width in (("poses", None), ("Th", 3), ("Rh", 3)))
-    return folder, body_frames(folder, numbers, poses, trans, _column(files, "shapes"), turns=turns)
+    return folder, _body(folder, numbers, files, _column(files, "shapes"))
 
 
 def _mesh_infos(path: Path) -> BodyFrames:
@@ -145,14 +136,17 @@ def _mesh_infos(path: Path) -> BodyFrames:
     infos = [(f"{path}, {name}", own) for name, own in by_name.items()]
     key = next((key for key in ("betas", "shapes") if all(key in own for _, own in infos)), None)
     betas = np.zeros(10) if key is None else _column(infos, key)
-    poses, trans, turns = (_column(infos, key, width) for key, width in (("poses", None), ("Th", 3), ("Rh", 3)))
-    pelvis = np.mean(_column(infos, "tpose_joints", 3 * _NUM_JOINTS), axis=0)[:3]
-    numbers = [_frame_number(path, name) for name in by_name]
-    return body_frames(path, numbers, poses, trans, betas, turns=turns, pelvis=pelvis)
+    body = _body(path, [_frame_number(path, name) for name in by_name], infos, betas)
+    return replace(body, pelvis=np.mean(_column(infos, "tpose_joints", 3 * _NUM_JOINTS), axis=0)[:3])
+
+
+def _body(path: Path, numbers: list[int], rows: Sequence[tuple[str, object]], betas: object) -> BodyFrames:
+    poses, trans, turns = _column(rows, "poses"), _column(rows, "Th", 3), _column(rows, "Rh", 3)
+    return body_frames(path, numbers, poses, trans, betas, turns=turns)
 
 
 def _column(rows: Iterable[tuple[str, object]], key: str, width: int | None = None) -> list[np.ndarray]:
-    """Finite numbers at ``key`` of each of the named dictionaries, ``width`` of them if given."""
+    """Finite numbers at ``key`` of each of the named dictionaries, ``width`` of them unless that is None."""
     shape = None if width is None else (width,)
     return [numbers_of(f"{where}: '{key}'", entry(where, own, key), shape) for where, own in rows]
 
@@ -181,11 +175,10 @@ def _views(path: Path, shots: Sequence[_Shot]) -> tuple[list[View], list[str]]:
     first, last = min(shot.frame for shot in shots), max(shot.frame for shot in shots)
     frames = []
     for shot in shots:
-        times = {"frame": shot.frame, "time": (shot.frame - first) / max(last - first, 1)}
-        frames.append(
-            FrameEntry(shot.where, {**shot.calibration, **times, "file_path": shot.file, "camera": shot.camera}, {})
-        )
-    views, warnings = read_views(FrameFile(path, {}, tuple(frames)))
+        own = {"file_path": shot.file, "camera": shot.camera, "frame": shot.frame}
+        own["time"] = (shot.frame - first) / max(last - first, 1)
+        frames.append(FrameEntry(shot.where, shot.calibration | own))
+    views, warnings = read_views(FrameFile(path, frames))
     return list(views.values()), warnings
 
 

@@ -125,7 +125,7 @@ def write_ply(path: Path, count: int) -> Path:
 
 
 def names_file(root: Path, named: str | None = None) -> FrameFile:
-    return FrameFile(root / "transforms.json", {} if named is None else {"ply_file_path": named}, ())
+    return FrameFile(root / "transforms.json", (), {} if named is None else {"ply_file_path": named})
 
 
 @pytest.mark.parametrize(
@@ -144,32 +144,32 @@ def test_which_file_is_read(tmp_path: Path, files: list[str], named: str | None,
     """The key wins, then the usual names in their order, then an only file."""
     for count, name in enumerate(files, 1):
         write_ply(tmp_path / name, count)
-    found = find_points(names_file(tmp_path, named))
-    assert found.warnings == ()
+    points, path, warnings = find_points(names_file(tmp_path, named))
+    assert warnings == []
     if read is None:
-        assert (found.points, found.path) == (None, None)
+        assert (points, path) == (None, None)
         return
-    assert found.points is not None
-    assert (found.path, len(found.points.xyz)) == (tmp_path / read, 1 + files.index(read))
-    np.testing.assert_array_equal(found.points.rgb, np.full_like(found.points.rgb, 128))
+    assert points is not None
+    assert (path, len(points.xyz)) == (tmp_path / read, 1 + files.index(read))
+    np.testing.assert_array_equal(points.rgb, np.full_like(points.rgb, 128))
 
 
 def test_a_named_file_must_be_there_and_a_found_one_may_be_broken(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"gone\.ply: no such point file"):
         find_points(names_file(tmp_path, "gone.ply"))
     (tmp_path / "points3d.ply").write_bytes(b"no points")
-    found = find_points(names_file(tmp_path))
-    assert found.points is None
-    assert "points3d.ply: cannot be read" in found.warnings[0]
+    points, _, warnings = find_points(names_file(tmp_path))
+    assert points is None
+    assert "points3d.ply: cannot be read" in warnings[0]
 
 
 def test_a_link_that_leads_out_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "capture").mkdir()
     (tmp_path / "capture" / "points3d.ply").symlink_to(write_ply(tmp_path / "own.ply", 3))
     with staying_within(tmp_path / "capture"):
-        found = find_points(names_file(tmp_path / "capture"))
-    assert found.points is None
-    assert "points3d.ply" in found.warnings[0]
+        points, _, warnings = find_points(names_file(tmp_path / "capture"))
+    assert points is None
+    assert "points3d.ply" in warnings[0]
 
 
 def test_both_json_formats_read_them(blender_root: Path, nerfstudio_root: Path) -> None:
