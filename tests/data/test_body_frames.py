@@ -93,13 +93,11 @@ def test_nothing_to_turn_leaves_everything_and_moves_with_the_cameras() -> None:
 
 def test_rows_in_any_order_and_shape() -> None:
     poses, trans = np.arange(3 * 165.0).reshape(3, 1, 165), np.arange(9.0).reshape(3, 1, 3)
-    body = body_frames(FILE, [7, 2, 5], poses, trans, np.ones((3, 10)) * [[0], [1], [2]], 2.0, pelvis=[[1, 2, 3]])
+    body = body_frames(FILE, [7, 2, 5], poses, trans, np.ones((3, 10)) * [[0], [1], [2]], 2.0)
     assert (body.frames, body.kind, body.betas.tolist(), body.scale.tolist()) == ((2, 5, 7), "smplx", [1] * 10, [2] * 3)
     assert body.poses.shape == (3, 55, 3)
     assert body.poses[:, 0, 0].tolist() == [165, 330, 0]
     assert body.trans[:, 0].tolist() == [3, 6, 0]
-    assert body.pelvis is not None
-    assert body.pelvis.tolist() == [1, 2, 3]
     kinds = [body_frames(FILE, [0], np.zeros((1, w)), [[0, 0, 0]], [0.0]).kind for w in (72, 156, 165)]
     assert kinds == ["smpl", "smplh", "smplx"]
 
@@ -136,7 +134,6 @@ GOOD: dict[str, Any] = {
         ({"scale": "big"}, "'scale' must hold as many numbers"),
         ({"scale": np.ones(3)}, "'scale' has 3 rows"),
         ({"turns": np.zeros((4, 4))}, "'turns' has 4 numbers per frame instead of 3"),
-        ({"pelvis": [0, 1]}, "'pelvis' must hold 3 finite numbers"),
         ({"frames": [0, 1, 2, 1]}, "frame 1 has body parameters twice"),
         ({"frames": []}, "holds no frame"),
     ],

@@ -26,10 +26,10 @@ class PhotoTags:
 
     Attributes:
         orientation: 1 to 8; 1 = upright, 2 to 4 = mirrored or upside down, 5 to 8 = lying.
-        focal_px: focal length in pixels of the stored image; None where the tags do not say.
+        focal_px: focal length in pixels of the stored image.
         exposure: light let in: seconds of exposure x ISO / 100 / f-number squared, each factor 1 where its tag is
             missing; None without a time of exposure.
-        model: name of the camera, "" without one.
+        model: name of the camera.
     """
 
     orientation: int = 1
@@ -56,24 +56,11 @@ def is_lying(orientation: int) -> bool:
 
 def rotated_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return the (H, W, D) image as the orientation of EXIF says it is to be shown; exact."""
-    match orientation:
-        case 2:
-            turned = pixels[:, ::-1]
-        case 3:
-            turned = pixels[::-1, ::-1]
-        case 4:
-            turned = pixels[::-1]
-        case 5:
-            turned = pixels.swapaxes(0, 1)
-        case 6:
-            turned = pixels[::-1].swapaxes(0, 1)
-        case 7:
-            turned = pixels[::-1, ::-1].swapaxes(0, 1)
-        case 8:
-            turned = pixels[:, ::-1].swapaxes(0, 1)
-        case _:
-            return pixels
-    return np.ascontiguousarray(turned)
+    if orientation == 1:
+        return pixels
+    down, across = orientation in (3, 4, 6, 7), orientation in (2, 3, 7, 8)
+    rotated = pixels[:: -1 if down else 1, :: -1 if across else 1]
+    return np.ascontiguousarray(rotated.swapaxes(0, 1) if is_lying(orientation) else rotated)
 
 
 def _focal_px(spec: OpenImageIO.ImageSpec) -> float | None:

@@ -32,14 +32,7 @@ END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of an image file.
-
-    Attributes:
-        width, height: pixels, as stored.
-        channels: number of stored channels.
-        has_alpha: whether one of them is alpha.
-        tags: what the camera wrote.
-    """
+    """Header of an image file: pixels and number of channels as stored, whether one is alpha, the camera's tags."""
 
     width: int
     height: int
@@ -109,35 +102,47 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
     alpha: they are clamped to [0, 1] and encoded as sRGB. Grey becomes RGB.
 
     Args:
-        path: a file.
         size: (width, height) of its camera; an image that has this shape only when it is rotated as its EXIF tag says
             is rotated. None: as stored.
-        upright: turn it as its EXIF tag says in any case.
+        upright: rotate it as its EXIF tag says in any case.
     """
     with _reading(path):
-        return _decoded(path, size, upright)
+        pixels, spec, is_linear = _decoded(path, as_stored=False)
+        return _as_colours(path, pixels, spec, is_linear, size, upright)
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
     return reading(path, "the image is damaged or of an unknown kind; copy or convert it again")
 
 
-def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
+def _decoded(path: Path, *, as_stored: bool) -> tuple[np.ndarray, OpenImageIO.ImageSpec, bool]:
+    """Return the pixels (H, W, D), the header, and whether they are floats; whole numbers as uint8 or as stored."""
     import OpenImageIO as oiio
 
     source = _open(path)
     spec = source.spec()
-    header = _header(spec)
     check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
-    is_linear = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-    pixels = source.read_image(oiio.FLOAT if is_linear else oiio.UINT8)
+    is_float = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    pixels = source.read_image(oiio.FLOAT if is_float else spec.format if as_stored else oiio.UINT8)
     message = image_error(source)
     source.close()
     # Half a JPEG decodes to an image with a grey lower half and a message.
     if pixels is None or "premature" in message.lower():
         reason = message or "the data ends early"
         raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
-    pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
+    return pixels.reshape(spec.height, spec.width, spec.nchannels), spec, is_float
+
+
+def _as_colours(
+    path: Path,
+    pixels: np.ndarray,
+    spec: OpenImageIO.ImageSpec,
+    is_linear: bool,
+    size: tuple[int, int] | None,
+    upright: bool,
+) -> Tensor:
+    """Return ``read_image`` of decoded pixels."""
+    header = _header(spec)
     if upright or (size is not None and header.size_for(size) != header.size):
         pixels = rotated_upright(pixels, header.tags.orientation)
     alpha_channel = _alpha_channel(spec)
@@ -154,19 +159,9 @@ def _decoded(path: Path, size: tuple[int, int] | None, upright: bool) -> Tensor:
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
     """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are whole numbers."""
-    import OpenImageIO as oiio
-
     with _reading(path):
-        source = _open(path)
-        spec = source.spec()
-        check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
-        whole = spec.format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-        numbers = source.read_image(spec.format if whole else oiio.FLOAT)
-        message = image_error(source)
-        source.close()
-        if numbers is None:
-            raise DyngsError(f"{path}: the image is truncated or damaged ({message}); copy it again")
-        return numbers.reshape(spec.height, spec.width, spec.nchannels).astype(np.float32), whole
+        numbers, _, is_float = _decoded(path, as_stored=True)
+        return numbers.astype(np.float32), not is_float
 
 
 def read_mask(path: Path) -> Tensor:
@@ -203,7 +198,7 @@ def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
 
     Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the covered fraction.
     """
-    return _shrink_axis(_shrink_axis(pixels, 0, _all_of(pixels.shape[0], height)), 1, _all_of(pixels.shape[1], width))
+    return _shrink_axis(_shrink_axis(pixels, 0, pixels.shape[0], height), 1, pixels.shape[1], width)
 
 
 def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
@@ -217,8 +212,8 @@ def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
         end = min(begin + step, height)
         first, last = begin * old // height, min(-(-end * old // height), old)
         rows = premultiplied(pixels[first:last])
-        part = _shrink_axis(rows, 0, _Span(old, height, begin, end, first))
-        parts.append(straight_uint8(_shrink_axis(part, 1, _all_of(part.shape[1], width))))
+        part = _shrink_axis(rows, 0, old, height, (begin, end), first)
+        parts.append(straight_uint8(_shrink_axis(part, 1, part.shape[1], width)))
     return torch.cat(parts)
 
 
@@ -277,38 +272,26 @@ def _encode_linear(rgb: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarra
     return np.round(encoded * 255).astype(np.uint8), alpha
 
 
-@dataclass(frozen=True)
-class _Span:
-    """Part of an axis that shrinks from ``old`` to ``size``: outputs ``begin`` to ``end``, inputs from ``first`` on."""
-
-    old: int
-    size: int
-    begin: int
-    end: int
-    first: int
-
-
-def _all_of(old: int, size: int) -> _Span:
-    return _Span(old, size, 0, size, 0)
-
-
-def _shrink_axis(pixels: Tensor, axis: int, span: _Span) -> Tensor:
-    old, size = span.old, span.size
+def _shrink_axis(
+    pixels: Tensor, axis: int, old: int, size: int, outputs: tuple[int, int] | None = None, first_input: int = 0
+) -> Tensor:
+    """Return the ``outputs`` (None: all) of an axis that shrinks from ``old`` to ``size``, of inputs from one on."""
+    begin_at, end_at = outputs or (0, size)
     if size == old:
         return pixels
     if size > old:
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
     # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the fractions exact.
-    starts = torch.arange(span.begin, span.end + 1, device=pixels.device) * old
+    starts = torch.arange(begin_at, end_at + 1, device=pixels.device) * old
     first = starts[:-1] // size
     shape = [1] * pixels.ndim
-    shape[axis] = span.end - span.begin
+    shape[axis] = end_at - begin_at
     total = pixels.new_zeros(1)
     for tap in range(-(-old // size) + 1):
         index = first + tap
         begin = torch.maximum(index * size, starts[:-1])
         end = torch.minimum((index + 1) * size, starts[1:])
         fraction = ((end - begin).clamp(min=0).double() / old).to(pixels.dtype).reshape(shape)
-        inside = (index - span.first).clamp(max=pixels.shape[axis] - 1)
+        inside = (index - first_input).clamp(max=pixels.shape[axis] - 1)
         total = total + pixels.index_select(axis, inside) * fraction
     return total

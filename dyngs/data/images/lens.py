@@ -26,11 +26,9 @@ WORTH = 1.02
 
 @dataclass(frozen=True)
 class LensMap:
-    """Positions of the pinhole image's pixels in the stored, distorted image; on the CPU.
+    """Positions ``grid`` (H, W, 2) float32 of the pinhole image's pixels in the stored, distorted image; on the CPU.
 
-    Attributes:
-        grid: (H, W, 2) float32 positions (x, y) in [-1, 1] from outer edge to outer edge of the stored image.
-        valid: (H, W) bool, the position lies inside the stored image.
+    From -1 to 1, from outer edge to outer edge; ``valid`` (H, W) bool: the position lies inside.
     """
 
     grid: Tensor
@@ -56,7 +54,9 @@ def distort(lens: Lens, points: Tensor) -> Tensor:
     from kornia.geometry.calibration import distort_points
 
     identity = torch.eye(3, dtype=points.dtype, device=points.device)[None]
-    coefficients = torch.tensor([_padded(lens.params)], dtype=points.dtype, device=points.device)
+    size = next(n for n in (4, 5, 8) if n >= len(lens.params))  # the numbers of coefficients that OpenCV has
+    padded = lens.params + (0.0,) * (size - len(lens.params))
+    coefficients = torch.tensor([padded], dtype=points.dtype, device=points.device)
     return lens.focal_ratio * distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
 
 
@@ -65,9 +65,6 @@ def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Te
 
     By iteration, in float64; NaN where it does not converge to ``_CLOSE_PX``, as far outside the field of
     view, and where a point is NaN.
-
-    Args:
-        intrinsics: (3, 3) camera matrix in pixels.
     """
     if is_pinhole(lens):
         return points
@@ -88,9 +85,6 @@ def kept_fraction(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
     """Return the fraction of the stored image's pixels that the pinhole image shows, found on a coarse grid.
 
     The rest lies beyond its edges: a pinhole of the same focal length sees less than a lens that bulges.
-
-    Args:
-        intrinsics: (3, 3) camera matrix in pixels.
     """
     if is_pinhole(lens):
         return 1.0
@@ -105,9 +99,6 @@ def wide_pinhole(lens: Lens, intrinsics: np.ndarray, width: int, height: int) ->
 
     Of what lies up to ``WIDEST_DEG`` / 2 from the axis. Its focal length is shorter, never longer; the middle of the
     image has that much fewer pixels per degree, and what the lens did not see is not valid in ``undistort_map``.
-
-    Args:
-        intrinsics: (3, 3) camera matrix in pixels, with the focal length of the lens.
     """
     if is_pinhole(lens):
         return lens, intrinsics
@@ -137,12 +128,9 @@ def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
 
     Computed in float64. Where the distortion is no longer monotonic (far outside the field of view), nothing is valid:
     otherwise the inside of the image would appear there a second time.
-
-    Args:
-        intrinsics: (3, 3) camera matrix in pixels.
     """
-    fx, fy, cx, cy = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    center, focal, size = torch.tensor([(cx, cy), (fx, fy), (width, height)], dtype=torch.float64, device="cpu")
+    k = np.asarray(intrinsics, np.float64)
+    center, focal, size = torch.as_tensor(np.stack([k[:2, 2], k.diagonal()[:2], (width, height)]), device="cpu")
     x = torch.arange(width, dtype=torch.float64, device="cpu") + 0.5
     limit = _radius_limit(lens, intrinsics, width, height)
     grid = torch.empty(height, width, 2, device="cpu")
@@ -159,21 +147,11 @@ def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
 
 
 def undistort(pixels: Tensor, lens_map: LensMap) -> Tensor:
-    """Return the (H, W, D) float pinhole image in [0, 1], bicubic; zero where ``lens_map`` is not valid.
-
-    Args:
-        pixels: (H, W, D) float in [0, 1], colours premultiplied.
-    """
+    """Return the pinhole image of ``pixels`` (H, W, D) float in [0, 1], premultiplied; zero where it is not valid."""
     resampled = torch.nn.functional.grid_sample(
         pixels.permute(2, 0, 1)[None], lens_map.grid[None], mode="bicubic", padding_mode="border", align_corners=False
     )[0].permute(1, 2, 0)
     return resampled.clamp(0, 1) * lens_map.valid[..., None]
-
-
-def _padded(params: tuple[float, ...]) -> tuple[float, ...]:
-    """Pad the coefficients with zeros to 4, 5 or 8, as OpenCV orders them."""
-    size = next(n for n in (4, 5, 8) if n >= len(params))
-    return params + (0.0,) * (size - len(params))
 
 
 def _distort_fisheye(lens: Lens, points: Tensor) -> Tensor:

@@ -32,8 +32,8 @@ def read_depth(path: Path) -> Tensor:
     if path.suffix.lower() in (".npy", ".npz"):
         values, unit = read_map(path, "depth"), 1.0
     else:
-        values, is_whole = read_raw(path)
-        unit = MILLIMETRE if is_whole else 1.0
+        values, is_integer = read_raw(path)
+        unit = MILLIMETRE if is_integer else 1.0
     if values.ndim == 3:
         values = values[..., 0]
     if values.ndim != 2 or not values.size:
@@ -83,11 +83,7 @@ MASKS = "masks"
 
 
 def cut_out(pixels: Tensor, silhouette: Silhouette) -> Tensor:
-    """Return the (H, W, 4) uint8 image of the person alone, straight alpha, from ``pixels`` (H, W, 3 or 4) uint8.
-
-    Raises:
-        DyngsError: the silhouette is missing, damaged or of another size.
-    """
+    """Return the (H, W, 4) uint8 image of the person alone, straight alpha, from ``pixels`` (H, W, 3 or 4) uint8."""
     alpha = _read_alpha(silhouette)
     if alpha.shape != pixels.shape[:2]:
         raise DyngsError(
@@ -124,12 +120,11 @@ def silhouette_box(alpha: Tensor, above: float = 0.0) -> tuple[slice, slice] | N
 def nearest_positions(width: int, height: int, grid: Tensor | None = None) -> Tensor:
     """Return where the pixels of a (height, width) image lie, (height, width, 2) in [-1, 1] from edge to edge.
 
-    Args:
-        grid: (H, W, 2) positions in a distorted image, see ``LensMap``; None: there is no lens.
+    In a distorted image if its ``LensMap.grid`` is passed.
     """
     x, y = ((2 * torch.arange(n, device="cpu") + 1) / n - 1 for n in (width, height))
-    places = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    return places if grid is None else taken_at(grid, places)
+    positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    return positions if grid is None else taken_at(grid, positions)
 
 
 def taken_at(values: Tensor, positions: Tensor) -> Tensor:
@@ -147,13 +142,9 @@ def resized(flow: Tensor, width: int, height: int) -> Tensor:
 
 
 def flow_at(flow: Tensor, view: View, size: tuple[int, int], lens_map: LensMap | None) -> Tensor:
-    """Return the flow of the undistorted image of ``size`` (width, height), in its pixels.
+    """Return the flow of the undistorted image of ``size`` (width, height), in its pixels, from that as stored.
 
-    Both ends are undistorted by the lens of ``view``; NaN where the map has no such pixel.
-
-    Args:
-        flow: (H, W, 2) of the stored image.
-        lens_map: of the view; None: it has no lens.
+    Both ends are undistorted by the lens of ``view``, if it has a ``lens_map``; NaN where that has no such pixel.
     """
     if lens_map is None:
         return resized(flow, *size)

@@ -30,13 +30,7 @@ _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Size, length and frame rate of a video.
-
-    Attributes:
-        width, height: pixels of an image, rotated as the rotation tag says.
-        num_frames: images that there should be; those of a truncated file may not all be readable.
-        fps: mean images per second, 0 if the file does not say.
-    """
+    """Size of a video's images, rotated as its tag says, how many there should be, and mean rate, 0 if not said."""
 
     width: int
     height: int
@@ -72,31 +66,24 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
 def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the frames of these ``numbers``, counted from 0, in ascending order, as ``read_frames`` does.
 
-    One image is in memory at a time. Nothing behind the last wanted one is decoded; unwanted ones before it are (each
-    image builds on others), but not converted.
+    One image is in memory at a time. Nothing behind the last one is decoded; others before it are (each image builds
+    on others), but not converted.
     """
-    wanted = set(numbers)
-    left = len(wanted)
+    requested, last = set(numbers), max(numbers, default=-1)
     index = -1
-    for index, frame in _decoded(path) if left else ():
-        if index not in wanted:
-            continue
-        if frame.is_corrupt:
-            raise _broken(path, index, "its data is damaged")
-        yield index, _rotated_rgb(path, frame)
-        left -= 1
-        if left == 0:
+    for index, frame in _decoded(path) if requested else ():
+        if index in requested:
+            if frame.is_corrupt:
+                raise _broken(path, index, "its data is damaged")
+            yield index, _rotated_rgb(path, frame)
+        if index == last:
             return
-    if left:
+    if index < last:
         raise _broken(path, index + 1, "the video ends there")
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """Read size, length and frame rate of a video; the first frame is decoded, and the packets are counted.
-
-    Raises:
-        DyngsError: no such file, no video in it, or damage at its beginning.
-    """
+    """Read size, length and frame rate of a video; the first frame is decoded, and the packets are counted."""
     from av.error import FFmpegError
 
     first = next((frame for _, frame in _decoded(path)), None)
@@ -210,12 +197,8 @@ def orientation_of(frame: av.VideoFrame) -> int:
         return 1
     a, b, _, c, d = struct.unpack("9i", matrix[:36])[:5]
     if abs(a) + abs(d) >= abs(b) + abs(c):
-        return {(1, 1): 1, (-1, 1): 2, (-1, -1): 3, (1, -1): 4}[_sign(a), _sign(d)]
-    return {(1, 1): 5, (1, -1): 6, (-1, -1): 7, (-1, 1): 8}[_sign(b), _sign(c)]
-
-
-def _sign(x: int) -> int:
-    return -1 if x < 0 else 1
+        return {(False, False): 1, (True, False): 2, (True, True): 3, (False, True): 4}[a < 0, d < 0]
+    return {(False, False): 5, (False, True): 6, (True, True): 7, (True, False): 8}[b < 0, c < 0]
 
 
 def _rotated_rgb(path: Path, frame: av.VideoFrame) -> np.ndarray:
