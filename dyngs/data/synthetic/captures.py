@@ -19,14 +19,12 @@ from dyngs.files.write import write_image, write_text
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """Options of rendered images.
+    """Options of rendered images of ``size`` pixels a side, with ``samples`` per pixel side.
 
     Attributes:
-        size: width and height in pixels.
         num_val, num_test: images that are held out.
-        seed: turns the training cameras; one seed gives the same bytes each time.
+        seed: rotates the training cameras; one seed gives the same bytes each time.
         distance: of the cameras from the origin, world units.
-        samples: S, samples per pixel side.
     """
 
     size: int = 128
@@ -39,11 +37,7 @@ class ImageOptions:
 
 @dataclass(frozen=True)
 class StillOptions(ImageOptions):
-    """Options of a capture of the static scene.
-
-    Attributes:
-        num_train: training images.
-    """
+    """Options of a capture of the static scene, with ``num_train`` training images."""
 
     num_train: int = 48
 
@@ -68,7 +62,7 @@ class DynamicOptions(ImageOptions):
 
 @dataclass(frozen=True)
 class _Shot:
-    """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, and the time."""
+    """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, the time, a fixed camera."""
 
     name: str
     world_from_cam: np.ndarray
@@ -125,11 +119,7 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
 
 
 def _write_split(
-    out: Path,
-    split: str,
-    shots: Sequence[_Shot],
-    scene_of: Callable[[_Shot], Scene],
-    options: StillOptions | DynamicOptions,
+    out: Path, split: str, shots: Sequence[_Shot], scene_of: Callable[[_Shot], Scene], options: ImageOptions
 ) -> None:
     """Write the images of one split, then its JSON; nothing where it has no images."""
     if not shots:
@@ -160,17 +150,19 @@ def _teleporting_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
     test = orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=-60.0)
     fixed = orbit_cameras(1, options.distance, elevation_deg=28.0, start_deg=-60.0)
     poses = {"train": train, "val": np.repeat(fixed, options.num_val, axis=0), "test": test}
+    gaps, count = max(options.num_times - 1, 1), options.num_test
     times = {
         "train": _even_times(options.num_times),
         "val": _even_times(options.num_val),
-        "test": _times_between(options.num_times, options.num_test),
+        # spread over [0, 1], each midway between two neighbours of the training times
+        "test": [(int((i + 0.5) * gaps / count) + 0.5) / gaps for i in range(count)],
     }
     return {
         split: [
             _Shot(f"{split}/r_{i:03d}", pose, time)
-            for i, (pose, time) in enumerate(zip(poses[split], times[split], strict=True))
+            for i, (pose, time) in enumerate(zip(own, times[split], strict=True))
         ]
-        for split in poses
+        for split, own in poses.items()
     }
 
 
@@ -202,12 +194,6 @@ def _room_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
 def _even_times(count: int) -> list[float]:
     """Return ``count`` times from 0 to 1, both included; a single one is 0."""
     return [i / max(count - 1, 1) for i in range(count)]
-
-
-def _times_between(num_times: int, count: int) -> list[float]:
-    """Return ``count`` times spread over [0, 1], each midway between two neighbours of ``_even_times(num_times)``."""
-    gaps = max(num_times - 1, 1)
-    return [(int((i + 0.5) * gaps / count) + 0.5) / gaps for i in range(count)]
 
 
 def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
@@ -245,12 +231,9 @@ POINTS_PER_THING = 200
 def true_tracks(
     scene_of: Callable[[float], Scene], shots: Sequence[tuple[str, float, np.ndarray]], seed: int = 0
 ) -> TrueTracks:
-    """Return the tracks of points spread over everything that moves.
+    """Return the tracks of points spread over all that moves in the scene at a time in [0, 1].
 
-    Args:
-        scene_of: maps a time in [0, 1] to the scene.
-        shots: name, time, and (4, 4) OpenGL camera-to-world pose of each view.
-        seed: of the places of the points.
+    ``shots``: name, time, and (4, 4) OpenGL camera-to-world pose of each view; ``seed``: of the points.
     """
     times = sorted({time for _, time, _ in shots})
     scenes = {time: scene_of(time) for time in times}
@@ -277,10 +260,10 @@ def is_in_image(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
 
 def _placed(scene: Scene, local: dict[int, np.ndarray]) -> np.ndarray:
     """(P, 3) float32 of points on the primitives of ``scene``; NaN on those that do not exist."""
-    there = len(scene.primitives)
+    things = scene.primitives
     return np.concatenate(
         [
-            scene.primitives[i].placed(x).astype(np.float32) if i < there else np.full_like(x, np.nan)
+            things[i].placed(x).astype(np.float32) if i < len(things) else np.full_like(x, np.nan)
             for i, x in local.items()
         ]
     )

@@ -8,7 +8,7 @@ Local letters: R rays (or points on surfaces), S samples per pixel side.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,8 @@ CAMERA_ANGLE_X = 0.6911112070083618
 Paint = Callable[[np.ndarray], np.ndarray]
 """Local surface points (R, 3), scaled so that the primitive spans [-1, 1], to linear albedo (R, 3)."""
 
+_LAMP_SIZE = 0.9
+_SKY, _GROUND, _LAMPLIGHT = (0.46, 0.50, 0.56), (0.20, 0.17, 0.15), (0.80, 0.74, 0.66)
 _MARCH_STEPS = 40
 _BISECTIONS = 18
 _SURFACE = 3e-3
@@ -27,15 +29,7 @@ _SURFACE = 3e-3
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball.
-
-    Attributes:
-        center: world units.
-        radius: world units.
-        paint: of its surface.
-        gloss: strength of its highlight.
-        turn: (3, 3) rotation that takes the paint's axes to the world's.
-    """
+    """A ball; ``gloss`` is the strength of its highlight, ``turn`` (3, 3) rotates the paint's axes to the world's."""
 
     center: tuple[float, float, float]
     radius: float
@@ -45,7 +39,7 @@ class Sphere:
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray misses."""
-        offset = origins - _f32(self.center)
+        offset = origins - f32(self.center)
         half_b = _dot(offset, directions)
         discriminant = half_b**2 - _dot(offset, offset) + self.radius**2
         distance = -half_b - np.sqrt(np.maximum(discriminant, 0.0))
@@ -53,11 +47,11 @@ class Sphere:
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) surface points in the paint's axes."""
-        return self.normals(points) @ _f32(self.turn)
+        return self.normals(points) @ f32(self.turn)
 
     def placed(self, local: np.ndarray) -> np.ndarray:
         """(R, 3) surface points, of those in the paint's axes: the inverse of ``local``."""
-        return np.float32(self.radius) * local @ _f32(self.turn).T + _f32(self.center)
+        return np.float32(self.radius) * local @ f32(self.turn).T + f32(self.center)
 
     def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
         """(R, 3) points spread evenly over the surface, in the paint's axes."""
@@ -65,11 +59,11 @@ class Sphere:
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) unit normals at surface points."""
-        return (points - _f32(self.center)) / np.float32(self.radius)
+        return (points - f32(self.center)) / np.float32(self.radius)
 
     def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(R,) fraction of the cosine-weighted sky that the ball hides: the form factor of a sphere."""
-        offset = _f32(self.center) - points
+        offset = f32(self.center) - points
         distance = np.sqrt(np.maximum(_dot(offset, offset), 1e-12))
         cosine = np.maximum(_dot(normals, offset) / distance, 0.0)
         return cosine * np.minimum(self.radius / distance, 1.0) ** 2
@@ -90,21 +84,20 @@ class Box:
         return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        start = (origins - _f32(self.center)) @ self._axes().T
+        start = (origins - f32(self.center)) @ self._axes().T
         towards = directions @ self._axes().T
-        enter, leave = _through_box(start, towards, _f32(self.half_extents))
+        enter, leave = _through_box(start, towards, f32(self.half_extents))
         return np.where((enter < leave) & (enter > 1e-4), enter, np.float32(np.inf))
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) surface points in the box's axes, each divided by the half extent."""
-        turned = (points - _f32(self.center)) @ self._axes().T
-        return turned / _f32(self.half_extents)
+        turned = (points - f32(self.center)) @ self._axes().T
+        return turned / f32(self.half_extents)
 
     def placed(self, local: np.ndarray) -> np.ndarray:
-        return (local * _f32(self.half_extents)) @ self._axes() + _f32(self.center)
+        return (local * f32(self.half_extents)) @ self._axes() + f32(self.center)
 
     def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
-        """(R, 3) points spread evenly over the six faces, in the box's axes, each divided by the half extent."""
         half = np.asarray(self.half_extents)
         areas = half.prod() / half
         local = random.uniform(-1.0, 1.0, (count, 3))
@@ -136,12 +129,8 @@ class Wave:
 class Sheet:
     """A thin cloth, seen from both sides: its material point (u, v) lies at ``center + (u, v, height(u, v))``.
 
-    Attributes:
-        center: of the cloth at rest.
-        half_extents: of the rectangle of (u, v).
-        waves: their sum is the height; moving their phases moves the cloth, while its paint keeps to (u, v).
-        paint: gets (u, v, 0) divided by the half extents.
-        gloss: strength of its highlight.
+    The height is the sum of ``waves``: moving their phases moves the cloth, while its paint keeps to (u, v). The paint
+    gets (u, v, 0) divided by the half extents.
     """
 
     center: tuple[float, float, float]
@@ -154,17 +143,14 @@ class Sheet:
         """(R,) world units above ``center``."""
         total = np.zeros(np.broadcast(u, v).shape, np.float32)
         for wave in self.waves:
-            ku, kv = _f32(wave.wave_vector)
+            ku, kv = f32(wave.wave_vector)
             total += np.float32(wave.amplitude) * np.sin(ku * u + kv * v + np.float32(wave.phase))
         return total
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray misses.
-
-        Marches through the cloth's bounding box until the ray changes sides, then bisects.
-        """
-        start = np.broadcast_to(origins - _f32(self.center), directions.shape)
-        bound = _f32([*self.half_extents, sum(abs(wave.amplitude) for wave in self.waves) + 1e-3])
+        """Marches through the cloth's bounding box until the ray changes sides, then bisects."""
+        start = np.broadcast_to(origins - f32(self.center), directions.shape)
+        bound = f32([*self.half_extents, sum(abs(wave.amplitude) for wave in self.waves) + 1e-3])
         enter, leave = _through_box(start, directions, bound)
         enter = np.maximum(enter, np.float32(1e-4))
         distances = np.full(len(directions), np.inf, np.float32)
@@ -200,25 +186,24 @@ class Sheet:
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) material coordinates (u, v, 0), each divided by the half extent."""
-        flat = (points - _f32(self.center))[:, :2] / _f32(self.half_extents)
+        flat = (points - f32(self.center))[:, :2] / f32(self.half_extents)
         return np.concatenate([flat, np.zeros_like(flat[:, :1])], axis=1)
 
     def placed(self, local: np.ndarray) -> np.ndarray:
-        u, v = (local[:, :2] * _f32(self.half_extents)).T
-        return np.stack([u, v, self.height(u, v)], axis=1) + _f32(self.center)
+        u, v = (local[:, :2] * f32(self.half_extents)).T
+        return np.stack([u, v, self.height(u, v)], axis=1) + f32(self.center)
 
     def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
-        """(R, 3) points spread evenly over the cloth at rest, in material coordinates."""
         local = random.uniform(-1.0, 1.0, (count, 3))
         local[:, 2] = 0.0
         return local.astype(np.float32)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) unit normals of the upper side at surface points."""
-        u, v, _ = (points - _f32(self.center)).T
+        u, v, _ = (points - f32(self.center)).T
         normals = np.stack([np.zeros_like(u), np.zeros_like(u), np.ones_like(u)], axis=-1)
         for wave in self.waves:
-            ku, kv = _f32(wave.wave_vector)
+            ku, kv = f32(wave.wave_vector)
             slope = np.float32(wave.amplitude) * np.cos(ku * u + kv * v + np.float32(wave.phase))
             normals[:, 0] -= slope * ku
             normals[:, 1] -= slope * kv
@@ -226,7 +211,7 @@ class Sheet:
 
     def occlusion(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(R,) fraction of the sky hidden: the form factor, for a point on its axis, of a level disk of equal area."""
-        offset = _f32(self.center) - points
+        offset = f32(self.center) - points
         squared = np.maximum(_dot(offset, offset), 1e-12)
         cosines = np.maximum(_dot(normals, offset), 0.0) * np.abs(offset[:, 2]) / squared
         spread = np.float32(4.0 * self.half_extents[0] * self.half_extents[1] / np.pi)
@@ -238,12 +223,9 @@ Primitive = Sphere | Box | Sheet
 
 @dataclass(frozen=True)
 class Scene:
-    """Primitives, z up, lit by a sky and one square lamp.
+    """Primitives, z up, lit by a sky and one square lamp, whose size softens the shadows.
 
     Attributes:
-        primitives: what there is.
-        lamp: centre of the lamp.
-        lamp_size: side of the lamp, world units; it softens the shadows.
         faint: a neighbour that hides no more than this fraction of a point's sky hides nothing, which leaves what is
             far from a moving thing exactly as it is.
         num_static: the first so many primitives stand still; None: all do.
@@ -251,12 +233,8 @@ class Scene:
 
     primitives: tuple[Primitive, ...]
     lamp: tuple[float, float, float] = (2.2, -2.6, 4.4)
-    lamp_size: float = 0.9
     faint: float = 0.0
     num_static: int | None = None
-    _sky: tuple[float, float, float] = field(default=(0.46, 0.50, 0.56), repr=False)
-    _ground: tuple[float, float, float] = field(default=(0.20, 0.17, 0.15), repr=False)
-    _lamplight: tuple[float, float, float] = field(default=(0.80, 0.74, 0.66), repr=False)
 
     @property
     def movers(self) -> range:
@@ -268,39 +246,25 @@ def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: i
     """(size, size, 4) uint8 image: sRGB with straight alpha, transparent background.
 
     Sample (a, b) of every pixel sees the lamp at place (a, b) of its grid, so shadows are soft and agree between views.
-
-    Args:
-        scene: what to draw.
-        world_from_cam: (4, 4) OpenGL camera-to-world pose.
-        size: width and height in pixels; the field of view is ``CAMERA_ANGLE_X``.
-        samples: S, per pixel side.
+    The field of view is ``CAMERA_ANGLE_X``; ``world_from_cam`` is a (4, 4) OpenGL pose.
     """
     color = np.zeros((size * size, 3), np.float32)
     hits = np.zeros(size * size, np.float32)
-    lamps = scene.lamp_size * ((np.arange(samples) + 0.5) / samples - 0.5)
     origin = world_from_cam[:3, 3].astype(np.float32)
-    for a in range(samples):
-        for b in range(samples):
-            directions = _pixel_rays(world_from_cam, size, (a + 0.5) / samples, (b + 0.5) / samples)
-            lamp = _f32(scene.lamp) + _f32([lamps[a], lamps[b], 0.0])
-            hit, rgb = _trace(scene, origin, directions, lamp)
-            color[hit] += rgb
-            hits[hit] += 1.0
+    for (x, y), directions in _sampled_rays(world_from_cam, size, samples):
+        lamp = f32(scene.lamp) + f32([_LAMP_SIZE * (x - 0.5), _LAMP_SIZE * (y - 0.5), 0.0])
+        hit, rgb = _trace(scene, origin, directions, lamp)
+        color[hit] += rgb
+        hits[hit] += 1.0
     straight = color / np.maximum(hits, 1.0)[:, None]
     rgba = np.concatenate([straight, hits[:, None] / samples**2], axis=1)
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
 
 
 def colours_along(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return (R, 3) float32 sRGB colours of rays, black where they hit nothing; the lamp is a point.
-
-    Args:
-        scene: what to draw.
-        origin: (3,) of all rays, world units.
-        directions: (R, 3) unit vectors in the world.
-    """
+    """Return (R, 3) float32 sRGB colours of rays from ``origin`` (3,), black where they hit nothing; a point lamp."""
     rgb = np.zeros((len(directions), 3), np.float32)
-    hit, colours = _trace(scene, _f32(origin), directions.astype(np.float32), _f32(scene.lamp))
+    hit, colours = _trace(scene, f32(origin), directions.astype(np.float32), f32(scene.lamp))
     rgb[hit] = colours
     return rgb
 
@@ -309,26 +273,18 @@ def render_movers(scene: Scene, world_from_cam: np.ndarray, size: int, samples: 
     """(size, size) bool: pixels of ``render_scene`` in which something that moves is seen; light does not count."""
     seen = np.zeros(size * size, bool)
     origin = world_from_cam[:3, 3].astype(np.float32)
-    for a in range(samples):
-        for b in range(samples):
-            directions = _pixel_rays(world_from_cam, size, (a + 0.5) / samples, (b + 0.5) / samples)
-            nearest, distance = _nearest(scene, origin, directions)
-            seen |= (nearest >= scene.movers.start) & np.isfinite(distance)
+    for _, directions in _sampled_rays(world_from_cam, size, samples):
+        nearest, distance = _nearest(scene, origin, directions)
+        seen |= (nearest >= scene.movers.start) & np.isfinite(distance)
     return seen.reshape(size, size)
 
 
 def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(R,) bool: points on surfaces of which a camera sees, somewhere in its image or not; NaN is never seen.
-
-    Args:
-        scene: what there is.
-        points: (R, 3).
-        world_from_cam: (4, 4) OpenGL camera-to-world pose.
-    """
+    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not; NaN is never seen."""
     origin = world_from_cam[:3, 3]
     offset = np.nan_to_num(points - origin)
     distance = np.maximum(np.sqrt(_dot(offset, offset)), 1e-6)
-    _, nearest = _nearest(scene, _f32(origin), (offset / distance[:, None]).astype(np.float32))
+    _, nearest = _nearest(scene, f32(origin), (offset / distance[:, None]).astype(np.float32))
     return np.isfinite(points).all(axis=1) & (nearest > distance - _SURFACE)
 
 
@@ -372,8 +328,8 @@ def _shade(
         seen = np.flatnonzero(lit)
         lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
     upward = (0.5 + 0.5 * normals[:, 2:]).astype(np.float32)
-    ambient = upward * _f32(scene._sky) + (1 - upward) * _f32(scene._ground)
-    direct = np.where(lit, 1.0, 0.0)[:, None] * _f32(scene._lamplight)
+    ambient = upward * f32(_SKY) + (1 - upward) * f32(_GROUND)
+    direct = np.where(lit, 1.0, 0.0)[:, None] * f32(_LAMPLIGHT)
     rgb = primitive.paint(primitive.local(points)) * (ambient * open_sky[:, None] + direct * facing[:, None])
     if primitive.gloss == 0:
         return rgb
@@ -381,14 +337,17 @@ def _shade(
     return rgb + direct * shine[:, None]
 
 
-def _pixel_rays(world_from_cam: np.ndarray, size: int, sub_x: float, sub_y: float) -> np.ndarray:
-    """(size * size, 3) float32 unit directions in the world through one subpixel of every pixel, row by row."""
+def _sampled_rays(
+    world_from_cam: np.ndarray, size: int, samples: int
+) -> Iterator[tuple[tuple[float, float], np.ndarray]]:
+    """Yield positions in a pixel, and (size * size, 3) float32 unit directions in the world through them, by rows."""
     focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
-    x = (np.arange(size) + sub_x - 0.5 * size) / focal
-    y = (np.arange(size) + sub_y - 0.5 * size) / focal
-    grid_x, grid_y = np.meshgrid(x, y)
-    local = np.stack([grid_x, -grid_y, -np.ones_like(grid_x)], axis=-1).reshape(-1, 3)
-    return _unit(local @ world_from_cam[:3, :3].T).astype(np.float32)
+    for a, b in np.ndindex(samples, samples):
+        sub_x, sub_y = (a + 0.5) / samples, (b + 0.5) / samples
+        x, y = ((np.arange(size) + sub - 0.5 * size) / focal for sub in (sub_x, sub_y))
+        grid_x, grid_y = np.meshgrid(x, y)
+        local = np.stack([grid_x, -grid_y, -np.ones_like(grid_x)], axis=-1).reshape(-1, 3)
+        yield (sub_x, sub_y), _unit(local @ world_from_cam[:3, :3].T).astype(np.float32)
 
 
 def _through_box(start: np.ndarray, directions: np.ndarray, bound: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -402,7 +361,7 @@ def _through_box(start: np.ndarray, directions: np.ndarray, bound: np.ndarray) -
     return enter, np.minimum(np.minimum(x, y), z)
 
 
-def _f32(values: Sequence[float] | np.ndarray) -> np.ndarray:
+def f32(values: Sequence[float] | np.ndarray) -> np.ndarray:
     return np.asarray(values, np.float32)
 
 

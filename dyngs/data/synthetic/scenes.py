@@ -8,12 +8,11 @@ Local letters: R points on surfaces.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
 
-from dyngs.data.synthetic.raytrace import Box, Paint, Primitive, Scene, Sheet, Sphere, Wave
+from dyngs.data.synthetic.raytrace import Box, Paint, Primitive, Scene, Sheet, Sphere, Wave, f32
 from dyngs.errors import DyngsError
 
 SceneName = Literal["spin", "wave", "merge", "room"]
@@ -172,7 +171,7 @@ def _checkers(count: int, light: Rgb, dark: Rgb) -> Paint:
     def paint(local: np.ndarray) -> np.ndarray:
         cells = np.floor((local[:, :2] * 0.94 + 1.0) * 0.5 * count).astype(np.int64).sum(axis=1)
         is_light = (cells % 2 == 0) & (np.abs(local[:, :2]).max(axis=1) < 0.94) & (local[:, 2] > 0.99)
-        return np.where(is_light[:, None], _f32(light), _f32(dark))
+        return np.where(is_light[:, None], f32(light), f32(dark))
 
     return paint
 
@@ -183,7 +182,7 @@ def _swirl(first: Rgb, second: Rgb) -> Paint:
     def paint(local: np.ndarray) -> np.ndarray:
         wave = np.sin(9.0 * local[:, 2] + 2.0 * np.arctan2(local[:, 1], local[:, 0]) + 1.5 * np.sin(4.0 * local[:, 0]))
         fraction = (0.5 + 0.5 * np.clip(4.0 * wave, -1.0, 1.0))[:, None].astype(np.float32)
-        return fraction * _f32(first) + (1 - fraction) * _f32(second)
+        return fraction * f32(first) + (1 - fraction) * f32(second)
 
     return paint
 
@@ -197,7 +196,7 @@ def _dots(ground: Rgb, dot: Rgb) -> Paint:
 
     def paint(local: np.ndarray) -> np.ndarray:
         is_dot = (local @ centers).max(axis=1) > np.cos(0.22)
-        return np.where(is_dot[:, None], _f32(dot), _f32(ground))
+        return np.where(is_dot[:, None], f32(dot), f32(ground))
 
     return paint
 
@@ -209,8 +208,8 @@ def _sectors(count: int, first: Rgb, second: Rgb) -> Paint:
         tilted_z = 0.8 * local[:, 2] + 0.6 * local[:, 1]
         tilted_y = 0.8 * local[:, 1] - 0.6 * local[:, 2]
         sector = np.floor(np.arctan2(tilted_y, local[:, 0]) * count / (2 * np.pi)).astype(np.int64)
-        rgb = np.where((sector % 2 == 0)[:, None], _f32(first), _f32(second))
-        return np.where((np.abs(tilted_z) > 0.93)[:, None], _f32([0.9, 0.9, 0.88]), rgb)
+        rgb = np.where((sector % 2 == 0)[:, None], f32(first), f32(second))
+        return np.where((np.abs(tilted_z) > 0.93)[:, None], f32([0.9, 0.9, 0.88]), rgb)
 
     return paint
 
@@ -221,7 +220,7 @@ def _framed(frame: Rgb, panel: Rgb) -> Paint:
     def paint(local: np.ndarray) -> np.ndarray:
         in_frame = np.sort(np.abs(local), axis=1)[:, 1] > 0.78
         ring = 0.80 + 0.20 * np.sin(11.0 * local[:, 2] + 4.0 * np.sin(2.0 * local[:, 0] + local[:, 1]))
-        return np.where(in_frame[:, None], _f32(frame), ring[:, None].astype(np.float32) * _f32(panel))
+        return np.where(in_frame[:, None], f32(frame), ring[:, None].astype(np.float32) * f32(panel))
 
     return paint
 
@@ -231,7 +230,7 @@ def _tiles(count: int, light: Rgb, dark: Rgb) -> Paint:
 
     def paint(local: np.ndarray) -> np.ndarray:
         cells = np.floor((local * 0.999 + 1.0) * 0.5 * count).astype(np.int64).sum(axis=1)
-        return np.where((cells % 2 == 0)[:, None], _f32(light), _f32(dark))
+        return np.where((cells % 2 == 0)[:, None], f32(light), f32(dark))
 
     return paint
 
@@ -244,7 +243,7 @@ def _wallpaper(across: int, up: int, counts: tuple[int, int], ground: Rgb, spot:
         column = (local[:, across] + 1.0) * counts[0] + 0.5 * (np.floor(row) % 2)
         distance = np.hypot(row % 1.0 - 0.5, column % 1.0 - 0.5)
         fraction = np.clip((0.34 - distance) / 0.08, 0.0, 1.0)[:, None].astype(np.float32)
-        return fraction * _f32(spot) + (1 - fraction) * _f32(ground)
+        return fraction * f32(spot) + (1 - fraction) * f32(ground)
 
     return paint
 
@@ -269,14 +268,14 @@ def _die() -> Paint:
                 is_pip |= (number == n) & (np.hypot(x - a, y - b) < 0.19)
         is_edge = np.maximum(np.abs(x), np.abs(y)) > 0.93
         rgb = np.where(is_edge[:, None], np.float32(0.6) * colors[axis], colors[axis])
-        return np.where(is_pip[:, None], _f32((0.96, 0.94, 0.88)), rgb)
+        return np.where(is_pip[:, None], f32((0.96, 0.94, 0.88)), rgb)
 
     return paint
 
 
 def _carpet() -> Paint:
     """Nested lozenges within a toothed border; each corner has its own colour, so that no part looks like another."""
-    border, cream, navy = _f32((0.50, 0.07, 0.08)), _f32((0.92, 0.82, 0.62)), _f32((0.06, 0.14, 0.34))
+    border, cream, navy = f32((0.50, 0.07, 0.08)), f32((0.92, 0.82, 0.62)), f32((0.06, 0.14, 0.34))
     corners = np.array([[0.72, 0.16, 0.12], [0.10, 0.42, 0.40], [0.86, 0.54, 0.12], [0.40, 0.18, 0.42]], np.float32)
 
     def paint(local: np.ndarray) -> np.ndarray:
@@ -290,7 +289,3 @@ def _carpet() -> Paint:
         return np.where((edge > 0.84)[:, None], rim, field)
 
     return paint
-
-
-def _f32(values: Sequence[float]) -> np.ndarray:
-    return np.asarray(values, np.float32)
