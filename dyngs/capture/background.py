@@ -47,12 +47,11 @@ the outline is a mixture."""
 
 @dataclass(frozen=True)
 class Background:
-    """What a fixed camera sees without the person.
+    """What a fixed camera sees without the person, in grey levels.
 
     Attributes:
-        colours: (H, W, 3) float32, grey levels: the median over time.
-        noise: (H, W) float32, grey levels: robust standard deviation over time of smoothed images, at least
-            ``NOISE``.
+        colours: (H, W, 3) float32, the median over time.
+        noise: (H, W) float32, robust standard deviation over time of smoothed images, at least ``NOISE``.
     """
 
     colours: np.ndarray
@@ -84,11 +83,7 @@ class Separation:
 
 
 def background_of(images: np.ndarray) -> Background:
-    """Return the background of a fixed camera.
-
-    Args:
-        images: (F, H, W, 3) uint8, spread over time.
-    """
+    """Return the background of a fixed camera from images (F, H, W, 3) uint8, spread over time."""
     colours = np.median(images, axis=0).astype(np.float32)
     away = np.stack([_away(colours, image) for image in images])
     noise = 1.4826 * np.median(away, axis=0)
@@ -136,7 +131,6 @@ def separation(background: Background, images: np.ndarray, masks: np.ndarray) ->
 
 
 def _difference(background: Background, image: np.ndarray) -> np.ndarray:
-    """Return the difference (H, W) from the background, in its standard deviations."""
     return _away(background.colours, image) / background.noise
 
 
@@ -150,16 +144,11 @@ def _shadow(background: Background, image: np.ndarray) -> np.ndarray:
     smooth = ndimage.gaussian_filter(image.astype(np.float32), (_SMOOTH, _SMOOTH, 0))
     ground = ndimage.gaussian_filter(background.colours, (_SMOOTH, _SMOOTH, 0))
     ratio = smooth.mean(-1) / np.maximum(ground.mean(-1), 1.0)
-    mean, spread = _mean_and_spread(ratio)
+    mean = ndimage.uniform_filter(ratio, _WINDOW)
+    spread = np.sqrt(np.maximum(ndimage.uniform_filter(ratio**2, _WINDOW) - mean**2, 0.0))
     colour = np.abs(smooth - ratio[..., None] * ground).max(-1) < LOW * background.noise
     shaded = (mean > SHADE[0]) & (mean < SHADE[1]) & (spread < SHADE_SPREAD * mean) & colour
     return ndimage.binary_opening(shaded, _disc(1))
-
-
-def _mean_and_spread(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (H, W) in a window around each pixel."""
-    mean = ndimage.uniform_filter(values, _WINDOW)
-    return mean, np.sqrt(np.maximum(ndimage.uniform_filter(values**2, _WINDOW) - mean**2, 0.0))
 
 
 def _slope(colours: np.ndarray) -> np.ndarray:
@@ -181,18 +170,13 @@ LEAST = 8
 """Least number of images of a camera."""
 SIDE = 960
 """Longest side of the images that are compared, px."""
+_MOVES = "moves, so there is no background to compare with; give masks of the person (--masks)"
 _ADVICE = "give masks of the person (--masks), or an image of the place without them (--background)"
 
 
 @dataclass(frozen=True)
 class _Camera:
-    """Images of one fixed camera.
-
-    Attributes:
-        where: for messages.
-        views: in order of time.
-        size: width and height that the images are compared at.
-    """
+    """Views of one fixed camera, in order of time, compared at ``size`` (width, height); ``where``: for messages."""
 
     where: str
     views: tuple[View, ...]
@@ -207,11 +191,9 @@ class _Camera:
 def with_background_masks(
     capture: Capture, folder: Path, empty: Path | None = None, say: Callable[[str], None] = print
 ) -> Capture:
-    """Return the capture with masks of the person, written to ``folder``.
+    """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is made.
 
     Args:
-        capture: of fixed cameras.
-        folder: is made.
         empty: an image without the person, or a folder of one for each camera, whose name ends in the camera's number
             (or is that of any image of it); None: the median over time.
 
@@ -251,15 +233,9 @@ def _fixed_cameras(capture: Capture) -> list[_Camera]:
     for number, views in sorted(groups.items()):
         where = f"{capture.root}, camera {number}"
         first = views[0]
-        same = all(
-            np.allclose(view.cam_from_world, first.cam_from_world, atol=1e-6)
-            and (view.width, view.height) == (first.width, first.height)
-            for view in views
-        )
-        if not same:
-            raise DyngsError(
-                f"{where} moves, so there is no background to compare with; give masks of the person (--masks)"
-            )
+        poses = np.stack([view.cam_from_world for view in views])
+        if not np.allclose(poses, poses[0], atol=1e-6) or len({(view.width, view.height) for view in views}) > 1:
+            raise DyngsError(f"{where} {_MOVES}")
         if len(views) < LEAST:
             raise DyngsError(f"{where}: has {len(views)} images, too few for a background; {_ADVICE}")
         views.sort(key=lambda view: (view.time or 0.0, view.name))
@@ -288,7 +264,6 @@ def _plates(empty: Path, cameras: Sequence[_Camera]) -> Mapping[int, Path]:
 
 
 def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Background:
-    """Return what the camera sees without the person."""
     if plate is not None:
         first = camera.views[0]
         pixels = read_image(plate, (first.width, first.height))[..., :3]
@@ -304,15 +279,11 @@ def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Bac
         spread = background_of(sampled).noise
         return Background(colours, np.full_like(spread, float(np.median(spread))))
     if displaced_by(sampled[..., 1]) > STANDS:
-        raise DyngsError(
-            f"{camera.where}: the camera moves, so there is no background to compare with; give masks of the person "
-            "(--masks)"
-        )
+        raise DyngsError(f"{camera.where}: the camera {_MOVES}")
     return background_of(sampled)
 
 
 def _require_clear(camera: _Camera, found: Separation, *, with_plate: bool) -> None:
-    """Refuse masks that cannot be trusted."""
     if found.is_clear if not with_plate else found.area > 0 and found.on_edges > 0.5:
         return
     if found.area < 1e-3:

@@ -43,8 +43,6 @@ def with_first_points(
     cube around the origin of Blender scenes that are still or show each time step from one side, if they lie there.
 
     Args:
-        capture: of a scene.
-        options: of the capture.
         triangulate: images of one time step at most; 0: nothing is triangulated.
         half_extent: half the side of the cube.
     """
@@ -53,12 +51,11 @@ def with_first_points(
     if capture.points is not None:
         return capture, lines
     views = capture.splits["train"]
-    is_in_cube = False
-    if capture.format in AROUND_ORIGIN:
-        why = outside_of_cube(views, half_extent)
-        is_in_cube = why is None
-        if why is not None:
-            lines.append(f"the scene does not lie around the origin, where Blender scenes do by custom: {why}")
+    is_by_custom = capture.format in AROUND_ORIGIN
+    why = outside_of_cube(views, half_extent) if is_by_custom else None
+    is_in_cube = is_by_custom and why is None
+    if why is not None:
+        lines.append(f"the scene does not lie around the origin, where Blender scenes do by custom: {why}")
     if triangulate == 0 or (is_in_cube and views[0].time is None):
         return capture, lines
     moment = views_of_a_time_step(views, triangulate)
@@ -97,11 +94,6 @@ def points_fault(points: PointCloud, views: Sequence[View], options: DataConfig)
       with the points shuffled in each image, is below ``PLACES_FIT`` times the same ratio of points drawn at random
       in the box of the points, among images of a time step or among all of them (neighbours may be too near each other
       to tell). Shuffling keeps the colours of each image, so a plain background does not count.
-
-    Args:
-        points: one or more, finite.
-        views: of training.
-        options: of the capture; its image sizes do not matter here.
     """
     rng = np.random.default_rng(0)
     chosen = np.sort(rng.permutation(len(points.xyz))[:SAMPLE])
@@ -151,19 +143,17 @@ def _colours_at(xyz: np.ndarray, shown: Sequence[tuple[View, np.ndarray]]) -> np
     """Return (V, P, 4) colours and alpha of the images at the points, NaN where they lie outside."""
     found = np.full((len(shown), len(xyz), 4), np.nan)
     for i, (view, image) in enumerate(shown):
-        places, inside = projected(xyz, view)
+        positions, inside = projected(xyz, view)
         size = np.array(image.shape[1::-1])
-        column, row = np.minimum((places[inside] * size).astype(int), size - 1).T
+        column, row = np.minimum((positions[inside] * size).astype(int), size - 1).T
         found[i, inside] = image[row, column]
     return found
 
 
 def _colour_ratio(colours: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -> float:
-    """Return the points' median colour error over images, over that of shuffled points; 1 for points of one colour.
+    """Return the median error over images of the points' ``rgb`` (P, 3), over that of shuffled points.
 
-    Args:
-        colours: (V, P, 3) of the images, NaN outside.
-        rgb: (P, 3) of the points in [0, 1].
+    ``colours`` (V, P, 3) of the images are NaN outside; 1 for points of one colour.
     """
     seen = ~np.isnan(colours[..., 0]).all(axis=0)
     colours, rgb = colours[:, seen], rgb[seen]
@@ -178,9 +168,7 @@ def _colour_ratio(colours: np.ndarray, rgb: np.ndarray, rng: np.random.Generator
 def _place_ratio(colours: np.ndarray, sizes: Sequence[int], rng: np.random.Generator) -> float:
     """Return the spread of colours between the images of a group, over that with points shuffled in each image.
 
-    Args:
-        colours: (V, P, 4) of the images, group by group, NaN outside.
-        sizes: number of images in each group.
+    ``colours`` (V, P, 4) of the images, group by group of these ``sizes``, are NaN outside.
     """
     own = shuffled = 0.0
     for block in np.split(colours, np.cumsum(sizes)[:-1]):

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
+from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.frame_cache import decode_frames, planned_frames
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
 from dyngs.data.readers.colmap import find_masks, mask_of
@@ -24,8 +23,6 @@ MOST_FRAMES = 60
 """Frames that are taken where ``data.frames`` names none."""
 FOCAL = 1.2
 """Guessed focal length, as a fraction of the longest side of the images: between a phone's and a film camera's."""
-_FACING = np.diag([1.0, -1.0, -1.0, 1.0])
-"""World to camera: the world is y up, and the camera looks along -z from its origin."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +47,10 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     """Read a clip of one fixed camera; ``options.root`` is a video, or a folder of images in the order of names.
 
     The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else ``FOCAL`` times
-    the longest side. The world is y up if the camera is level, the camera stands at its origin.
+    the longest side. The world is y up if the camera is level, the camera stands at its origin. Without
+    ``data.frames``, ``MOST_FRAMES`` are taken, evenly spread.
 
     Args:
-        options: ``frames`` chooses frames by number; without it ``MOST_FRAMES`` are taken, evenly spread.
         masks: folder of masks (white = the person), named as the images, or ``frame_000012.png`` for frame 12 of a
             video; None: alpha, if the images have it.
 
@@ -69,8 +66,7 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
             wanted = {found.paths[i]: video for i in numbers if (video := found.videos[i]) is not None}
             decode_frames(source, wanted, options.frame_cache_mb)
         headers = [read_header(found.paths[i]) for i in numbers]
-    silhouettes: Sequence[Silhouette | None]
-    silhouettes = [None] * len(numbers) if masks is None else silhouettes_of(masks, [found.names[i] for i in numbers])
+    silhouettes = None if masks is None else silhouettes_of(masks, [found.names[i] for i in numbers])
     first = headers[0]
     check_size(source, first.width, first.height, first.channels)
     width, height = first.upright_size
@@ -80,20 +76,20 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
             f"{found.paths[other]}: has another size than {found.paths[numbers[0]].name}; give the frames of one camera"
         )
     focal = first.tags.focal_px or FOCAL * max(width, height)
-    intrinsics = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    intrinsics = pinhole_matrix(focal, focal, width / 2, height / 2)
     last = max(len(numbers) - 1, 1)
     views = tuple(
         View(
             name=Path(found.names[i]).with_suffix("").as_posix(),
             image_path=found.paths[i],
-            cam_from_world=_FACING.copy(),
+            cam_from_world=OPENGL_FROM_OPENCV.copy(),
             intrinsics=intrinsics,
             width=width,
             height=height,
             time=row / last,
             frame=row,
             video=found.videos[i],
-            silhouette=silhouettes[row],
+            silhouette=None if silhouettes is None else silhouettes[row],
         )
         for row, i in enumerate(numbers)
     )
@@ -136,7 +132,6 @@ def _images_of(folder: Path) -> list[Path]:
 
 
 def _chosen(options: DataConfig, count: int) -> list[int]:
-    """Return the numbers of the frames to take, ascending."""
     if options.frames is None:
         return evenly_spaced(count, MOST_FRAMES)
     numbers = list(range(count))[parse_frames(options.frames)]

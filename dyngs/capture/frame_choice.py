@@ -40,12 +40,10 @@ class FrameMeasures:
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """Frames taken from a video.
+    """Frames taken from a video: their ``numbers``, ascending, of ``num_frames``.
 
     Attributes:
-        numbers: of the frames, ascending, counted from 0.
-        num_frames: frames that the video has.
-        num_static: those of them at which nothing had moved since the frame before.
+        num_static: frames of the video at which nothing had moved since the frame before.
         blurred: chosen ones much less sharp than the others.
         reach: largest motion since the first frame, as a fraction of the image's width.
     """
@@ -82,10 +80,6 @@ def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
 
     A frame counts by the motion since the one before, at most ``_FASTEST`` times the median, and to a small part by
     itself, so that what moves while the camera rests is not lost. Frames that repeat the one before count nothing.
-
-    Args:
-        measures: of all frames of the video.
-        wanted: number of frames.
     """
     count = len(measures)
     still = measures.most <= _NOISE
@@ -112,9 +106,7 @@ def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
 def sharpness_of(rgb: np.ndarray) -> float:
     """Return the variance of the Laplacian of the brightness: higher is sharper."""
     grey = rgb[..., 1].astype(np.float32)
-    laplacian = (
-        4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
-    )  # fmt: skip
+    laplacian = 4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
     return float(laplacian.var()) if laplacian.size else 0.0
 
 

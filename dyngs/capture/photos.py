@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,7 @@ _SAMPLE_BYTES = 2**20
 
 @dataclass(frozen=True)
 class Photo:
-    """An image of the capture that is made.
-
-    Attributes:
-        name: path below ``images/``.
-        header: size and tags as stored there.
-        source: path of the photo below the given folder.
-    """
+    """An image ``name`` below ``images/`` with its header there; ``source``: the photo below its folder."""
 
     name: str
     header: ImageHeader
@@ -50,9 +45,7 @@ def photos_below(folder: Path) -> list[Path]:
 def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
     """Return 16 hexadecimal digits of names, sizes and times of change of files, and of the beginnings of videos.
 
-    Args:
-        source: a video, or a folder.
-        files: of that folder; None: all photos below it.
+    Of a video, or of ``files`` of a folder, None: all photos below it.
     """
     digest = hashlib.sha256()
     for path in files or ([source] if source.is_file() else photos_below(source)):
@@ -71,12 +64,8 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
 
     Photos that lie on their side by their EXIF tag are copied as they are: the model's sizes say that they are to be
     rotated, and readers of ours do. Those that are upside down, mirrored or square cannot be told by their size: they
-    are written upright, as PNG, and so are HEIC photos and the first frame of GIF files.
-
-    Args:
-        source: a folder; hidden files, and those of ``out``, are left out.
-        images: a folder, made if there are photos; images that are there already are left.
-        out: the capture that will be made.
+    are written upright, as PNG, and so are HEIC photos and the first frame of GIF files. Hidden files and those of
+    ``out``, the capture that will be made, are left out; images that are there already are left.
 
     Raises:
         DyngsError: a file is no image, truncated, too large, or lies outside the folder; pillow-heif is missing.
@@ -96,7 +85,11 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
         stored = header if header is not None and target.suffix == photo.suffix else read_header(target)
         photos.append(Photo(names[relative].as_posix(), stored, relative.as_posix()))
     left_out = Counter(file.suffix.lower() or "without a suffix" for file in files if file not in headers)
-    notes = [_left_out_line(left_out)] if left_out else []
+    notes = []
+    if left_out:
+        what = ", ".join(f"{count} {suffix}" for suffix, count in sorted(left_out.items()))
+        known = ", ".join(sorted(PHOTO_SUFFIXES))
+        notes.append(f"left out, no photos: {what} (photos are {known}; convert what else is one)")
     animated = sum(photo.suffix.lower() == ".gif" for photo in taken)
     notes += [f"{animated} .gif: the first frame of each is taken"] if animated else []
     return photos, tuple(notes)
@@ -119,14 +112,8 @@ def copied(source: Path, target: Path) -> None:
 def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str, Path]) -> list[str]:
     """Write upright images under plain names into ``images`` for COLMAP, masks beside; return the names.
 
-    COLMAP ignores the orientation of EXIF, and its lists of pairs cannot hold names with white space.
-
-    Args:
-        photos: in order.
-        stored_in: folder of theirs.
-        images: a folder that does not outlive the work, as files in it may be links to the photos; images that are
-            there already are left.
-        masks: of photos, by name; white = keep.
+    COLMAP ignores the orientation of EXIF, and its lists of pairs cannot hold names with white space. The folder must
+    not outlive the work, as files in it may be links to the photos; images that are there already are left.
     """
     names = []
     images.mkdir(exist_ok=True)
@@ -140,7 +127,10 @@ def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str,
             if is_written:
                 write_image(images / name, read_image(stored, upright=True).numpy())
             else:
-                _link(stored, images / name)
+                try:
+                    os.link(stored, images / name)
+                except OSError:
+                    shutil.copyfile(stored, images / name)
         mask = masks.get(photo.name)
         if mask is not None:
             target = images.with_name("masks") / f"{name}.png"
@@ -155,20 +145,12 @@ def _files_below(folder: Path) -> list[Path]:
     )  # fmt: skip
 
 
-def _left_out_line(counts: Counter[str]) -> str:
-    what = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
-    return f"left out, no photos: {what} (photos are {', '.join(sorted(PHOTO_SUFFIXES))}; convert what else is one)"
-
-
 def _require_heif(photos: Sequence[Path], source: Path) -> None:
-    if photos:
-        try:
-            import pillow_heif  # noqa: F401
-        except ImportError:
-            raise DyngsError(
-                f"{source}: {len(photos)} photos are HEIC, first {photos[0].name}, which needs the package "
-                "pillow-heif: pip install 'dyngs[heic]', or convert them to JPEG"
-            ) from None
+    if photos and find_spec("pillow_heif") is None:
+        raise DyngsError(
+            f"{source}: {len(photos)} photos are HEIC, first {photos[0].name}, which needs the package pillow-heif: "
+            "pip install 'dyngs[heic]', or convert them to JPEG"
+        )
 
 
 def _checked(photo: Path) -> ImageHeader | None:
@@ -222,10 +204,3 @@ def _convert_heif(photo: Path, target: Path) -> None:
         rgb, exif = image.convert("RGB"), image.info.get("exif")
     with atomic_file(target) as temporary:
         rgb.save(temporary, exif=exif or b"", compress_level=1)
-
-
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)

@@ -87,8 +87,8 @@ def points_over_clip(views: Sequence[View], options: DataConfig) -> PointCloud |
 def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
     """Return the pairs (i, j), i < j, of views in order of time that are matched; a bounded number for each view.
 
-    Those that are near each other in time (``TIME_STEPS``), and of the others the ``OVERLAPPING`` whose images show
-    most of the same space, judged by random points in what the cameras see.
+    Those near each other in time (``TIME_STEPS``), and of the others the ``OVERLAPPING`` whose images show most of the
+    same space, judged by random points in what the cameras see.
     """
     count = len(views)
     pairs = {(i, i + step) for step in TIME_STEPS for i in range(count - step)}

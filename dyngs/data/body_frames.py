@@ -68,11 +68,8 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     """Return the same bodies with ``turns`` merged into the root joint's rotation.
 
     The pelvis keeps its place in the world, ``scale * turn(j) + trans``, where j is the rest position of the fitted
-    body's pelvis if the files say it, else ``pelvis``. Hence the root rotates by ``turn * poses[:, 0]``, and
-    ``trans' = trans + scale * (turn(j) - pelvis)``.
-
-    Args:
-        pelvis: (3,) rest position of the pelvis (joint 0) of the shaped template that is to be posed.
+    body's pelvis if the files say it, else ``pelvis`` (3,), that of the shaped template that is to be posed. Hence the
+    root rotates by ``turn * poses[:, 0]``, and ``trans' = trans + scale * (turn(j) - pelvis)``.
     """
     fitted = pelvis if body.pelvis is None else body.pelvis
     poses, turned = body.poses, fitted
@@ -86,7 +83,7 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
 
 
 def moved(body: BodyFrames, offset: np.ndarray) -> BodyFrames:
-    """Return the bodies with ``offset`` (3,) subtracted from all positions, as ``geometry.recenter`` moves cameras."""
+    """Return the bodies with ``offset`` (3,) subtracted from all positions."""
     return replace(body, trans=body.trans - offset)
 
 
@@ -147,9 +144,6 @@ def read_body_file(path: Path) -> BodyFrames:
 
     Without ``frames``, row n is for frame n. ``surface_model_type`` "anny" says that betas are of the free template's
     shape space.
-
-    Raises:
-        DyngsError: names the file and what is wrong.
     """
     found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames"))
     count = len(found["poses"]) if found["poses"].ndim else 0

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import torch
@@ -17,13 +17,7 @@ from dyngs.ops.transfer import Upload
 
 @dataclass(frozen=True)
 class Decoded:
-    """Pixels and maps of an image.
-
-    Attributes:
-        pixels: (H, W, 3 or 4) uint8, straight alpha.
-        mask: (H, W) bool, or None.
-        moves, depth, flow: maps as those of ``Image``, or None.
-    """
+    """Pixels (H, W, 3 or 4) uint8, straight alpha, mask (H, W) bool, and maps as those of ``Image``."""
 
     pixels: Tensor
     mask: Tensor | None
@@ -39,29 +33,18 @@ class Decoded:
         """Begin to copy everything to ``device``; the result returns the image there."""
         arrays = self._there()
         upload = Upload(list(arrays.values()), device)
-        nothing = {field.name: None for field in fields(self)}
-
-        def uploaded() -> Decoded:
-            return Decoded(**nothing | dict(zip(arrays, upload.arrays(), strict=True)))  # pyright: ignore[reportArgumentType]
-
-        return uploaded
+        return lambda: replace(self, **dict(zip(arrays, upload.arrays(), strict=True)))
 
     def _there(self) -> dict[str, Tensor]:
         """Return the arrays that there are, by name."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: x for name, x in found.items() if x is not None}
+        return {name: x for name, x in vars(self).items() if x is not None}
 
 
 Item = TypeVar("Item")
 
 
 class Ahead(Generic[Item]):
-    """Results that are worked on in the background; none of them depends on when that is done.
-
-    Args:
-        work: returns the item of an index; it is called in other threads.
-        threads: number of these threads; 0: nothing is done ahead.
-    """
+    """Results that ``threads`` work on in the background, 0: none; none of them depends on when that is done."""
 
     def __init__(self, work: Callable[[int], Item], threads: int) -> None:
         self._work, self._threads = work, threads
@@ -80,12 +63,12 @@ class Ahead(Generic[Item]):
             return
         if self._process != os.getpid():  # threads do not survive a fork
             self._pool, self._pending, self._process = None, {}, os.getpid()
-        wanted = list(dict.fromkeys(indices))[: self.most]
-        for index in set(self._pending) - set(wanted):
+        expected = list(dict.fromkeys(indices))[: self.most]
+        for index in set(self._pending) - set(expected):
             dropped = self._pending.pop(index, None)
             if dropped is not None:
                 dropped.cancel()
-        for index in wanted:
+        for index in expected:
             if index not in self._pending:
                 if self._pool is None:
                     self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="dyngs-images")
@@ -99,11 +82,7 @@ class Ahead(Generic[Item]):
             pool.shutdown(wait=True, cancel_futures=True)
 
     def take(self, index: int) -> Item | None:
-        """Return the item of ``index``, when it is ready, or None where it was not expected.
-
-        Raises:
-            Exception: what the work on it raised.
-        """
+        """Return the item of ``index`` when it is ready, or raise what the work raised; None where not expected."""
         found = self._pending.pop(index, None)
         return None if found is None or self._process != os.getpid() else found.result()
 

@@ -17,13 +17,9 @@ ROTATION_TOLERANCE = 1e-3
 
 
 def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
-    """Return the rigid (4, 4) float64 transform nearest to ``matrix``, and its deviation from rigid.
+    """Return the rigid (4, 4) float64 transform nearest to ``matrix`` (4, 4) or (3, 4), in any convention.
 
-    Args:
-        matrix: (4, 4) or (3, 4), either direction and any axis convention.
-
-    Returns:
-        The pose, its rotation re-orthonormalised, and the largest entry of ``|R^T R - I|`` before that.
+    And by how much that was not rigid: the largest entry of ``|R^T R - I|``.
 
     Raises:
         DyngsError: not finite, not a pose, mirrored, scaled, or further than ``ROTATION_TOLERANCE`` from a rotation.
@@ -86,11 +82,7 @@ def camera_center(cam_from_world: np.ndarray) -> np.ndarray:
 
 
 def repair_warning(errors: dict[str, float]) -> list[str]:
-    """Return one line about the rotations that were not orthonormal, none if all were.
-
-    Args:
-        errors: origin of each pose to its deviation as ``checked_pose`` returned it.
-    """
+    """Return one line about the rotations that were not orthonormal, by origin, as ``checked_pose`` says; or none."""
     off = {where: error for where, error in errors.items() if error > 1e-5}
     if not off:
         return []
@@ -130,9 +122,7 @@ def match_size(
 ) -> tuple[np.ndarray, tuple[int, int], bool]:
     """Return the intrinsics for the stored image, its (width, height), and whether they were rescaled.
 
-    Args:
-        intrinsics: (3, 3) for an image of ``described`` (width, height).
-        stored: (width, height) of the file, None where it could not be opened.
+    From those of an image of ``described`` size; ``stored`` is that of the file, None where it could not be opened.
 
     Raises:
         DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal point.
@@ -177,21 +167,17 @@ NEAREST = 1e-9
 
 
 def projected(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of points in an image: (P, 2) in [0, 1] across and down, and (P,) whether they lie in it.
+    """Return the positions of points (P, 3) in an image: (P, 2) in [0, 1] across and down, and (P,) if they lie in it.
 
-    As a pinhole camera sees them; places of points that are not in the image mean nothing.
-
-    Args:
-        points: (P, 3) float64 in the world of the view.
-        view: its camera; only pose, intrinsics and size count.
+    As a pinhole camera sees them; positions of points that are not in the image mean nothing.
     """
     local = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
     in_front = local[:, 2] > NEAREST
     k, depth = view.intrinsics, np.where(in_front, local[:, 2], 1.0)
     across = (k[0, 0] * local[:, 0] / depth + k[0, 2]) / view.width
     down = (k[1, 1] * local[:, 1] / depth + k[1, 2]) / view.height
-    places = np.stack([across, down], axis=1)
-    return places, in_front & (places >= 0).all(axis=1) & (places < 1).all(axis=1)
+    positions = np.stack([across, down], axis=1)
+    return positions, in_front & (positions >= 0).all(axis=1) & (positions < 1).all(axis=1)
 
 
 def times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
@@ -203,12 +189,9 @@ def times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
 
 
 def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
-    """Return the (3,) point nearest to all optical axes (least squares), None where the axes are nearly parallel.
+    """Return the (3,) point nearest to all optical axes (least squares), None where they are nearly parallel.
 
-    It may lie behind the cameras; see ``fraction_in_front``.
-
-    Args:
-        world_from_cam: (V, 4, 4) rigid OpenCV poses.
+    Of (V, 4, 4) rigid OpenCV poses; it may lie behind the cameras, see ``fraction_in_front``.
     """
     centers, axes = world_from_cam[:, :3, 3], world_from_cam[:, :3, 2]
     middle = centers.mean(axis=0)

@@ -54,20 +54,18 @@ _SMALL_BYTES = 4
 
 @dataclass(frozen=True)
 class Image:
-    """The image of one view with its camera, as a training target.
+    """The image of the view ``name`` with its camera, as a training target; what a view does not have is None.
 
     Attributes:
-        name: name of the view.
         cameras: one pinhole camera (V = 1) of this image's size, float32.
         rgb_premultiplied: (H, W, 3) float32, colours times alpha.
-        alpha: (H, W) float32 in [0, 1], None where the file has no alpha.
+        alpha: (H, W) float32 in [0, 1].
         mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
-        time: in [0, 1] or None.
-        frame: the view's frame number or None.
-        moves: (H, W) float32, the fraction of each pixel that moves, by the motion mask; None without one.
-        depth: (H, W) float32 depth in the unit of its map, 0 where unknown; None without one.
-        flow: (H, W, 2) float32 displacement in pixels of this image up to the view ``flow_to``, NaN where unknown;
-            None without one.
+        time: in [0, 1].
+        frame: the view's frame number.
+        moves: (H, W) float32, the fraction of each pixel that moves, by the motion mask.
+        depth: (H, W) float32 depth in the unit of its map, 0 where unknown.
+        flow: (H, W, 2) float32 displacement in pixels of this image up to the view ``flow_to``, NaN where unknown.
     """
 
     name: str
@@ -89,21 +87,16 @@ class Image:
 
     def to(self, device: torch.device | str) -> Image:
         """Return the same image, with its camera, on another device."""
-        maps = {name: None if x is None else sent(x, device) for name, x in self._maps().items()}
-        return replace(
-            self,
-            cameras=self.cameras.to(device=device),
-            rgb_premultiplied=sent(self.rgb_premultiplied, device),
-            **maps,
-        )
+        tensors: dict[str, Tensor] = {name: sent(x, device) for name, x in self._tensors().items()}
+        return replace(self, cameras=self.cameras.to(device=device), **tensors)
 
     @property
     def num_bytes(self) -> int:
-        return self.rgb_premultiplied.nbytes + sum(x.nbytes for x in self._maps().values() if x is not None)
+        return sum(x.nbytes for x in self._tensors().values())
 
-    def _maps(self) -> dict[str, Tensor | None]:
-        """Return everything per pixel next to the colours, by name."""
-        return {name: getattr(self, name) for name in ("alpha", "mask", "moves", "depth", "flow")}
+    def _tensors(self) -> dict[str, Tensor]:
+        """Return everything per pixel that there is, by name."""
+        return {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
 
     def shrunk(self, factor: int) -> Image:
         """Return the image with both sides divided by ``factor``, averaged over pixel areas, and its camera."""
@@ -116,7 +109,6 @@ class Image:
             None if x is None else area_downscale(x[..., None], width, height)[..., 0]
             for x in (self.alpha, self.mask, self.moves)
         )
-        places = nearest_positions(width, height)
         return replace(
             self,
             cameras=Cameras(old.cam_from_world, scale[:, None] * old.intrinsics, width, height),
@@ -124,7 +116,7 @@ class Image:
             alpha=alpha,
             mask=None if mask is None else (mask > FULLY_KEPT).float(),
             moves=moves,
-            depth=None if self.depth is None else taken_at(self.depth[..., None], places)[..., 0],
+            depth=None if self.depth is None else _nearest(self.depth, nearest_positions(width, height)),
             flow=None if self.flow is None else resized(self.flow, width, height),
         )
 
@@ -155,8 +147,8 @@ class ImageLoader:
         Args:
             views: one split of a capture.
             options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count; None: the defaults.
-            with_maps: read depth maps and flow, too, where views have them.
-            decoding_threads: decode what is to be expected in so many threads; 0, or ``cache_mb`` 0: in none.
+            with_maps: read depth maps and flow, too.
+            decoding_threads: decode what is to be expected in so many threads; none if ``cache_mb`` is 0.
         """
         self._views = tuple(views)
         self._options = options = options or DataConfig(root=Path())
@@ -208,13 +200,11 @@ class ImageLoader:
         return self._with_camera(index, self._as_stored(index))
 
     def _with_camera(self, index: int, image: Image) -> Image:
-        """Return ``image`` with its camera corrected, on ``device``."""
         if self.corrected is not None:
             image = replace(image, cameras=self.corrected(index % len(self._views), image.cameras))
         return image if self.device.type == "cpu" else image.to(self.device)
 
     def _as_stored(self, index: int) -> Image:
-        """Return the image of view ``index`` with the camera of the capture."""
         view = self._views[index]
         decoded = self._decoded(index % len(self._views))
         height, width = decoded.pixels.shape[:2]
@@ -298,8 +288,8 @@ class ImageLoader:
     @property
     def bytes_to_come(self) -> int:
         """Bytes that images will take, in the cache or decoded ahead, beside those that they take now."""
-        whole = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._options.cache_mb * 1e6))
-        return max(whole - self.cached_bytes, 0)
+        every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._options.cache_mb * 1e6))
+        return max(every - self.cached_bytes, 0)
 
     @property
     def bytes_on_gpu(self) -> int:
@@ -308,8 +298,8 @@ class ImageLoader:
 
     def _bytes_of_all(self) -> int:
         """Return the bytes of all images once decoded; whether a file has alpha is not known, and taken as no."""
-        masks = [view.mask_path is not None for view in self._views]
-        return sum(w * h * (3 + mask) for (w, h), mask in zip(self.sizes, masks, strict=True))
+        sizes = zip(self._views, self.sizes, strict=True)
+        return sum(width * height * (3 + (view.mask_path is not None)) for view, (width, height) in sizes)
 
     @property
     def cached_bytes(self) -> int:
@@ -323,16 +313,14 @@ class ImageLoader:
 
     @property
     def _taken(self) -> int:
-        """Bytes that are taken where images are given out."""
+        """Bytes that are taken where images are given out, of ``_room``."""
         return self.cached_bytes if self._device == CPU else self._gpu_bytes + self._small_bytes
 
     @property
     def _room(self) -> float:
-        """Bytes that may be taken there."""
         return self._options.cache_mb * 1e6 if self._device == CPU else self._gpu_room
 
     def _decoded(self, index: int) -> Decoded:
-        """Return the decoded image ``index`` on ``device``."""
         with self._lock:
             if index in self._kept:
                 return self._kept[index]
@@ -346,7 +334,9 @@ class ImageLoader:
         """Return the decoded image ``index``, and its copy that is on its way to a GPU, if there is one."""
         with self._lock:
             decoded = self._cache.get(index)
-        decoded = self._read(index) if decoded is None else decoded
+        if decoded is None:
+            with images_up_to(self._options.max_megapixels):
+                decoded = self._decode(self._views[index])
         return decoded, None if self._device == CPU else decoded.upload(self._device)
 
     def _keep(self, index: int, decoded: Decoded, there: Decoded) -> None:
@@ -376,17 +366,14 @@ class ImageLoader:
         waiting = min(self._ahead.most, left) * size
         return self._taken + size + waiting <= self._room
 
-    def _read(self, index: int) -> Decoded:
-        with images_up_to(self._options.max_megapixels):
-            return self._decode(self._views[index])
-
     def _decode(self, view: View) -> Decoded:
         pixels = read_image(view.image_path, (view.width, view.height))
         if view.silhouette is not None:
             pixels = cut_out(pixels, view.silhouette)
-        mask = None if view.mask_path is None else read_mask(view.mask_path)
-        if mask is not None:
-            _require_shape(view, view.mask_path, mask, "mask")
+        mask = None
+        if view.mask_path is not None:
+            mask = read_mask(view.mask_path)
+            _require_size(view, view.mask_path, mask.shape, "mask")
         size = target_size(view.width, view.height, self._options.downscale, self._options.longest_side)
         maps = self._maps(view, size)
         if is_pinhole(view.lens) and size == (view.width, view.height):
@@ -409,18 +396,18 @@ class ImageLoader:
         if view.motion_mask_path is not None:
             read = read_labels if view.motion_mask_labels else read_mask
             moves = read(view.motion_mask_path).float()
-            _require_shape(view, view.motion_mask_path, moves, "motion mask")
+            _require_size(view, view.motion_mask_path, moves.shape, "motion mask")
             if lens_map is not None:
                 moves = undistort(moves[..., None], lens_map)[..., 0]
             maps["moves"] = area_downscale(moves[..., None], *size)[..., 0]
         if self._with_maps and view.depth_path is not None:
-            places = nearest_positions(*size, None if lens_map is None else lens_map.grid)
-            depth = taken_at(read_depth(view.depth_path)[..., None], places)[..., 0]
-            seen = None if lens_map is None else taken_at(lens_map.valid.float()[..., None], nearest_positions(*size))
-            maps["depth"] = depth if seen is None else depth * seen[..., 0]
+            positions = nearest_positions(*size, None if lens_map is None else lens_map.grid)
+            maps["depth"] = _nearest(read_depth(view.depth_path), positions)
+            if lens_map is not None:
+                maps["depth"] *= _nearest(lens_map.valid.float(), nearest_positions(*size))
         if self._with_maps and view.flow_path is not None:
             flow = read_flow(view.flow_path)
-            _require_shape(view, view.flow_path, flow, "flow field")
+            _require_size(view, view.flow_path, flow.shape, "flow field")
             maps["flow"] = flow_at(flow, view, size, lens_map)
         return maps
 
@@ -462,19 +449,20 @@ def check_files(views: Sequence[View]) -> None:
             )
         if view.mask_path is not None:
             mask = check_image(view.mask_path)
-            _require_size(view, view.mask_path, (mask.width, mask.height), "mask")
+            _require_size(view, view.mask_path, (mask.height, mask.width), "mask")
 
 
-def _require_shape(view: View, path: Path | None, found: Tensor, what: str) -> None:
-    _require_size(view, path, (found.shape[1], found.shape[0]), what)
-
-
-def _require_size(view: View, path: Path | None, size: tuple[int, int], what: str) -> None:
-    if size != (view.width, view.height):
+def _require_size(view: View, path: Path, shape: Sequence[int], what: str) -> None:
+    height, width = shape[:2]
+    if (width, height) != (view.width, view.height):
         raise DyngsError(
-            f"{path}: the {what} is {size[0]}x{size[1]} but its image is {view.width}x{view.height}; "
-            "make them the same size"
+            f"{path}: the {what} is {width}x{height} but its image is {view.width}x{view.height}; make them the same "
+            "size"
         )
+
+
+def _nearest(values: Tensor, positions: Tensor) -> Tensor:
+    return taken_at(values[..., None], positions)[..., 0]
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:

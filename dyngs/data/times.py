@@ -207,11 +207,7 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
 
 
 def parse_frames(text: str, key: str = "data.frames") -> slice:
-    """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at ``key``.
-
-    Raises:
-        DyngsError: anything else, or a step of 0.
-    """
+    """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at ``key``."""
     shown = printable(repr(text), 60)
     if not re.fullmatch(r"\s*([-+]?\d+)?\s*:\s*([-+]?\d+)?\s*(:\s*([-+]?\d+)?\s*)?", text, re.ASCII):
         raise DyngsError(f"{key}={shown}: write start:stop or start:stop:step in whole numbers, such as 0:100:2")
@@ -224,10 +220,8 @@ def parse_frames(text: str, key: str = "data.frames") -> slice:
 def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
     """Return the views at the times that the slice ``frames`` selects from the sorted distinct times of all splits.
 
-    The first selected time becomes 0 and the last one 1; a single one becomes 0.
-
-    Raises:
-        DyngsError: a bad slice, one that selects no time or no training view, or views without times.
+    The first selected time becomes 0 and the last one 1; a single one becomes 0. Raises DyngsError: a bad slice, one
+    that selects no time or no training view, or views without times.
     """
     distinct, picked = _picked_times(root, splits, frames, "data.frames")
     selected = _at_times(splits, distinct, picked)
@@ -243,10 +237,8 @@ def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tu
     """Return the splits without the times that the slice ``frames`` selects, and the views at these times.
 
     Where some cameras only have test views, the second are those of these cameras; otherwise those of all splits. Times
-    of both parts are scaled to [0, 1], as two clips.
-
-    Raises:
-        DyngsError: a bad slice, one that selects no time or all times with training views, or views without times.
+    of both parts are scaled to [0, 1], as two clips. Raises DyngsError: a bad slice, one that selects no time or all
+    times with training views, or views without times.
     """
     distinct, picked = _picked_times(root, splits, frames, "data.pose_frames")
     kept = _at_times(splits, distinct, sorted(set(distinct.values()) - set(picked)))
@@ -259,11 +251,7 @@ def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tu
 
 
 def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Splits:
-    """Return the views of the splits anew: those of ``cameras`` for training, those of all others for testing.
-
-    Raises:
-        DyngsError: a camera that has no images, or no other camera.
-    """
+    """Return the views of the splits anew: those of ``cameras`` for training, those of all others for testing."""
     views = all_views(splits)
     known = sorted({view.camera_id for view in views})
     unknown = sorted(set(cameras) - set(known))
@@ -305,7 +293,7 @@ def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
     """Return indices of views, in order of time, for each static camera with images at several times.
 
-    A camera is a pose, intrinsics, a lens and a size. Of several views with one camera and time the first is taken.
+    A camera is a pose, intrinsics, a lens and a size; of several views of one time the first is taken.
     """
     cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
     for i, view in enumerate(views):
@@ -316,7 +304,7 @@ def static_cameras(views: Sequence[View]) -> list[list[int]]:
 
 
 def are_scattered(views: Sequence[View]) -> bool:
-    """Return whether views in order of time jump about as if they were in any order."""
+    """Whether views in order of time jump about as if they were in any order."""
     centers = np.stack([inverse_rigid(view.cam_from_world)[:3, 3] for view in views])
     apart = np.linalg.norm(centers[:, None] - centers, axis=2)
     usual = float(np.median(apart[np.triu_indices(len(views), 1)]))
@@ -326,7 +314,7 @@ def are_scattered(views: Sequence[View]) -> bool:
 def videos(views: Sequence[View]) -> list[list[int]]:
     """Return indices of views, in order of time, for each video: of a fixed camera, or of the one that moves.
 
-    None where views without a common camera jump about in time.
+    No video where views without a common camera jump about in time.
     """
     fixed = static_cameras(views)
     if fixed:

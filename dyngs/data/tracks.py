@@ -22,9 +22,9 @@ class ImageTracks:
     """Tracks of P points in F images.
 
     Attributes:
-        names: of the F images: names of views, or their ``file_path`` as the capture's files have it.
+        names: (F,) names of views, or their ``file_path`` as the capture's files have it.
         xy: (F, P, 2) float32 in pixels of the stored images; the centre of the first pixel is (0.5, 0.5).
-        visible: (F, P) bool, the point is seen there; where it is not, ``xy`` means nothing.
+        visible: (F, P) bool; where a point is not seen, ``xy`` means nothing.
     """
 
     names: tuple[str, ...]
@@ -40,10 +40,7 @@ class ImageTracks:
 
 
 def read_tracks(path: Path) -> ImageTracks:
-    """Read tracks from a ``.npz`` with ``xy`` (F, P, 2), ``visible`` (F, P) and ``names`` (F,), text.
-
-    Positions that are not finite are taken as not visible.
-    """
+    """Read tracks from a ``.npz`` with the arrays of ``ImageTracks``; positions that are not finite are not visible."""
     if not path.is_file():
         raise DyngsError(f"{path}: no such tracks; restore them or remove tracks_file_path")
     arrays = read_npz(path, ("xy", "visible", "names"))
@@ -98,12 +95,7 @@ def write_true_tracks(root: Path, tracks: TrueTracks) -> Path:
 
 
 def read_true_tracks(root: Path, world_offset: np.ndarray) -> TrueTracks | None:
-    """Return the tracks of the capture in folder ``root``, in its recentred world; None where it has none.
-
-    Args:
-        root: the folder.
-        world_offset: (3,) of the capture, see ``Capture``.
-    """
+    """Return the tracks of the capture in ``root``, in its recentred world (see ``Capture``); None without any."""
     path = root / TRACKS_FILE
     if not inside(path).is_file():
         return None

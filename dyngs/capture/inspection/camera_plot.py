@@ -85,7 +85,7 @@ class _Panel:
 
 
 def _drawing_axes(poses: np.ndarray) -> np.ndarray:
-    """(3, 3) rows right, back and up of the drawing: up is the cameras' mean up."""
+    """Return (3, 3) rows right, back and up of the drawing: up is the cameras' mean up."""
     up = -poses[:, :3, 1].mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
     lead = np.eye(3)[np.abs(up).argmin()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +39,8 @@ def time_problems(capture: Capture) -> list[str]:
     """Return the problems of times and of who saw them: a moving scene must be seen from several sides."""
     views = all_views(capture.splits)
     timed = [view for view in views if view.time is not None]
-    problems = listed(
-        (view for view in timed if not 0 <= (view.time or 0.0) <= 1),
-        lambda view: f"'{view.name}': the time {view.time} is outside [0, 1]",
-    )
+    outside = [view for view in timed if not 0 <= (view.time or 0.0) <= 1]
+    problems = listed(f"'{view.name}': the time {view.time} is outside [0, 1]" for view in outside)
     if timed and len(timed) < len(views):
         problems.append(f"{len(views) - len(timed)} of {len(views)} views have no time")
     if _is_still_monocular(capture):
@@ -55,10 +53,7 @@ def time_problems(capture: Capture) -> list[str]:
 
 
 def scene_problems(capture: Capture) -> list[str]:
-    """Return the problems of poses and points together.
-
-    Cameras that look away from the scene, points that no camera sees, cameras that see no points.
-    """
+    """Return the problems of poses and points together: cameras that look away, points that no camera sees, .."""
     views = [view for view in all_views(capture.splits) if pose_fault(view) is None]
     if not views:
         return []
@@ -88,7 +83,6 @@ def scene_problems(capture: Capture) -> list[str]:
 
 
 def _odd_cameras(views: list[View], center: np.ndarray, what: str) -> list[str]:
-    """Few cameras that have the centre of the scene behind them, while nearly all have it in their image."""
     in_image = sum(_lies_in(center[None], view)[0] for view in views)
     local = [view.cam_from_world[2, :3] @ center + view.cam_from_world[2, 3] for view in views]
     away = [view.name for view, depth in zip(views, local, strict=True) if depth <= 0]
@@ -98,7 +92,6 @@ def _odd_cameras(views: list[View], center: np.ndarray, what: str) -> list[str]:
 
 
 def _point_problems(xyz: np.ndarray, views: list[View]) -> list[str]:
-    """Points outside every image and points much farther away than most, from a sample of points and views."""
     rng = np.random.default_rng(0)
     sample = xyz[rng.permutation(len(xyz))[:2000]]
     seen = np.zeros(len(sample), bool)
@@ -160,79 +153,51 @@ def _ill_posed(capture: Capture) -> list[str]:
     ]
 
 
-def listed(items: Iterable[Any], line: Callable[[Any], str]) -> list[str]:
-    """Return one line per item, and a count of those beyond ``MAX_LINES_PER_KIND``."""
-    lines = [line(item) for item in items]
-    if len(lines) <= MAX_LINES_PER_KIND:
-        return lines
-    return [*lines[:MAX_LINES_PER_KIND], f"... and {len(lines) - MAX_LINES_PER_KIND} more like the last one"]
+def listed(lines: Iterable[str]) -> list[str]:
+    """Return the lines, and a count of those beyond ``MAX_LINES_PER_KIND``."""
+    found = list(lines)
+    more = len(found) - MAX_LINES_PER_KIND
+    return [*found[:MAX_LINES_PER_KIND], f"... and {more} more like the last one"] if more > 0 else found
 
 
 def problems_of(capture: Capture, deep: bool) -> list[str]:
-    """Return one line for everything suspicious about a capture, beside its own warnings.
-
-    Args:
-        deep: decode every image instead of reading its header only.
-    """
-    problems = []
-    for check in (_split_problems, _name_problems, _pose_problems, _intrinsics_problems):
-        problems += check(capture)
-    problems += [*_image_problems(capture, deep), *mask_problems(capture)]
-    return [*problems, *time_problems(capture), *scene_problems(capture)]
-
-
-def _split_problems(capture: Capture) -> list[str]:
+    """Return a line for everything suspicious, beside the capture's own warnings; ``deep``: decode every image."""
+    views, train = all_views(capture.splits), capture.splits.get("train", ())
     problems = []
     if not capture.splits.get("test"):
         problems.append("the split 'test' is empty, so nothing can be measured (see data.test_every)")
-    if len(capture.splits.get("train", ())) < 3:
-        problems.append(f"only {len(capture.splits.get('train', ()))} training views; a scene needs some 20 or more")
-    return problems
-
-
-def _name_problems(capture: Capture) -> list[str]:
-    """Names and images that occur more than once."""
-    views = all_views(capture.splits)
-    names = Counter(view.name for view in views)
-    images = Counter(view.image_path for view in views)
-    doubled = listed(
-        (n for n, count in names.items() if count > 1), lambda n: f"the name '{n}' occurs {names[n]} times"
-    )
-    shared = listed((p for p, count in images.items() if count > 1), lambda p: f"{p} is the image of {images[p]} views")
-    return doubled + shared
-
-
-def _pose_problems(capture: Capture) -> list[str]:
-    views = all_views(capture.splits)
-    problems = listed((fault for fault in map(pose_fault, views) if fault is not None), str)
+    if len(train) < 3:
+        problems.append(f"only {len(train)} training views; a scene needs some 20 or more")
+    names, images = Counter(view.name for view in views), Counter(view.image_path for view in views)
+    problems += listed(f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1)
+    problems += listed(f"{path} is the image of {count} views" for path, count in images.items() if count > 1)
+    problems += listed(fault for view in views if (fault := pose_fault(view)) is not None)
     poses = Counter(view.cam_from_world.round(9).tobytes() for view in views if view.time is None)
     same = sum(count for count in poses.values() if count > 1)
     if same:
         problems.append(f"{same} views of a static scene share their pose with another one")
-    return problems
+    problems += listed(f"'{view.name}': {fault}" for view in views if (fault := _fault_of_intrinsics(view)) is not None)
+    problems += [*_image_problems(capture, deep), *mask_problems(capture)]
+    return [*problems, *time_problems(capture), *scene_problems(capture)]
 
 
-def _intrinsics_problems(capture: Capture) -> list[str]:
-    def faults() -> Iterator[str]:
-        for view in all_views(capture.splits):
-            k, width, height = view.intrinsics, view.width, view.height
-            fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
-            if not np.isfinite(k).all() or fx <= 0 or fy <= 0:
-                yield f"'{view.name}': the focal length ({fx:g}, {fy:g}) px is not a positive number"
-            elif not (0 <= cx <= width and 0 <= cy <= height):
-                yield f"'{view.name}': the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} image"
-            elif max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > 0.2:
-                yield f"'{view.name}': the principal point ({cx:g}, {cy:g}) is far from the middle of {width}x{height}"
-            elif not 0.9 < fx / fy < 1.1:
-                yield f"'{view.name}': the focal lengths ({fx:g}, {fy:g}) px differ by more than 10%"
-            elif not 0.05 < fx / max(width, height) < 50:
-                yield f"'{view.name}': a focal length of {fx:g} px does not suit a {width}x{height} image"
-
-    return listed(faults(), str)
+def _fault_of_intrinsics(view: View) -> str | None:
+    k, width, height = view.intrinsics, view.width, view.height
+    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+    if not np.isfinite(k).all() or fx <= 0 or fy <= 0:
+        return f"the focal length ({fx:g}, {fy:g}) px is not a positive number"
+    if not (0 <= cx <= width and 0 <= cy <= height):
+        return f"the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} image"
+    if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > 0.2:
+        return f"the principal point ({cx:g}, {cy:g}) is far from the middle of {width}x{height}"
+    if not 0.9 < fx / fy < 1.1:
+        return f"the focal lengths ({fx:g}, {fy:g}) px differ by more than 10%"
+    if not 0.05 < fx / max(width, height) < 50:
+        return f"a focal length of {fx:g} px does not suit a {width}x{height} image"
+    return None
 
 
 def _image_problems(capture: Capture, deep: bool) -> list[str]:
-    """Images and masks that are missing, unreadable, or of another size than their camera's."""
     unreadable, sizes, channels = [], [], Counter[int]()
     for view in all_views(capture.splits):
         for path in (view.image_path, view.mask_path):
@@ -250,18 +215,14 @@ def _image_problems(capture: Capture, deep: bool) -> list[str]:
                 sizes.append(f"{path} has {header.width}x{header.height} pixels, {camera}")
             if path == view.image_path:
                 channels[header.channels] += 1
-    problems = listed(unreadable, str) + listed(sizes, str)
+    problems = listed(unreadable) + listed(sizes)
     if len(channels) > 1:
         problems.append("images have different numbers of channels: " + tallied(channels))
     return problems
 
 
 def transforms_file_problems(root: Path, known: str) -> list[str]:
-    """Return the problems of ``transforms*.json`` files in a folder that no reader accepts.
-
-    Args:
-        known: the reader's error; lines that it holds already are left out.
-    """
+    """Return the problems of ``transforms*.json`` files that no reader accepts, but for those in ``known``."""
     problems = []
     for file in sorted(root.glob("transforms*.json")) if root.is_dir() else []:
         try:
@@ -277,12 +238,11 @@ def transforms_file_problems(root: Path, known: str) -> list[str]:
                 problems.append(f"{file}: holds no frames with 'file_path' and 'transform_matrix' ({why})")
             continue
         faults = (matrix_fault(pose, f"{file}: '{name}'") for name, pose in entries)
-        doubled = ((n, count) for n, count in names.items() if count > 1)
         if not entries:
             problems.append(f"{file} lists no frames")
-        problems += listed(missing, lambda n: f"{root / n}: no such image")
-        problems += listed((fault for fault in faults if fault is not None), str)
-        problems += listed(doubled, lambda item: f"the name '{item[0]}' occurs {item[1]} times")
+        problems += listed(f"{root / n}: no such image" for n in missing)
+        problems += listed(fault for fault in faults if fault is not None)
+        problems += listed(f"the name '{n}' occurs {count} times" for n, count in names.items() if count > 1)
     return [line for line in problems if line not in known]
 
 
@@ -305,7 +265,7 @@ def mask_problems(capture: Capture) -> list[str]:
         ignored = [1 - float(read_mask(view.mask_path).float().mean()) for view in looked_at if view.mask_path]
         if not ignored or sum(ignored) <= MOST_IGNORED * len(ignored):
             return []
-        brightest = _brightest(looked_at)
+        brightest = max(int(read_image(view.mask_path)[..., :3].max()) for view in looked_at if view.mask_path)
     except DyngsError:  # told of by those who check files
         return []
     fraction, first = sum(ignored) / len(ignored), looked_at[0].mask_path
@@ -315,7 +275,3 @@ def mask_problems(capture: Capture) -> list[str]:
         else "white counts and black is ignored: are they inverted?"
     )
     return [f"masks ignore {fraction:.0%} of the pixels in {len(ignored)} that were looked at, first {first}; {why}"]
-
-
-def _brightest(views: Sequence[View]) -> int:
-    return max(int(read_image(view.mask_path)[..., :3].max()) for view in views if view.mask_path)

@@ -36,6 +36,8 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
     focal_px = [float(f) for view in views for f in (view.intrinsics[0, 0], view.intrinsics[1, 1])]
     fov_deg = [float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views]
     centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3)
+    masked = sum(view.mask_path is not None for view in views)
+    file = "" if capture.points_file is None else f" ({capture.points_file.name})"
     facts = [
         ("format", capture.format),
         ("views", ", ".join(f"{len(views)} {split}" for split, views in capture.splits.items() if views)),
@@ -46,10 +48,10 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
         ("lens", tallied(lenses) + _kept(views)),
         *_exposures(views),
         ("alpha", "transparent background" if capture.has_alpha else "none"),
-        ("masks", _masks(views)),
+        ("masks", f"{masked} of {len(views)} images; white counts, black is ignored" if masked else "none"),
         *_prior_facts(capture),
         *_time_facts(capture),
-        ("points", _points(capture)),
+        ("points", "none" if capture.points is None else f"{len(capture.points.xyz)}{file}"),
     ]
     if len(centers):
         spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
@@ -91,17 +93,6 @@ def _exposures(views: Sequence[View]) -> list[tuple[str, str]]:
     if factor < SAME_LIGHT:
         return [("exposure", f"{said}the same")]
     return [("exposure", f"{said}up to {factor:.3g} times as much light; train.exposure=auto finds out if it matters")]
-
-
-def _masks(views: Sequence[View]) -> str:
-    count = sum(view.mask_path is not None for view in views)
-    return f"{count} of {len(views)} images; white counts, black is ignored" if count else "none"
-
-
-def _points(capture: Capture) -> str:
-    if capture.points is None:
-        return "none"
-    return str(len(capture.points.xyz)) + ("" if capture.points_file is None else f" ({capture.points_file.name})")
 
 
 def _prior_facts(capture: Capture) -> Iterator[tuple[str, str]]:
@@ -156,33 +147,19 @@ def _range(values: Iterable[float]) -> str:
 
 @dataclass(frozen=True)
 class InspectReport:
-    """Facts and problems of a capture.
-
-    Attributes:
-        root: the capture folder.
-        capture: as it was read, None where that failed.
-        facts: (name, value) pairs for people, in order.
-        problems: everything suspicious, one line each; empty for a capture that looks right.
-    """
+    """Facts of a capture, (name, value) pairs in order, and all that is suspicious; no ``capture`` if unreadable."""
 
     root: Path
     capture: Capture | None
     facts: tuple[tuple[str, str], ...]
     problems: tuple[str, ...]
 
-    @property
-    def ok(self) -> bool:
-        """Whether there are no problems."""
-        return not self.problems
-
 
 def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectReport:
     """Return a report on the capture at ``source``; what makes a capture unreadable is a problem in it, no error.
 
-    Args:
-        source: the folder, or the options by which it would be read.
-        deep: decode every image in full and videos to files, which is slow and finds truncated files; otherwise
-            only headers are read, and frames of videos only where they are decoded already.
+    ``deep``: every image is decoded in full and videos to files, which is slow and finds truncated files; otherwise
+    only headers are read, and frames of videos only where they are decoded already.
     """
     from dyngs.data.read import read_capture
 
@@ -193,9 +170,9 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
         with images_up_to(options.max_megapixels), reading(options.root, "`dyngs --debug` shows where"):
             report = report_on(capture, deep)
     except DyngsError as error:
-        more = (*listed(links, str), *transforms_file_problems(options.root, str(error)))
+        more = (*listed(links), *transforms_file_problems(options.root, str(error)))
         return InspectReport(options.root, None, (), (str(error), *more))
-    return replace(report, problems=(*listed(links, str), *report.problems))
+    return replace(report, problems=(*listed(links), *report.problems))
 
 
 def report_on(capture: Capture, deep: bool = False) -> InspectReport:
@@ -213,7 +190,7 @@ def format_report(report: InspectReport) -> str:
     width = max((len(name) for name, _ in report.facts), default=0)
     lines = [f"capture {report.root}"]
     lines += [f"  {name:<{width}}  {value}" for name, value in report.facts]
-    if report.ok:
+    if not report.problems:
         lines.append("nothing suspicious")
     else:
         lines.append(f"suspicious ({len(report.problems)}):")

@@ -46,11 +46,7 @@ class VideoFacts:
 
 
 def video_report(path: Path) -> str:
-    """Return a report on a video file, or on the videos of a folder, as lines of text.
-
-    Raises:
-        DyngsError: a video that cannot be read.
-    """
+    """Return a report on a video file, or on the videos of a folder, as lines of text."""
     if path.is_file():
         found = video_facts(path)
         return "\n".join([*_lines(found), *_next(path, found)])
@@ -95,13 +91,9 @@ def _look(film: Film) -> tuple[SmallImages, np.ndarray]:
 
 
 _ORIENTATIONS = (
-    "",
-    "mirrored",
-    "rotated by 180 degrees",
-    "mirrored upside down",
-    "mirrored and rotated by 270 degrees",
-)
-_ORIENTATIONS += ("rotated by 90 degrees", "mirrored and rotated by 90 degrees", "rotated by 270 degrees")
+    "", "mirrored", "rotated by 180 degrees", "mirrored upside down", "mirrored and rotated by 270 degrees",
+    "rotated by 90 degrees", "mirrored and rotated by 90 degrees", "rotated by 270 degrees",
+)  # fmt: skip
 """What is done to frames on reading, by their orientation."""
 
 

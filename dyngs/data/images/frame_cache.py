@@ -12,7 +12,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -45,13 +45,7 @@ _locked: dict[Path, BinaryIO] = {}
 
 @dataclass(frozen=True)
 class VideoFrames:
-    """Frames of a video in the cache, decoded or not.
-
-    Attributes:
-        info: size, length and frame rate of the video.
-        source: the video.
-        paths: one image file per frame, in order; ``decode_frames`` writes those that are missing.
-    """
+    """Image files of the frames of the video ``source``, in order; ``decode_frames`` writes those that are missing."""
 
     info: VideoInfo
     source: Path
@@ -78,17 +72,14 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
     """Decode the frames whose image is missing; every file is written atomically.
 
     The total size is estimated from the frames written so far, from the first on, so that too much is refused early.
-    The least recently used frames of other captures are removed to make room, unless a running process uses them.
-
-    Args:
-        frames: image file, as ``planned_frames`` named it, to the frame of a video that it holds.
-        limit_mb: 1e6 bytes on disk that all cached frames together may take.
+    The least recently used frames of other captures are removed to make room, unless a running process uses them. All
+    may take ``limit_mb`` 1e6 bytes on disk.
 
     Raises:
         DyngsError: a damaged video (names it and the frame), more than the limit or than the disk has (says how much).
     """
-    wanted = {path.parent: frame.video for path, frame in frames.items()}
-    for folder in wanted:
+    videos = {path.parent: frame.video for path, frame in frames.items()}
+    for folder in videos:
         _lock(folder)
     missing: dict[Path, list[int]] = {}
     for path in sorted(frames):
@@ -97,10 +88,10 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
     if not missing:
         return
     need, count, written = sum(map(len, missing.values())), 0, 0
-    space = _DiskSpace(root, frozenset(wanted), limit_mb)
+    space = _DiskSpace(root, frozenset(videos), limit_mb)
     for folder, numbers in missing.items():
-        _make(folder, wanted[folder])
-        for number, rgb in read_numbered_frames(wanted[folder], numbers):
+        _make(folder, videos[folder])
+        for number, rgb in read_numbered_frames(videos[folder], numbers):
             path = folder / f"frame_{number:06d}.png"
             _write_png(path, rgb)
             count, written = count + 1, written + path.stat().st_size
@@ -207,7 +198,8 @@ class _DiskSpace:
                 f"{self._root}: the frames of its videos need about {total / 1e6:.4g} MB on disk{others}, but "
                 f"data.frame_cache_mb is {self._limit_mb:g}; raise it, or choose fewer with data.frames=start:stop:step"
             )
-        self._elsewhere -= _removed(self._kept, self._elsewhere + total - limit)
+        if self._elsewhere + total > limit:
+            self._elsewhere -= _removed(self._kept, self._elsewhere + total - limit)
         if self._elsewhere + total > limit:
             raise DyngsError(
                 f"{cache}: the frames of other videos, which are in use, take {self._elsewhere / 1e6:.4g} MB, and "
@@ -226,13 +218,9 @@ class _DiskSpace:
 def _removed(kept: frozenset[Path], too_much: float) -> int:
     """Remove the least recently used frames, except in ``kept``, until ``too_much`` bytes are freed; return these."""
     gone = 0
-    if too_much <= 0:
-        return gone
     others = [folder for folder in _our_folders() if folder not in kept and folder not in _locked]
     for folder in sorted(others, key=lambda folder: (folder / _MARK_NAME).stat().st_mtime_ns):
-        if gone >= too_much:
-            break
-        gone += _remove(folder)
+        gone += _remove(folder) if gone < too_much else 0
     return gone
 
 
@@ -251,11 +239,11 @@ def _remove(folder: Path) -> int:
         with (folder / _MARK_NAME).open("rb") as mark:
             if fcntl is not None:
                 fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            frames = [path for path in _own_files(folder) if path.name != _MARK_NAME]
-            for path in frames:
-                size = path.stat().st_size
-                path.unlink()
-                freed += size
+            for path in _own_files(folder):
+                if path.name != _MARK_NAME:
+                    size = path.stat().st_size
+                    path.unlink()
+                    freed += size
         (folder / _MARK_NAME).unlink()
         folder.rmdir()
     except OSError:
@@ -263,12 +251,11 @@ def _remove(folder: Path) -> int:
     return freed
 
 
-def _own_files(folder: Path) -> Iterator[Path]:
-    """Yield the regular files of a folder that are named like ours."""
+def _own_files(folder: Path) -> list[Path]:
+    """Return the regular files of a folder that are named like ours."""
     with os.scandir(folder) as entries:
-        for found in entries:
-            if found.is_file(follow_symlinks=False) and _OUR_FILES.fullmatch(found.name):
-                yield Path(found.path)
+        ours = [x for x in entries if x.is_file(follow_symlinks=False) and _OUR_FILES.fullmatch(x.name)]
+    return [Path(found.path) for found in ours]
 
 
 def _num_bytes(folder: Path) -> int:

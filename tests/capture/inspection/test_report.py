@@ -42,7 +42,7 @@ def _with_view(capture: Capture, **changes: Any) -> Capture:
 
 def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
     report = report_on(_capture(tmp_path), deep=True)
-    assert report.ok, report.problems
+    assert not report.problems, report.problems
     text = format_report(report)
     for fact in ("5 train, 1 test", "32x24", "40 px", "43.6 degrees", "200", "nothing suspicious"):
         assert fact in text, text
@@ -52,7 +52,7 @@ def test_the_demo_capture_is_quiet(tmp_path: Path) -> None:
     root = write_still_capture(tmp_path / "demo", StillOptions(size=16, num_train=4, num_test=2, samples=1))
     for source in (root, DataConfig(root=root)):  # type: ignore[call-arg]
         report = inspect_capture(source)
-        assert report.ok, report.problems
+        assert not report.problems, report.problems
         assert "transparent background" in format_report(report)
 
 
@@ -150,7 +150,7 @@ def test_no_capture_at_all_is_a_problem_not_an_error(tmp_path: Path, content: st
         (tmp_path / "transforms_train.json").write_text(content)
     report = inspect_capture(tmp_path if content is not None else tmp_path / "none")
     assert report.capture is None
-    assert not report.ok
+    assert report.problems
     assert str(tmp_path) in format_report(report)
 
 
@@ -176,7 +176,7 @@ def _sequence(root: Path, cameras: int, times: int) -> Capture:
 
 def test_cameras_by_times(tmp_path: Path) -> None:
     report = report_on(_sequence(tmp_path, 4, 3))
-    assert report.ok, report.problems
+    assert not report.problems, report.problems
     facts = dict(report.facts)
     assert facts["times"] == "3 in 0 to 1"
     assert facts["sequence"] == "4 cameras x 3 times, 12 images"
@@ -200,14 +200,14 @@ def test_videos_are_not_decoded_to_be_inspected(tmp_path: Path) -> None:
         write_video(tmp_path / f"cam0{i}.mp4", 3, fps=25)
     before = sorted(tmp_path.iterdir())
     report = inspect_capture(tmp_path)
-    assert report.ok, report.problems
+    assert not report.problems, report.problems
     facts = dict(report.facts)
     assert (facts["frame rate"], facts["sequence"]) == ("25 per second", "4 cameras x 3 times, 12 images")
     assert facts["video frames"] == "0 of 12 are decoded already"
     assert sorted(tmp_path.iterdir()) == before
     edit_json(tmp_path / "cameras.json", lambda content: content.update(fps=24))
     report = inspect_capture(tmp_path, deep=True)
-    assert report.ok, report.problems
+    assert not report.problems, report.problems
     assert dict(report.facts)["frame rate"] == "24 per second"
     assert dict(report.facts)["video frames"] == "12 of 12 are decoded already"
 
@@ -247,7 +247,7 @@ def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
     """Also those that no image needs; and an image that lies outside is the first problem."""
     root = tmp_path / "capture"
     write_still_capture(root, StillOptions(size=8, num_train=4))
-    assert inspect_capture(root).ok
+    assert not inspect_capture(root).problems
     (root / "notes").symlink_to(tmp_path)
     report = inspect_capture(root)
     assert report.capture is not None
