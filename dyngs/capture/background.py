@@ -21,23 +21,18 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 
-NOISE = 1.5
-"""Least standard deviation of the background that is expected, grey levels."""
+NOISE = 1.5  # least standard deviation of the background that is expected, grey levels
 LOW, HIGH = 5.0, 12.0
 """Differences, in standard deviations, above which a pixel may be, and is, the person: what may be is, where it touches
 what is."""
-GAP = 0.006
-"""Half the width of gaps that are closed, as a fraction of the image's longer side."""
+GAP = 0.006  # half the width of gaps that are closed, as a fraction of the image's longer side
 OFTEN, MOST_STAYING = 0.4, 0.1
 LEAST_ON_EDGES, LEAST_AREA = 0.8, 1e-3
 """Limits of what can be trusted. Two people walking by, and on the spot: on edges 0.96 to 1.00, and 0.56 to 0.79;
 staying 0.00, and 0.14 to 0.61."""
-LEAST_FRACTION = 0.1
-"""Smaller parts than this fraction of the largest are left out."""
-SHADE = (0.5, 0.97)
-"""Range of brightness, as a fraction of the background's, that a shadow has."""
-SHADE_SPREAD = 0.08
-"""Largest spread of that fraction, of its mean, in a window where it is a shadow."""
+LEAST_FRACTION = 0.1  # smaller parts than this fraction of the largest are left out
+SHADE = (0.5, 0.97)  # range of brightness, as a fraction of the background's, that a shadow has
+SHADE_SPREAD = 0.08  # largest spread of that fraction, of its mean, in a window where it is a shadow
 _WINDOW = 5
 _SMOOTH = 0.7
 EDGE, HALF = 2, 0.45
@@ -164,12 +159,9 @@ def _disc(radius: int) -> np.ndarray:
     return rows**2 + columns**2 <= radius**2 + radius
 
 
-SAMPLES = 41
-"""Images of a camera whose median is the background."""
-LEAST = 8
-"""Least number of images of a camera."""
-SIDE = 960
-"""Longest side of the images that are compared, px."""
+SAMPLES = 41  # images of a camera whose median is the background
+LEAST = 8  # least number of images of a camera
+SIDE = 960  # longest side of the images that are compared, px
 _MOVES = "moves, so there is no background to compare with; give masks of the person (--masks)"
 _ADVICE = "give masks of the person (--masks), or an image of the place without them (--background)"
 

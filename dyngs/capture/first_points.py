@@ -69,18 +69,13 @@ def with_first_points(
     return capture.replace(points=points), lines
 
 
-SAMPLE = 2000
-"""Points that are looked at."""
+SAMPLE = 2000  # points that are looked at
 LONGEST_SIDE = 240
 """Of the images that they are looked at in, px."""
-GROUPS, GROUP = 3, 5
-"""Groups of images from about the same time step, and images of each."""
-MIN_SEEN = 0.1
-"""Points of which a smaller fraction lies in any image do not belong to the cameras."""
-COLOURS_FIT, PLACES_FIT = 0.85, 0.9
-"""Points fit if their error is smaller than that of chance by this factor."""
-_INNER = (2.0, 98.0)
-"""Percentiles of the points between which random ones are drawn."""
+GROUPS, GROUP = 3, 5  # groups of images from about the same time step, and images of each
+MIN_SEEN = 0.1  # points of which a smaller fraction lies in any image do not belong to the cameras
+COLOURS_FIT, PLACES_FIT = 0.85, 0.9  # points fit if their error is smaller than that of chance by this factor
+_INNER = (2.0, 98.0)  # percentiles of the points between which random ones are drawn
 
 
 def points_fault(points: PointCloud, views: Sequence[View], options: DataConfig) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from dyngs.config import DataConfig
@@ -19,20 +19,9 @@ from dyngs.files.wrong_place import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
 """``Capture.format`` of what is read here."""
-MOST_FRAMES = 60
-"""Frames that are taken where ``data.frames`` names none."""
+MOST_FRAMES = 60  # frames that are taken where ``data.frames`` names none
 FOCAL = 1.2
 """Guessed focal length, as a fraction of the longest side of the images: between a phone's and a film camera's."""
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """Frames of a clip, in order: names with suffix, image files, and of a video where they are from."""
-
-    names: tuple[str, ...]
-    paths: tuple[Path, ...]
-    videos: tuple[VideoFrame | None, ...]
-    fps: float | None = None
 
 
 def is_plain_clip(source: Path) -> bool:
@@ -59,44 +48,43 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     """
     source = options.root
     with staying_within(source if source.is_dir() else source.parent, options.follow_links), reading(source):
-        found = _frames_of(source)
-    numbers = _chosen(options, len(found.names))
+        paths, fps = _frames_of(source)
+    numbers = _chosen(options, len(paths))
+    videos = {paths[i]: VideoFrame(source, i) for i in numbers} if source.is_file() else {}
     with images_up_to(options.max_megapixels), reading(source):
-        if found.videos[0] is not None:
-            wanted = {found.paths[i]: video for i in numbers if (video := found.videos[i]) is not None}
-            decode_frames(source, wanted, options.frame_cache_mb)
-        headers = [read_header(found.paths[i]) for i in numbers]
-    silhouettes = None if masks is None else silhouettes_of(masks, [found.names[i] for i in numbers])
+        decode_frames(source, videos, options.frame_cache_mb)
+        headers = [read_header(paths[i]) for i in numbers]
+    silhouettes = None if masks is None else silhouettes_of(masks, [paths[i].name for i in numbers])
     first = headers[0]
     check_size(source, first.width, first.height, first.channels)
     width, height = first.upright_size
     other = next((i for i, x in zip(numbers, headers, strict=True) if x.upright_size != (width, height)), None)
     if other is not None:
         raise DyngsError(
-            f"{found.paths[other]}: has another size than {found.paths[numbers[0]].name}; give the frames of one camera"
+            f"{paths[other]}: has another size than {paths[numbers[0]].name}; give the frames of one camera"
         )
     focal = first.tags.focal_px or FOCAL * max(width, height)
     intrinsics = pinhole_matrix(focal, focal, width / 2, height / 2)
     last = max(len(numbers) - 1, 1)
     views = tuple(
         View(
-            name=Path(found.names[i]).with_suffix("").as_posix(),
-            image_path=found.paths[i],
+            name=paths[i].stem,
+            image_path=paths[i],
             cam_from_world=OPENGL_FROM_OPENCV.copy(),
             intrinsics=intrinsics,
             width=width,
             height=height,
             time=row / last,
             frame=row,
-            video=found.videos[i],
+            video=videos.get(paths[i]),
             silhouette=None if silhouettes is None else silhouettes[row],
         )
         for row, i in enumerate(numbers)
     )
     has_alpha = masks is not None or first.has_alpha
-    note = f"{len(numbers)} of {len(found.names)} frames, focal length {focal:.0f} px "
+    note = f"{len(numbers)} of {len(paths)} frames, focal length {focal:.0f} px "
     note += "by the EXIF tags" if first.tags.focal_px else "guessed"
-    return Capture(source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=found.fps, warnings=(note,))
+    return Capture(source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note,))
 
 
 def zoomed(view: View, factor: float, distance: float) -> View:
@@ -110,19 +98,17 @@ def zoomed(view: View, factor: float, distance: float) -> View:
     return replace(view, intrinsics=intrinsics, cam_from_world=pose)
 
 
-def _frames_of(source: Path) -> _Frames:
+def _frames_of(source: Path) -> tuple[Sequence[Path], float | None]:
+    """Return the image files of the frames of a clip, in order, and the frame rate of a video."""
     if source.is_file():
         planned = planned_frames(source)
-        names = tuple(f"frame_{number:06d}.png" for number in range(len(planned.paths)))
-        videos = tuple(VideoFrame(source, number) for number in range(len(planned.paths)))
-        if not names:
+        if not planned.paths:
             raise DyngsError(f"{source}: the video holds no image; copy it again")
-        return _Frames(names, planned.paths, videos, planned.info.fps or None)
+        return planned.paths, planned.info.fps or None
     images = _images_of(source)
     if not images:
         raise DyngsError(f"{source}: holds no images; give a folder of the frames of a clip, or a video")
-    names = tuple(path.name for path in images)
-    return _Frames(names, tuple(inside(path) for path in images), (None,) * len(images))
+    return [inside(path) for path in images], None
 
 
 def _images_of(folder: Path) -> list[Path]:
@@ -143,8 +129,7 @@ def _chosen(options: DataConfig, count: int) -> list[int]:
 def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
     """Return the masks (white = the person) in a folder of the named images.
 
-    Raises:
-        DyngsError: no folder, or an image without a mask.
+    Raises DyngsError: no folder, or an image without a mask.
     """
     if not masks.is_dir():
         raise DyngsError(f"no such folder of masks: {masks}")

@@ -65,10 +65,8 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
     Photos that lie on their side by their EXIF tag are copied as they are: the model's sizes say that they are to be
     rotated, and readers of ours do. Those that are upside down, mirrored or square cannot be told by their size: they
     are written upright, as PNG, and so are HEIC photos and the first frame of GIF files. Hidden files and those of
-    ``out``, the capture that will be made, are left out; images that are there already are left.
-
-    Raises:
-        DyngsError: a file is no image, truncated, too large, or lies outside the folder; pillow-heif is missing.
+    ``out``, the capture that will be made, are left out; images that are there already are left. Raises DyngsError: a
+    file is no image, truncated, too large, or lies outside the folder; pillow-heif is missing.
     """
     result = out.resolve()
     files = [file for file in _files_below(source) if result not in file.resolve().parents]
@@ -96,17 +94,9 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
 
 
 def copied(source: Path, target: Path) -> None:
-    """Make ``target`` a copy of a file, atomically; file systems that share blocks until one is written do so."""
+    """Make ``target`` a copy of a file, atomically."""
     with atomic_file(target) as temporary:
-        try:
-            with source.open("rb") as given, temporary.open("wb") as new:
-                while os.copy_file_range(given.fileno(), new.fileno(), 2**30):
-                    pass
-            is_whole = temporary.stat().st_size == source.stat().st_size
-        except (AttributeError, OSError):  # another system, or two file systems
-            is_whole = False
-        if not is_whole:
-            shutil.copyfile(source, temporary)
+        shutil.copyfile(source, temporary)
 
 
 def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str, Path]) -> list[str]:

@@ -12,12 +12,10 @@ import numpy as np
 from dyngs.capture.sfm_work import LENS, LONGEST_SIDE, MAX_FEATURES, SfmTask, feature_options, match_listed
 
 _AT_ONCE, _MATCHING_CALLS = 8, 16
-_SMALL_PX = 1000
-"""Images up to this long are doubled in size for finding features: they have few otherwise."""
+_SMALL_PX = 1000  # images up to this long are doubled in size for finding features: they have few otherwise
 _PEAK = 0.02 / 3
 _STRONGER, _TRIED = (1.0, 1.5, 2.0, 3.0, 4.0), 3
-ENOUGH = 4000
-"""Features of a frame of a video, on average over three of them, above which weak ones are left out."""
+ENOUGH = 4000  # features of a frame of a video, on average over three of them, above which weak ones are left out
 
 
 def find_features(task: SfmTask) -> float:
@@ -131,8 +129,7 @@ def _enter_focal_lengths(task: SfmTask) -> None:
 _EXHAUSTIVE_PHOTOS, _EXHAUSTIVE_FRAMES = 60, 24
 _STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Distances in the order of names at which images are compared: dense near, sparse far (loops of a few seconds)."""
-_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24
-"""Images that look most alike, compared with each one beside its neighbours."""
+_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24  # images that look most alike, compared with each one beside its neighbours
 _WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
 
 

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 Mapper = Literal["global", "incremental"]
 GOOD_ERROR_PX = 1.5
 """Mean reprojection error, in pixels of images up to 1,000 px long, above which the other mapping is tried, too."""
-GOOD_AGREEMENT = 0.9
-"""Fraction of matched pairs that fit the poses, below which the other mapping is tried, too."""
+GOOD_AGREEMENT = 0.9  # fraction of matched pairs that fit the poses, below which the other mapping is tried, too
 _TRACKS_PER_IMAGE = 400
 """Points of an image that global mapping places at first, those seen in most images; the others are added to the
 poses found. All of them take two to three times as long, for the same points in the end."""

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 _FITS_PX = 4.0
 """Median distance from the epipolar lines up to which a pair fits its poses, in pixels of images up to 1,000 px."""
-_WELL = 30
-"""Matches of a pair that is looked at."""
+_WELL = 30  # matches of a pair that is looked at
 _MOST_FITTED_PAIRS = 2000
 
 
@@ -70,20 +69,15 @@ def turning_fraction(database: Path) -> float:
     return sum(kind in flat for kind in found) / len(found) if found else 0.0
 
 
-_MOST_PAIRS, _MOST_MATCHES = 120, 200
-"""Pairs, and matches of each, that are looked at."""
+_MOST_PAIRS, _MOST_MATCHES = 120, 200  # pairs, and matches of each, that are looked at
 _FOCALS = np.geomspace(0.4, 3.0, 13)
 """Focal lengths that are tried, as fractions of the image's longest side."""
-_FINE = 9
-"""Focal lengths that are tried between the neighbours of the best of these."""
-_ROUNDS = 3
-"""How often a turn is found anew from the matches that it explains best."""
-_WIDEST, _FAR = 90, 75
-"""Percentiles: of the pairs, and of the matches of a pair."""
+_FINE = 9  # focal lengths that are tried between the neighbours of the best of these
+_ROUNDS = 3  # how often a turn is found anew from the matches that it explains best
+_WIDEST, _FAR = 90, 75  # percentiles: of the pairs, and of the matches of a pair
 _NONE, _NONE_PX = 0.0015, 1.0
 """Parallax below which the camera did not move: fraction of the longest side, and pixels."""
-_SMALL, _SMALL_PX = 0.008, 2.0
-"""The same, below which it hardly moved."""
+_SMALL, _SMALL_PX = 0.008, 2.0  # the same, below which it hardly moved
 _COVERED, _CELLS = 0.5, 8
 """Fraction of the image that matches must cover to tell that, in cells of which the longest side has so many."""
 

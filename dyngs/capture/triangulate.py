@@ -36,20 +36,15 @@ MIN_CLIP_POINTS = 1000
 LONGEST_SIDE = 1000
 MAX_FEATURES = 2048
 """SIFT features per image."""
-CLIP_IMAGES = 50
-"""Images of a clip, evenly spaced in time, that points are triangulated from."""
-TIME_STEPS = (1, 2, 4, 8)
-"""Each image of a clip is matched with those so many images before and after it,"""
-OVERLAPPING = 4
-"""and with so many others that share most of what they see."""
+CLIP_IMAGES = 50  # images of a clip, evenly spaced in time, that points are triangulated from
+TIME_STEPS = (1, 2, 4, 8)  # each image of a clip is matched with those so many images before and after it
+OVERLAPPING = 4  # and with so many others that share most of what they see
 MAX_TURN = 45.0
 """Degrees between the optical axes beyond which images are not matched for their overlap: SIFT does not."""
 MAX_ERROR, PRECISION = 0.002, 1.0
 """Mean reprojection error of a track over a clip: in longer sides of the image, and in px, which SIFT needs."""
-GREY = 0.5
-"""Background of images with alpha."""
-_PROBES = 4000
-"""Random points by which the overlap of images is judged."""
+GREY = 0.5  # background of images with alpha
+_PROBES = 4000  # random points by which the overlap of images is judged
 
 
 def views_of_a_time_step(views: Sequence[View], limit: int) -> list[View]:

@@ -78,8 +78,7 @@ def with_poses(
 def is_unposed(data: DataConfig) -> bool:
     """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of captures knows.
 
-    Raises:
-        DyngsError: a folder of a single video: names it.
+    Raises DyngsError: a folder of a single video: names it.
     """
     root = data.root
     if root.is_file():

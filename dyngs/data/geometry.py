@@ -19,10 +19,8 @@ ROTATION_TOLERANCE = 1e-3
 def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
     """Return the rigid (4, 4) float64 transform nearest to ``matrix`` (4, 4) or (3, 4), in any convention.
 
-    And by how much that was not rigid: the largest entry of ``|R^T R - I|``.
-
-    Raises:
-        DyngsError: not finite, not a pose, mirrored, scaled, or further than ``ROTATION_TOLERANCE`` from a rotation.
+    And by how much that was not rigid: the largest entry of ``|R^T R - I|``. Raises DyngsError: not finite, not a pose,
+    mirrored, scaled, or further than ``ROTATION_TOLERANCE`` from a rotation.
     """
     if matrix.shape not in ((4, 4), (3, 4)):
         raise DyngsError(f"{where}: the pose must be a 4x4 matrix, got shape {matrix.shape}; export it again")
@@ -123,9 +121,8 @@ def match_size(
     """Return the intrinsics for the stored image, its (width, height), and whether they were rescaled.
 
     From those of an image of ``described`` size; ``stored`` is that of the file, None where it could not be opened.
-
-    Raises:
-        DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal point.
+    Raises DyngsError: another aspect ratio, so that no rescaling is right; an implausible focal length or principal
+    point.
     """
     _check_plausible(intrinsics, described, where)
     if stored is None or stored == described:

@@ -42,8 +42,7 @@ from dyngs.files.containment import images_up_to
 from dyngs.ops.device import CPU, gpu_memory
 from dyngs.ops.transfer import sent
 
-FULLY_KEPT = 1 - 1e-4
-"""Mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding."""
+FULLY_KEPT = 1 - 1e-4  # mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
 
 GPU_FRACTION = 0.25
 """Fraction of the free memory of a GPU that images may take: the rest is for the scene and what is drawn."""

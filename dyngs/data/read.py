@@ -40,8 +40,7 @@ from dyngs.errors import DyngsError, NoCaptureError, reading
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
 
-FARTHEST = 1e18
-"""Points with larger coordinates are dropped as mistakes; their squares would not fit into float32."""
+FARTHEST = 1e18  # points with larger coordinates are dropped as mistakes; their squares would not fit into float32
 
 _PRIORS = {"depth_path": "depth maps", "motion_mask_path": "motion masks", "flow_path": "flow fields"}
 """Files of priors that a capture may name, none of them required: fields of views, and what they are called."""

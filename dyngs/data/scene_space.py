@@ -12,16 +12,13 @@ from dyngs.data.capture import Capture, PointCloud, View, all_views, each_view
 from dyngs.data.geometry import camera_center, focus_point, fraction_in_front, inverse_rigid, times_seen
 from dyngs.data.times import evenly_spaced
 
-NEAR_PER_FOCUS = 0.25
-"""Nearest depth, in distances from the cameras to what they look at."""
+NEAR_PER_FOCUS = 0.25  # nearest depth, in distances from the cameras to what they look at
 FAR_PER_BASELINE = 38.0
 """Farthest depth, in the largest distance between cameras: from there it is seen under 1.5 degrees, COLMAP's least."""
 MIN_VIEWS = 3
 """Images that see a random point, where there are as many."""
-COUNTED_VIEWS = 60
-"""Views, evenly spaced, in which points are counted."""
-MIN_CUBE_SEEN = 0.5
-"""Fraction of a cube that two cameras must see for the scene to lie in it."""
+COUNTED_VIEWS = 60  # views, evenly spaced, in which points are counted
+MIN_CUBE_SEEN = 0.5  # fraction of a cube that two cameras must see for the scene to lie in it
 
 
 def depth_bounds(views: Sequence[View]) -> tuple[float, float]:

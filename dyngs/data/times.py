@@ -34,11 +34,9 @@ viewpoint have nothing to do with each other."""
 MOST_STEPS, MOST_IMAGES, FEWEST_STEPS = 300, 4000, 2
 """Time steps of several videos (those of the usual clips of ten seconds) and images of all together, at most, unless a
 number is given; and time steps at least."""
-SAME_STEP = 0.2
-"""Frames within this fraction of a frame's duration of a time step count as taken at it."""
+SAME_STEP = 0.2  # frames within this fraction of a frame's duration of a time step count as taken at it
 _MAX_NAMED = 5
-_EVEN = 1.1
-"""Longest over shortest gap of evenly spaced times, with allowance for rounding in the files."""
+_EVEN = 1.1  # longest over shortest gap of evenly spaced times, with allowance for rounding in the files
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -73,10 +71,8 @@ def times_by_name(root: Path, splits: Splits, per_second: float | None = None) -
     Where the name of every image ends in a number, and no two of a folder in the same, that number is the time: frames
     that are missing leave gaps. Otherwise times are positions in the order of the names, numbers in them read as
     numbers. Each folder is a camera; the same numbers, or positions, in another one are the same times. With
-    ``per_second``, so many of them are a second.
-
-    Raises:
-        DyngsError: fewer than two images, or folders with different numbers of images and names without numbers.
+    ``per_second``, so many of them are a second. Raises DyngsError: fewer than two images, or folders with different
+    numbers of images and names without numbers.
     """
     views = all_views(splits)
     if len(views) < 2:
@@ -132,9 +128,7 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for all splits.
 
     Times that are all equal are left as they are, see ``still_if_constant``; without ``stretch`` all within [0, 1] are.
-
-    Raises:
-        DyngsError: a time that is no finite number, or some views with and some without a time; names the view.
+    Raises DyngsError: a time that is no finite number, or some views with and some without a time; names the view.
     """
     views = all_views(splits)
     for view in views:

@@ -17,14 +17,10 @@ from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import staying_within
 from dyngs.files.fields import read_json_object
 
-MAX_LINES_PER_KIND = 5
-"""Problems of one kind that are listed; the others are counted."""
-MAX_VIEWS = 300
-"""Views, chosen at random, in which points are looked for."""
-MARGIN = 0.1
-"""Fractions of the image by which a point may lie outside: lenses distort."""
-WIDE_BASELINE = 10.0
-"""Degrees between neighbouring views, seen from the scene, from which they are far apart."""
+MAX_LINES_PER_KIND = 5  # problems of one kind that are listed; the others are counted
+MAX_VIEWS = 300  # views, chosen at random, in which points are looked for
+MARGIN = 0.1  # fractions of the image by which a point may lie outside: lenses distort
+WIDE_BASELINE = 10.0  # degrees between neighbouring views, seen from the scene, from which they are far apart
 CLOSE_IN_TIME, FEW_VIEWS = 0.08, 3
 """Motion over this fraction of a clip is small; with fewer views in it, each time step is seen from one side only."""
 
@@ -251,10 +247,8 @@ def tallied(counter: Counter[Any]) -> str:
     return ", ".join(f"{key} ({count})" if len(counter) > 1 else f"{key}" for key, count in counter.most_common(6))
 
 
-LOOKED_AT = 4
-"""Masks that are read."""
-MOST_IGNORED = 0.5
-"""Fraction of the pixels that masks may ignore before that is suspicious: passers-by fill less."""
+LOOKED_AT = 4  # masks that are read
+MOST_IGNORED = 0.5  # fraction of the pixels that masks may ignore before that is suspicious: passers-by fill less
 
 
 def mask_problems(capture: Capture) -> list[str]:

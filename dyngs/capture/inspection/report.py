@@ -20,12 +20,9 @@ from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError, counted, printable, reading
 from dyngs.files.containment import images_up_to, leaving_links
 
-SAME_LIGHT = 1.05
-"""Factor between the most and the least light up to which images count as equally exposed."""
-MUCH_LOST = 90
-"""Per cent of an image below which a wider pinhole is worth a word."""
-MOST_LENSES = 20
-"""Different lenses that are looked at; more are not needed to tell how much is lost."""
+SAME_LIGHT = 1.05  # factor between the most and the least light up to which images count as equally exposed
+MUCH_LOST = 90  # per cent of an image below which a wider pinhole is worth a word
+MOST_LENSES = 20  # different lenses that are looked at; more are not needed to tell how much is lost
 
 
 def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:

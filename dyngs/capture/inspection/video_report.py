@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ import numpy as np
 from dyngs.capture.multi_video.films import (
     VIDEOS_FILE,
     Film,
-    SmallImages,
     open_film,
     read_given,
     shrunk_grey,
@@ -23,16 +23,11 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import as_word, counted, reading
 from dyngs.files.containment import inside
 
-MAX_FRAMES = 3000
-"""Frames that are looked at, from the first one on."""
-UNEVEN = 1.5
-"""Longest over typical gap between frames of a rate that varies."""
-BLURRED = 0.5
-"""Frames with less than this fraction of the typical sharpness are blurred."""
-FAST = 0.05
-"""Fraction of the width by which the image moves from frame to frame of a camera that moves fast."""
-LITTLE = 0.05
-"""Fraction of the width by which the image of a camera that hardly moves is displaced over the clip."""
+MAX_FRAMES = 3000  # frames that are looked at, from the first one on
+UNEVEN = 1.5  # longest over typical gap between frames of a rate that varies
+BLURRED = 0.5  # frames with less than this fraction of the typical sharpness are blurred
+FAST = 0.05  # fraction of the width by which the image moves from frame to frame of a camera that moves fast
+LITTLE = 0.05  # fraction of the width by which the image of a camera that hardly moves is displaced over the clip
 _PAIRS = 40
 
 
@@ -62,7 +57,7 @@ def video_facts(path: Path) -> VideoFacts:
     """Return what there is to know about a video; its frames are decoded once."""
     film = open_film(inside(path))
     small, sharpness = _look(film)
-    displaced = displaced_by(small.grey)
+    displaced = displaced_by(small)
     shown, sound = _streams(path)
     seconds = film.seconds
     facts = (
@@ -75,19 +70,17 @@ def video_facts(path: Path) -> VideoFacts:
     return VideoFacts(film, facts, displaced <= STANDS)
 
 
-def _look(film: Film) -> tuple[SmallImages, np.ndarray]:
+def _look(film: Film) -> tuple[np.ndarray, np.ndarray]:
     """Return small images of the frames, and the sharpness of each."""
     small, sharpness = [], []
-    for number, rgb in enumerate(read_frames(film.path)):
-        if number >= min(MAX_FRAMES, len(film.seconds)):
-            break
+    for rgb in islice(read_frames(film.path), min(MAX_FRAMES, len(film.seconds))):
         small.append(shrunk_grey(rgb))
         step = max(max(rgb.shape[:2]) // 800, 1)
         grey = rgb[::step, ::step, 1].astype(np.float32)
         sharpness.append(
             float(np.diff(grey, axis=0).std() + np.diff(grey, axis=1).std()) if min(grey.shape) > 1 else 0.0
         )
-    return SmallImages(np.stack(small), film.seconds[: len(small)]), np.array(sharpness)
+    return np.stack(small), np.array(sharpness)
 
 
 _ORIENTATIONS = (
@@ -121,12 +114,12 @@ def _sharpness(sharpness: np.ndarray) -> str:
     return f"{low:.2f} to {high:.2f} of the typical frame; {found}"
 
 
-def _camera(small: SmallImages, displaced: float) -> str:
+def _camera(small: np.ndarray, displaced: float) -> str:
     if displaced <= STANDS:
-        changed = float((motion_of(small) > 0).mean()) if len(small.grey) > 1 else 0.0
+        changed = float((motion_of(small) > 0).mean()) if len(small) > 1 else 0.0
         return f"stands still; {changed:.1%} of the image changes at a time"
-    starts = evenly_spaced(len(small.grey) - 1, _PAIRS)
-    steps = [displacement(small.grey[i].astype(float), small.grey[i + 1].astype(float)) for i in starts]
+    starts = evenly_spaced(len(small) - 1, _PAIRS)
+    steps = [displacement(small[i].astype(float), small[i + 1].astype(float)) for i in starts]
     known = [step for step in steps if np.isfinite(step)]
     far = "far" if np.isinf(displaced) else f"by up to {displaced:.1%} of its width"
     if not known:

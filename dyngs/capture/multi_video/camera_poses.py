@@ -31,20 +31,13 @@ if TYPE_CHECKING:
 
 MOMENTS = 15
 """Frames of a video whose median shows what stands."""
-MEDIAN_BYTES = 400_000_000
-"""Memory that they take at most."""
-STARTS = (0, 1, 2)
-"""Random seeds of mapping: repeated patterns lead some astray, and then fewer points are seen."""
-FEW_OBSERVATIONS = 400
-"""Observations per camera below which other features are tried, too."""
-LARGEST_ERROR = 2.0
-"""Observations with a larger reprojection error, in px, are left out in the end,"""
-ENOUGH_TRACKS = 60
-"""and points that only two cameras see, where each camera sees so many others."""
-LONE_LENSES = 1.0
-"""Mean reprojection error in px above which cameras of one size are also tried with a lens each."""
-_LESS = 0.7
-"""Lenses of their own are kept if they lower the error to this, or find more cameras."""
+MEDIAN_BYTES = 400_000_000  # memory that these frames take at most
+STARTS = (0, 1, 2)  # random seeds of mapping: repeated patterns lead some astray, and then fewer points are seen
+FEW_OBSERVATIONS = 400  # observations per camera below which other features are tried, too
+LARGEST_ERROR = 2.0  # observations with a larger reprojection error, in px, are left out in the end
+ENOUGH_TRACKS = 60  # points that only two cameras see are left out where each camera sees so many others
+LONE_LENSES = 1.0  # mean reprojection error in px above which cameras of one size are also tried with a lens each
+_LESS = 0.7  # lenses of their own are kept if they lower the error to this, or find more cameras
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from dyngs.capture.multi_video.camera_poses import FixedModel, camera_name, fixe
 from dyngs.capture.multi_video.films import (
     VIDEOS_FILE,
     Film,
-    SmallImages,
     checked_starts,
     open_film,
     read_given,
@@ -88,7 +87,7 @@ def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgre
     lines = [_require_fixed(source, films, small)]
     films, small, found, line = _posed(work, films, small, options, report)
     lines.append(line)
-    watchers = [_watcher(film, images, found.model) for film, images in zip(films, small, strict=True)]
+    watchers = [_watcher(film, grey, found.model) for film, grey in zip(films, small, strict=True)]
     begun, line = found_starts(films, watchers) if starts is None else given_starts(films, starts)
     lines.append(line)
     clocks = [film.seconds + start for film, start in zip(films, begun, strict=True)]
@@ -170,9 +169,9 @@ def _write_model(
     full.write(folder)
 
 
-def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[SmallImages]) -> str:
+def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[np.ndarray]) -> str:
     """Return a line that says that all cameras stand."""
-    found = [displaced_by(images.grey) for images in small]
+    found = [displaced_by(grey) for grey in small]
     moving = [
         f"{film.name} ({'far' if np.isinf(displaced) else f'up to {displaced:.1%} of its width'})"
         for film, displaced in zip(films, found, strict=True)
@@ -191,12 +190,12 @@ def _require_fixed(source: Path, films: Sequence[Film], small: Sequence[SmallIma
 
 
 def _posed(
-    work: Path, films: list[Film], small: list[SmallImages], options: SfmOptions, report: ReportProgress
-) -> tuple[list[Film], list[SmallImages], FixedModel, str]:
+    work: Path, films: list[Film], small: list[np.ndarray], options: SfmOptions, report: ReportProgress
+) -> tuple[list[Film], list[np.ndarray], FixedModel, str]:
     """Return the cameras that have a pose, with their small images, the poses, and a line on them."""
     images = []
     for film, shown in zip(films, small, strict=True):
-        images.append(image_without_movers(film, len(shown.grey)))
+        images.append(image_without_movers(film, len(shown)))
         report("what stands, cameras", len(images), len(films))
     folder = work / "colmap"
     found = fixed_model(films, images, folder, options.num_threads, report)
@@ -221,11 +220,11 @@ def _posed(
     return [film for film, _ in kept], [shown for _, shown in kept], found, line
 
 
-def _watcher(film: Film, images: SmallImages, model: pycolmap.Reconstruction) -> Watcher:
+def _watcher(film: Film, grey: np.ndarray, model: pycolmap.Reconstruction) -> Watcher:
     """Return a camera with the rays of its small images, and the motion in them."""
     image = next(image for image in model.images.values() if camera_name(image) == film.name)
     camera = model.cameras[image.camera_id]
-    height, width = images.grey.shape[1:]
+    height, width = grey.shape[1:]
     rows, columns = np.mgrid[0:height, 0:width]
     step = camera.width // width
     places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1) * step
@@ -233,4 +232,4 @@ def _watcher(film: Film, images: SmallImages, model: pycolmap.Reconstruction) ->
     rotation = np.asarray(image.cam_from_world().rotation.matrix())
     rays = np.nan_to_num(directions) @ rotation
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
-    return Watcher(np.asarray(image.projection_center()), rays, motion_of(images), images.seconds)
+    return Watcher(np.asarray(image.projection_center()), rays, motion_of(grey), film.seconds[: len(grey)])

@@ -15,10 +15,8 @@ from dyngs.data.images.video import VideoInfo, frame_seconds, probe_video, read_
 from dyngs.errors import DyngsError
 from dyngs.files.fields import first_few, is_number, read_json_object
 
-SMALL_SIDE = 160
-"""Longer side of the small images, px."""
-SMALL_BYTES = 400_000_000
-"""Memory that the small images of all videos take at most."""
+SMALL_SIDE = 160  # longer side of the small images, px
+SMALL_BYTES = 400_000_000  # memory that the small images of all videos take at most
 
 
 @dataclass(frozen=True)
@@ -37,28 +35,19 @@ class Film:
         return float(1 / np.median(gaps)) if len(gaps) and np.median(gaps) > 0 else self.info.fps or 30.0
 
 
-@dataclass(frozen=True)
-class SmallImages:
-    """Small images ``grey`` (F, H, W) uint8 of the beginning of a video; ``seconds`` (F,) as in ``Film``."""
-
-    grey: np.ndarray
-    seconds: np.ndarray
-
-
 def open_film(path: Path) -> Film:
     """Return a video."""
     info = probe_video(path)
     return Film(path.stem, path, info, np.array(frame_seconds(path, info.num_frames)))
 
 
-def small_images(films: Sequence[Film], report: ReportProgress = report_nothing) -> list[SmallImages]:
-    """Return small grey images of all videos, of the first frames where all would take too much memory."""
+def small_images(films: Sequence[Film], report: ReportProgress = report_nothing) -> list[np.ndarray]:
+    """Return small grey images (F, H, W) uint8 of all videos, of the first frames where all would take too much."""
     limit = SMALL_BYTES // max(len(films) * SMALL_SIDE * SMALL_SIDE, 1)
     images = []
     for number, film in enumerate(films):
         shown = [shrunk_grey(rgb) for rgb in islice(read_frames(film.path), limit)]
-        grey = np.stack(shown[: len(film.seconds)]) if shown else np.zeros((0, 1, 1), np.uint8)
-        images.append(SmallImages(grey, film.seconds[: len(grey)]))
+        images.append(np.stack(shown[: len(film.seconds)]) if shown else np.zeros((0, 1, 1), np.uint8))
         report("videos looked at", number + 1, len(films))
     return images
 
@@ -86,10 +75,8 @@ class Given:
 def read_given(folder: Path, names: Sequence[str]) -> Given:
     """Read ``videos.json``: ``{"starts": {"cam00": 0, "cam01": 1.25}, "test": ["cam00"]}``; all keys are optional.
 
-    ``"starts": 0`` says that all videos begin at once.
-
-    Raises:
-        DyngsError: a camera that is not there or missing, or something that is no number.
+    ``"starts": 0`` says that all videos begin at once. Raises DyngsError: a camera that is not there or missing, or
+    something that is no number.
     """
     path = folder / VIDEOS_FILE
     if not path.is_file():
@@ -116,8 +103,7 @@ def read_given(folder: Path, names: Sequence[str]) -> Given:
 def checked_starts(starts: Mapping[str, object], names: Sequence[str], where: str) -> dict[str, float]:
     """Return the seconds at which the videos begin, for every camera.
 
-    Raises:
-        DyngsError: a camera that is not there or missing, or something that is no number of at most a day.
+    Raises DyngsError: a camera that is not there or missing, or something that is no number of at most a day.
     """
     unknown = sorted(starts.keys() - set(names))
     missing = sorted(set(names) - starts.keys())

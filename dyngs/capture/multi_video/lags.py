@@ -12,22 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from dyngs.capture.multi_video.films import SmallImages
-
-MIN_OVERLAP = 0.4
-"""Fraction of the shorter signal that must lie within the other one at every shift that is tried,"""
-MIN_SAMPLES = 8
-"""and so many samples."""
-MIN_PEAK = 0.15
-"""Lowest correlation of two signals that count as alike."""
-RIVAL = 0.8
-"""A peak is clear if no other one is higher than this times itself."""
+MIN_OVERLAP = 0.4  # fraction of the shorter signal that must lie within the other one at every shift that is tried
+MIN_SAMPLES = 8  # and least number of samples
+MIN_PEAK = 0.15  # lowest correlation of two signals that count as alike
+RIVAL = 0.8  # a peak is clear if no other one is higher than this times itself
 CERTAIN_PEAK, CERTAIN_RIVAL = 0.5, 0.6
 """Likewise where no third recording can confirm it: 0.7 % of unrelated signals of 120 samples have such a peak,"""
-CERTAIN_DEVIATIONS = 6.0
-"""and none stands out by so many standard deviations of the other correlations."""
-PEAK_WIDTH = 2.0
-"""Shifts within so many samples of a peak belong to it."""
+CERTAIN_DEVIATIONS = 6.0  # and none stands out by so many standard deviations of the other correlations
+PEAK_WIDTH = 2.0  # shifts within so many samples of a peak belong to it
 _ROUNDS = 20
 
 
@@ -203,12 +195,9 @@ def _reached(links: set[tuple[int, int]], count: int) -> set[int]:
     return reached
 
 
-BINS = 48
-"""Planes between the lowest and the highest one that both cameras see."""
-_NOISE = 6.0
-"""Differences below so many times the typical one are noise."""
-_LEAST_CHANGE = 8.0
-"""Grey levels below which a difference is noise anyway."""
+BINS = 48  # planes between the lowest and the highest one that both cameras see
+_NOISE = 6.0  # differences below so many times the typical one are noise
+_LEAST_CHANGE = 8.0  # grey levels below which a difference is noise anyway
 _MIN_BASELINE = 1e-6
 
 
@@ -227,9 +216,8 @@ class Watcher:
     seconds: np.ndarray
 
 
-def motion_of(images: SmallImages) -> np.ndarray:
-    """Return (F, P) uint8: how much each pixel differs from the median of the clip, less what noise explains."""
-    grey = images.grey
+def motion_of(grey: np.ndarray) -> np.ndarray:
+    """Return (F, P) uint8: how much each pixel of (F, H, W) differs from the median, less what noise explains."""
     every = max(len(grey) // 60, 1)
     typical = np.median(grey[::every], axis=0)
     motion = np.empty((len(grey), grey[0].size), np.uint8)

@@ -14,14 +14,11 @@ from dyngs.capture.multi_video.lags import Alignment, Watcher, align, correlate,
 from dyngs.data.images.video import opened_video
 from dyngs.errors import DyngsError, reading
 
-RATE = 100.0
-"""Values of a signal per second."""
-MAX_SECONDS = 900.0
-"""Sound after this is not listened to."""
+RATE = 100.0  # values of a signal per second
+MAX_SECONDS = 900.0  # sound after this is not listened to
 _SAMPLES_PER_SECOND = 8000
 _BANDS_HZ = (60, 150, 300, 500, 800, 1200, 1800, 2600, 3900)
-_WINDOW = 256
-"""Samples of a spectrum: 32 ms."""
+_WINDOW = 256  # samples of a spectrum: 32 ms
 
 
 def onsets(path: Path) -> np.ndarray | None:
@@ -76,14 +73,10 @@ def _samples(path: Path) -> np.ndarray | None:
     return np.pad(samples, (missing, 0)) if missing >= 0 else samples[-missing:]
 
 
-NEIGHBOURS = 8
-"""Other cameras that the motion seen by a camera is compared with."""
-COARSE, FINE = 1.2, 0.0
-"""Blur of motion in time, in frames, with which the offsets are found, and then measured."""
-WHOLE = 0.2
-"""Offsets so near to whole frames, in frames, are taken as whole: they are not known better."""
-TOGETHER = 0.97
-"""Videos begin together if that explains them as well as the offsets found, to this fraction."""
+NEIGHBOURS = 8  # other cameras that the motion seen by a camera is compared with
+COARSE, FINE = 1.2, 0.0  # blur of motion in time, in frames, with which the offsets are found, and then measured
+WHOLE = 0.2  # offsets so near to whole frames, in frames, are taken as whole: they are not known better
+TOGETHER = 0.97  # videos begin together if that explains them as well as the offsets found, to this fraction
 MAX_RATE = 60.0
 _SHOWN = 12
 
@@ -102,8 +95,7 @@ def given_starts(films: Sequence[Film], starts: Mapping[str, float]) -> Starts:
 def found_starts(films: Sequence[Film], watchers: Sequence[Watcher]) -> Starts:
     """Return the starts by the sound if all videos have some that tells, else by the motion that they show.
 
-    Raises:
-        DyngsError: neither sound nor motion tells; says what to give.
+    Raises DyngsError: neither sound nor motion tells; says what to give.
     """
     by_sound, why_not = _by_sound(films)
     rate = min(max(film.rate for film in films), MAX_RATE)

@@ -9,17 +9,13 @@ from dyngs.data.times import evenly_spaced
 
 STANDS = 0.002
 """A camera stands if its image is never displaced by more than this fraction of its longer side."""
-SAMPLES = 16
-"""Images that are compared with the typical one."""
+SAMPLES = 16  # images that are compared with the typical one
 _ITERATIONS = 16
 _TOLD, _FLAT = 0.4, 1.0
 """Pixels that are looked at: this fraction of them, where the image changes most, by so many grey levels per pixel."""
-_SCALES = (40.0, 20.0, 10.0, 5.0, 3.0)
-"""Grey levels of the Cauchy weights in the first rounds, and in the later ones."""
-_MOST_PIXELS = 0.5
-"""Fraction of those pixels that must fit the displacement: so much stands."""
-_FITS = 12.0
-"""Grey levels within which they fit."""
+_SCALES = (40.0, 20.0, 10.0, 5.0, 3.0)  # grey levels of the Cauchy weights in the first rounds, and in the later ones
+_MOST_PIXELS = 0.5  # fraction of those pixels that must fit the displacement: so much stands
+_FITS = 12.0  # grey levels within which they fit
 
 
 def displaced_by(grey: np.ndarray) -> float:

@@ -32,8 +32,7 @@ try:
 except ImportError:  # Windows, where a folder with an open file in it cannot be renamed
     fcntl = None
 
-WHOLE_BYTES = 2**30
-"""Larger videos are compared by samples and modification time only."""
+WHOLE_BYTES = 2**30  # larger videos are compared by samples and modification time only
 _MARK_NAME = "video.json"
 _MARK = "frames that dyngs decoded from a video; the folder may be removed"
 _NUM_SAMPLES, _SAMPLE_BYTES = 256, 2**20
@@ -73,10 +72,8 @@ def decode_frames(root: Path, frames: Mapping[Path, VideoFrame], limit_mb: float
 
     The total size is estimated from the frames written so far, from the first on, so that too much is refused early.
     The least recently used frames of other captures are removed to make room, unless a running process uses them. All
-    may take ``limit_mb`` 1e6 bytes on disk.
-
-    Raises:
-        DyngsError: a damaged video (names it and the frame), more than the limit or than the disk has (says how much).
+    may take ``limit_mb`` 1e6 bytes on disk. Raises DyngsError: a damaged video (names it and the frame), more than the
+    limit or than the disk has (says how much).
     """
     videos = {path.parent: frame.video for path, frame in frames.items()}
     for folder in videos:
@@ -188,8 +185,7 @@ class _DiskSpace:
     def check(self, now: int, end: float) -> None:
         """Free space for ``end`` bytes, of which ``now`` are written already.
 
-        Raises:
-            DyngsError: it is more than the limit, or than other processes or the disk leave.
+        Raises DyngsError: it is more than the limit, or than other processes or the disk leave.
         """
         total, limit, cache = self._used + end, self._limit_mb * 1e6, cache_folder("frames")
         if total > limit:

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp")
 _TAIL_BYTES = 4096
-_STRIP_PIXELS = 2**18
-"""Pixels of an image that are shrunk at a time."""
+_STRIP_PIXELS = 2**18  # pixels of an image that are shrunk at a time
 _PNG_END = b"IEND"
 END_MARKERS = {".png": _PNG_END, ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 """What complete files end in, by suffix."""
@@ -83,8 +82,7 @@ def read_header(path: Path) -> ImageHeader:
 def header_if_readable(path: Path) -> ImageHeader | None:
     """Read the header of a capture's image; None where it is missing or damaged, which the loader reports.
 
-    Raises:
-        DyngsError: the image lies outside the capture, or is larger than ``data.max_megapixels``.
+    Raises DyngsError: the image lies outside the capture, or is larger than ``data.max_megapixels``.
     """
     inside(path)
     try:

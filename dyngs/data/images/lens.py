@@ -20,8 +20,7 @@ _CLOSE_PX = 0.05
 _GRID = 64
 WIDEST_DEG = 120.0
 """Field of view that ``wide_pinhole`` keeps at most: beyond, a pinhole's image is mostly stretched rim."""
-WORTH = 1.02
-"""A focal length that is shorter by less than this factor is not worth it."""
+WORTH = 1.02  # a focal length that is shorter by less than this factor is not worth it
 
 
 @dataclass(frozen=True)

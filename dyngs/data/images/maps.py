@@ -17,8 +17,7 @@ from dyngs.files.containment import check_size, inside
 from dyngs.files.hdf5 import read_hdf5
 from dyngs.files.numpy_files import read_map
 
-MILLIMETRE = 1e-3
-"""Unit of maps in whole numbers, as in nerfstudio."""
+MILLIMETRE = 1e-3  # unit of maps in whole numbers, as in nerfstudio
 _FARTHEST = 1e9
 _NEAREST = 1e-9
 
@@ -49,8 +48,7 @@ def read_labels(path: Path) -> Tensor:
 
 
 _MAGIC = 202021.25
-_LONGEST = 1e5
-"""Longer displacements in pixels mean "unknown"; Middlebury writes more than 1e9."""
+_LONGEST = 1e5  # longer displacements in pixels mean "unknown"; Middlebury writes more than 1e9
 
 
 def read_flow(path: Path) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Collection, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     import av
     from av.container import InputContainer
 
-MAX_FRAMES = 1_000_000
-"""Limit on the frames of one video: ten hours."""
+MAX_FRAMES = 1_000_000  # limit on the frames of one video: ten hours
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
 """FFmpeg's names for files that hold images themselves, whatever their suffix says."""
 
@@ -41,8 +40,7 @@ class VideoInfo:
 def videos_in(folder: Path) -> list[Path]:
     """Return the videos directly in a folder, by name; hidden files are left out.
 
-    Raises:
-        DyngsError: two with the same name but for the suffix.
+    Raises DyngsError: two with the same name but for the suffix.
     """
     with reading(folder, "choose another folder or change its permissions"):
         videos = files_in(folder, VIDEO_SUFFIXES)
@@ -56,8 +54,7 @@ def videos_in(folder: Path) -> list[Path]:
 def read_frames(path: Path) -> Iterator[np.ndarray]:
     """Yield the frames of a video in order, (H, W, 3) uint8, rotated as its rotation tag says.
 
-    Raises:
-        DyngsError: no such file, no video in it, or damage (at the damaged place).
+    Raises DyngsError: no such file, no video in it, or damage (at the damaged place).
     """
     for _, frame in _decoded(path, "AUTO"):
         yield _rotated_rgb(path, frame)
@@ -84,23 +81,15 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
 
 def probe_video(path: Path) -> VideoInfo:
     """Read size, length and frame rate of a video; the first frame is decoded, and the packets are counted."""
-    from av.error import FFmpegError
-
     first = next((frame for _, frame in _decoded(path)), None)
     if first is None:
         raise _broken(path, 0, "it holds no image")
     height, width = _rotated_rgb(path, first).shape[:2]
-    counted = hidden = 0
     with _reading(path), opened_video(path) as container:
         stream = container.streams.video[0]
-        promised, fps = stream.frames, float(stream.average_rate or 0)
-        try:
-            for packet in container.demux(stream):
-                counted += packet.size > 0
-                hidden += packet.size > 0 and packet.is_discard  # cut off by an edit list: never shown
-        except FFmpegError:
-            pass  # truncated: what the header promises is what there should be
-    count = max(promised, counted) - hidden
+        fps, hidden = float(stream.average_rate or 0), [packet.is_discard for packet in _packets(container)]
+        # of a truncated file, what the header promises is what there should be
+        count = max(stream.frames, len(hidden)) - sum(hidden)
     if count > MAX_FRAMES:
         raise DyngsError(f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up")
     return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0)
@@ -112,22 +101,26 @@ def frame_seconds(path: Path, num_frames: int) -> list[float]:
     Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or too few, the mean
     rate does, and 30 frames per second where the file names none either.
     """
-    from av.error import FFmpegError
-
     stamps: list[float] = []
     with _reading(path), opened_video(path) as container:
-        stream = container.streams.video[0]
-        fps = float(stream.average_rate or 0) or 30.0
-        try:
-            for packet in container.demux(stream):
-                if packet.size > 0 and not packet.is_discard and packet.pts is not None and packet.time_base:
-                    stamps.append(float(packet.pts * packet.time_base))
-        except FFmpegError:
-            pass  # truncated: the frames up to there have their stamps
+        fps = float(container.streams.video[0].average_rate or 0) or 30.0
+        for packet in _packets(container):
+            if not packet.is_discard and packet.pts is not None and packet.time_base:
+                stamps.append(float(packet.pts * packet.time_base))
     shown = sorted(stamps)[:num_frames]
     if len(shown) < num_frames or len(set(shown)) < num_frames:
         return [number / fps for number in range(num_frames)]
     return [stamp - shown[0] for stamp in shown]
+
+
+def _packets(container: InputContainer) -> Iterator[av.Packet]:
+    """Yield the packets of frames, up to where the file is cut off; discarded ones, by an edit list, are not shown."""
+    from av.error import FFmpegError
+
+    with suppress(FFmpegError):
+        for packet in container.demux(container.streams.video[0]):
+            if packet.size > 0:
+                yield packet
 
 
 def _decoded(path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE") -> Iterator[tuple[int, av.VideoFrame]]:

@@ -36,10 +36,7 @@ class CameraSource:
 def find_cameras(root: Path) -> dict[str, Path]:
     """Map camera names, sorted, to folders of images, or to video files where there is no such folder.
 
-    Images lie in the folder itself or in ``images`` below it.
-
-    Raises:
-        DyngsError: two videos for one camera.
+    Images lie in the folder itself or in ``images`` below it. Raises DyngsError: two videos for one camera.
     """
     found = {path.stem: path for path in videos_in(root)}
     for path in sorted(root.iterdir()):
@@ -53,8 +50,7 @@ def find_cameras(root: Path) -> dict[str, Path]:
 def open_camera(name: str, path: Path) -> CameraSource:
     """List the images of the camera that ``find_cameras`` found at ``path``.
 
-    Raises:
-        DyngsError: an image without a number, two with the same one, or a video that cannot be opened.
+    Raises DyngsError: an image without a number, two with the same one, or a video that cannot be opened.
     """
     if path.is_file():
         planned = planned_frames(path)
@@ -229,10 +225,8 @@ def read_llff(root: Path) -> Capture:
 
     Each row holds a 3x5 matrix, row by row, and the near and far bounds (not used). Its columns: the camera's down,
     right and backward axes and its position in the world, then height, width and focal length of the full image in
-    pixels (Mildenhall et al. 2019). The first camera is the test view, as in N3V.
-
-    Raises:
-        DyngsError: an unreadable file, rows and cameras that differ in number, bad poses, images or videos.
+    pixels (Mildenhall et al. 2019). The first camera is the test view, as in N3V. Raises DyngsError: an unreadable
+    file, rows and cameras that differ in number, bad poses, images or videos.
     """
     path = root / POSES
     rows = _read_rows(path)

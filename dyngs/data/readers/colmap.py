@@ -199,8 +199,7 @@ _RECORDS = {
 def check_model_file(path: Path) -> None:
     """Check that a model file (``cameras|images|points3D|rigs|frames``, ``.bin`` or ``.txt``) is complete.
 
-    Raises:
-        DyngsError: missing, truncated, trailing bytes, or text lines with too few fields.
+    Raises DyngsError: missing, truncated, trailing bytes, or text lines with too few fields.
     """
     if not inside(path).is_file():
         raise DyngsError(f"{path}: the COLMAP model lacks this file; export the whole model again")

@@ -31,10 +31,8 @@ def read_people_snapshot(root: Path) -> Capture:
 
     ``camera.pkl``: camera_f, camera_c (2,) px, camera_k (5,) OpenCV, camera_rt axis-angle and camera_t of
     cam_from_world, width, height. ``masks.hdf5``: masks (F, H, W), 0 is background. ``reconstructed_poses.hdf5``: SMPL
-    pose (F, 72), trans (F, 3), betas (10,), in metres. Frames without a mask or parameters are left out.
-
-    Raises:
-        DyngsError: h5py is not installed; anything missing, broken or inconsistent; names the file.
+    pose (F, 72), trans (F, 3), betas (10,), in metres. Frames without a mask or parameters are left out. Raises
+    DyngsError: h5py is not installed; anything missing, broken or inconsistent; names the file.
     """
     camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)

@@ -107,8 +107,7 @@ def read_frame_file(path: Path) -> FrameFile:
 def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     """Return views by ``file_path`` as written in the file, in its order, and warnings.
 
-    Raises:
-        DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same image twice.
+    Raises DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same image twice.
     """
     root = file.path.parent
     paths = [_image_path(root, frame) for frame in file.frames]
@@ -312,10 +311,8 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
     """Return the points that belong to a transforms file, the file that they are from, and warnings.
 
     Those of its key ``ply_file_path``; else of the first of ``USUAL_NAMES`` that is in its folder; else of the only
-    ``.ply`` there. A file that is named nowhere and cannot be read is left out, with a warning.
-
-    Raises:
-        DyngsError: the file that the key names is missing, unreadable, or outside the capture.
+    ``.ply`` there. A file that is named nowhere and cannot be read is left out, with a warning. Raises DyngsError: the
+    file that the key names is missing, unreadable, or outside the capture.
     """
     root, written = file.path.parent, file.fields.get(KEY)
     if isinstance(written, str) and written:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -28,17 +28,6 @@ _MASK_FOLDERS = ("mask_cihp", "mask", "masks")
 _NUM_JOINTS = 24
 
 
-@dataclass(frozen=True)
-class _Shot:
-    """One image, ``file`` below the capture's folder, of a camera calibrated by fields of a transforms file."""
-
-    file: str
-    camera: int
-    frame: int
-    calibration: dict[str, object]
-    where: str
-
-
 def read_zju_mocap(root: Path) -> Capture:
     """Read the capture of a person by several calibrated static cameras or by one; units are metres.
 
@@ -53,15 +42,19 @@ def read_zju_mocap(root: Path) -> Capture:
     """
     if (root / ANNOTATIONS).is_file():
         path, shots = root / ANNOTATIONS, _annotated_shots(root / ANNOTATIONS)
-        found, body = _params_per_file(root, {shot.frame for shot in shots})
+        found, body = _params_per_file(root, {number for number, _ in shots})
         person, folders = "nonzero", _MASK_FOLDERS
     else:
         path, shots = root / CAMERAS, _single_shots(root / CAMERAS)
         found, body = root / MESHES, _mesh_infos(root / MESHES)
         person, folders = "white", ("masks",)
-    views, warnings = _views(path, shots)
+    first, last = min(number for number, _ in shots), max(number for number, _ in shots)
+    for number, shot in shots:
+        shot.own["time"] = (number - first) / max(last - first, 1)
+    read, warnings = read_views(FrameFile(path, [shot for _, shot in shots]))
+    views = list(read.values())
     rows_of(found, body, views)
-    masks = [_mask(root, shot.file, folders) for shot in shots]
+    masks = [_mask(root, str(shot.own["file_path"]), folders) for _, shot in shots]
     people = [
         replace(view, silhouette=None if mask is None else Silhouette(mask, person))
         for view, mask in zip(views, masks, strict=True)
@@ -73,7 +66,8 @@ def read_zju_mocap(root: Path) -> Capture:
     return Capture(root, "zju_mocap", splits, body=of_one_clip(body), warnings=(*warnings, *notes))
 
 
-def _annotated_shots(path: Path) -> list[_Shot]:
+def _annotated_shots(path: Path) -> list[tuple[int, FrameEntry]]:
+    """Return frame number and entry of each image."""
     fields = read_pickled_array(inside(path))
     cams = {key: _items(f"{path}, cams", entry(path, fields, "cams"), key) for key in ("K", "D", "R", "T")}
     counts = {key: len(values) for key, values in cams.items()}
@@ -95,23 +89,24 @@ def _annotated_shots(path: Path) -> list[_Shot]:
                 f"{len(files)}; export it again"
             )
         frame = _frame_number(path, str(files[0]))
-        shots += [
-            _Shot(str(file), camera, frame, calibration, f"{path}, camera {camera}")
-            for camera, (file, calibration) in enumerate(zip(files, calibrations, strict=True))
-        ]
+        for camera, (file, calibration) in enumerate(zip(files, calibrations, strict=True)):
+            fields_of = calibration | {"file_path": str(file), "camera": camera, "frame": frame}
+            shots.append((frame, FrameEntry(f"{path}, camera {camera}", fields_of)))
     if not shots:
         raise DyngsError(f"{path}: 'ims' lists no images; export it again")
     return shots
 
 
-def _single_shots(path: Path) -> list[_Shot]:
+def _single_shots(path: Path) -> list[tuple[int, FrameEntry]]:
     shots = []
     for name, own in sorted(_by_name(path).items()):
         where = f"{path}, {name}"
         pose = numbers_of(f"{where}: 'extrinsics'", entry(where, own, "extrinsics"), (4, 4))
         lens = own.get("distortions", np.zeros(5))
         calibration = _calibration(where, entry(where, own, "intrinsics"), lens, pose)
-        shots.append(_Shot(f"images/{name}", 0, _frame_number(path, name), calibration, where))
+        number = _frame_number(path, name)
+        fields = calibration | {"file_path": f"images/{name}", "camera": 0, "frame": number}
+        shots.append((number, FrameEntry(where, fields)))
     return shots
 
 
@@ -168,18 +163,6 @@ def _calibration(where: str, intrinsics: object, lens: object, cam_from_world: n
         **dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), values, strict=False)),
         "transform_matrix": opengl_from_cam(pose).tolist(),
     }
-
-
-def _views(path: Path, shots: Sequence[_Shot]) -> tuple[list[View], list[str]]:
-    """One view per image, and warnings; times run from 0 at the lowest frame number to 1 at the highest one."""
-    first, last = min(shot.frame for shot in shots), max(shot.frame for shot in shots)
-    frames = []
-    for shot in shots:
-        own = {"file_path": shot.file, "camera": shot.camera, "frame": shot.frame}
-        own["time"] = (shot.frame - first) / max(last - first, 1)
-        frames.append(FrameEntry(shot.where, shot.calibration | own))
-    views, warnings = read_views(FrameFile(path, frames))
-    return list(views.values()), warnings
 
 
 def _splits(views: Sequence[View]) -> tuple[Splits, list[str]]:

@@ -74,10 +74,8 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
     """Write images of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
 
     Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA, straight alpha, sRGB) for
-    every split with images. The folder appears when it is complete.
-
-    Raises:
-        DyngsError: ``out`` holds something already, or cannot be written.
+    every split with images. The folder appears when it is complete. Raises DyngsError: ``out`` holds something already,
+    or cannot be written.
     """
     scene = still_life()
     splits = {
@@ -101,10 +99,8 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
 
     ``motion/`` holds a mask for each image, white where something that moves is seen, and ``true_tracks.npz`` the
     tracks of points on it (``TrueTracks``). Frames of val and test name their mask (``motion_mask_path``), those of
-    train do not: training would take it as a prior.
-
-    Raises:
-        DyngsError: no such scene, no images asked for, ``out`` holds something already, or cannot be written.
+    train do not: training would take it as a prior. Raises DyngsError: no such scene, no images asked for, ``out``
+    holds something already, or cannot be written.
     """
     scene_at(name, 0.0)
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:

@@ -23,8 +23,7 @@ _LAMP_SIZE = 0.9
 _SKY, _GROUND, _LAMPLIGHT = (0.46, 0.50, 0.56), (0.20, 0.17, 0.15), (0.80, 0.74, 0.66)
 _MARCH_STEPS = 40
 _BISECTIONS = 18
-_SURFACE = 3e-3
-"""World units by which a surface may seem to lie before one of its own points."""
+_SURFACE = 3e-3  # world units by which a surface may seem to lie before one of its own points
 
 
 @dataclass(frozen=True)
