@@ -154,7 +154,6 @@ def _slope(colours: np.ndarray) -> np.ndarray:
 
 
 def _disc(radius: int) -> np.ndarray:
-    """Return the (2 radius + 1, 2 radius + 1) bool disc."""
     rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     return rows**2 + columns**2 <= radius**2 + radius
 
@@ -236,7 +235,6 @@ def _fixed_cameras(capture: Capture) -> list[_Camera]:
 
 
 def _plates(empty: Path, cameras: Sequence[_Camera]) -> Mapping[int, Path]:
-    """Return the images without the person, by index of the camera."""
     if empty.is_file():
         if len(cameras) > 1:
             raise DyngsError(f"{empty}: is one image for {len(cameras)} cameras; give a folder with one each")

@@ -112,7 +112,6 @@ def _frames_of(source: Path) -> tuple[Sequence[Path], float | None]:
 
 
 def _images_of(folder: Path) -> list[Path]:
-    """Return the images directly in a folder, or else in ``images`` below it, 9 before 10."""
     found = files_in(folder, SUFFIXES) or files_in(folder / "images", SUFFIXES)
     return sorted(found, key=lambda path: natural_order(path.name))
 

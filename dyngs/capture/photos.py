@@ -154,7 +154,6 @@ def _checked(photo: Path) -> ImageHeader | None:
 
 
 def _is_converted(photo: Path, header: ImageHeader | None) -> bool:
-    """Whether a photo is written anew, as PNG."""
     if header is None or photo.suffix.lower() == ".gif":
         return True
     return header.tags.orientation != 1 and header.upright_size == header.size
@@ -185,7 +184,6 @@ def _store(photo: Path, target: Path, header: ImageHeader | None) -> None:
 
 
 def _convert_heif(photo: Path, target: Path) -> None:
-    """Write a HEIC photo as PNG, upright and with its tags."""
     import pillow_heif
 
     heif: Any = pillow_heif

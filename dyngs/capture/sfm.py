@@ -44,17 +44,12 @@ _TURNING = (
 
 @dataclass(frozen=True)
 class SfmResult:
-    """Result of pose estimation.
+    """Result of pose estimation: a capture in COLMAP's layout in the folder ``root``.
 
     Attributes:
-        root: the capture folder in COLMAP's layout, to be trained on.
-        num_images: images passed.
-        num_registered: images with a pose.
-        unregistered: names of the others.
-        num_points: sparse points.
+        unregistered: names of the images without a pose.
         mean_error_px: mean reprojection error.
         mean_track: images in which a point is seen, on average.
-        mapper: "global" or "incremental".
         seconds: of each stage, by name.
         notes: lines about choices, and about what to film or photograph better.
     """
@@ -119,7 +114,6 @@ def estimate_poses(
     Args:
         source: a folder of photos (subfolders included) or a video file.
         out: a folder that does not exist, or is empty.
-        options: matching, mapping, effort.
 
     Raises:
         DyngsError: too few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
@@ -147,7 +141,6 @@ def estimate_poses(
 
 
 def _posed_in(work: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress) -> SfmResult:
-    """Write the capture for ``out`` in ``work/capture`` and return the result."""
     stages: dict[str, float] = {}
     capture = work / "capture"
 
@@ -248,14 +241,14 @@ def _parallax_seen(task: SfmTask) -> list[str]:
     if found.may_follow_a_mover:
         return [
             f"matches cover only {found.covered:.0%} of where the images have features: they may be of something "
-            "that moves, which the poses then follow; give masks of it (--masks), or film more of what stands",
+            "that moves, which the poses then follow; give masks of it (--masks), or film more of what stands"
         ]
     if found.kind is Parallax.ENOUGH:
         return []
     return [
         f"the camera hardly moved: near and far things shift by {found.fraction:.1%} of the image against each other, "
         f"so depth and focal length are uncertain; {_film(task)} while walking sideways by about a quarter of the "
-        "distance to the scene",
+        "distance to the scene"
     ]
 
 

@@ -174,7 +174,6 @@ def matched_pairs(database: Path) -> list[MatchedPair]:
 
 
 def _cells(places: np.ndarray) -> int:
-    """Return in how many cells, an eighth of the longest side wide, there are places."""
     return len(np.unique(np.floor(places * _CELLS).astype(int), axis=0))
 
 

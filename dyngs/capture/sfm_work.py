@@ -65,11 +65,7 @@ class SfmTask:
 
     Attributes:
         database: COLMAP's; made where it is missing.
-        images: folder of upright images.
-        names: of the images in it, in order.
-        photos: the same ones, with their tags.
-        options: matching, mapping, threads.
-        report: is told of what is done.
+        images: folder of upright images, ``names`` in order; ``photos``: the same ones, with their tags.
         is_video: they are frames of a video.
         masks: folder of masks ``NAME.png``, white = keep; None without.
     """
@@ -167,14 +163,8 @@ def working(out: Path, task: str) -> Iterator[Path]:
     """Yield the hidden work folder beside ``out``, which holds what a stopped run of the same task has done.
 
     It is removed when the block ends, and when it raises an error of ours: what failed once fails again. It stays
-    where the user or the system stops the program.
-
-    Args:
-        out: the folder that is made in the end.
-        task: images and options in words; a folder of another task is emptied first.
-
-    Raises:
-        DyngsError: another process works there; it cannot be made.
+    where the user or the system stops the program. ``task``: images and options in words; a folder of another task is
+    emptied first. Raises DyngsError: another process works there; it cannot be made.
     """
     work = out.parent / f".{out.name}.sfm"
     if work.is_symlink():

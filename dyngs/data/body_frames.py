@@ -130,7 +130,6 @@ def _rows(where: Path, name: str, value: object, frames: Sequence[int], width: i
 
 
 def _mean_row(where: Path, name: str, value: object, frames: Sequence[int]) -> np.ndarray:
-    """(width,) from one row, or the mean of one per frame."""
     array = float_array(value)
     if array is not None and array.ndim == 1:
         array = array[None]

@@ -36,7 +36,6 @@ class Decoded:
         return lambda: replace(self, **dict(zip(arrays, upload.arrays(), strict=True)))
 
     def _there(self) -> dict[str, Tensor]:
-        """Return the arrays that there are, by name."""
         return {name: x for name, x in vars(self).items() if x is not None}
 
 

@@ -16,6 +16,7 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import View
 from dyngs.data.decoding import Ahead, Decoded
 from dyngs.data.geometry import scaled_intrinsics
+from dyngs.data.images import maps as image_maps
 from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,
@@ -27,16 +28,6 @@ from dyngs.data.images.images import (
     target_size,
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
-from dyngs.data.images.maps import (
-    cut_out,
-    flow_at,
-    nearest_positions,
-    read_depth,
-    read_flow,
-    read_labels,
-    resized,
-    taken_at,
-)
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
 from dyngs.ops.device import CPU, gpu_memory
@@ -94,7 +85,6 @@ class Image:
         return sum(x.nbytes for x in self._tensors().values())
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Return everything per pixel that there is, by name."""
         return {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
 
     def shrunk(self, factor: int) -> Image:
@@ -115,8 +105,8 @@ class Image:
             alpha=alpha,
             mask=None if mask is None else (mask > FULLY_KEPT).float(),
             moves=moves,
-            depth=None if self.depth is None else _nearest(self.depth, nearest_positions(width, height)),
-            flow=None if self.flow is None else resized(self.flow, width, height),
+            depth=None if self.depth is None else _nearest(self.depth, image_maps.nearest_positions(width, height)),
+            flow=None if self.flow is None else image_maps.resized(self.flow, width, height),
         )
 
 
@@ -195,7 +185,6 @@ class ImageLoader:
         return self._views
 
     def __getitem__(self, index: int) -> Image:
-        """Return the image of view ``index``."""
         return self._with_camera(index, self._as_stored(index))
 
     def _with_camera(self, index: int, image: Image) -> Image:
@@ -249,8 +238,8 @@ class ImageLoader:
     def expect(self, indices: Sequence[int]) -> None:
         """Begin to decode the images that are requested next, in this order, as far as they are not cached."""
         with self._lock:
-            wanted = [i for i in indices if i not in self._kept and not (self._small_by > 1 and i in self._small)]
-        self._ahead.expect(wanted)
+            missing = [i for i in indices if i not in self._kept and not (self._small_by > 1 and i in self._small)]
+        self._ahead.expect(missing)
 
     def rest(self) -> None:
         """End the threads that decode ahead; they begin anew with the next ``expect``."""
@@ -307,7 +296,6 @@ class ImageLoader:
 
     @property
     def _kept(self) -> dict[int, Decoded]:
-        """Images that are kept where they are given out."""
         return self._cache if self._device == CPU else self._on_gpu
 
     @property
@@ -368,7 +356,7 @@ class ImageLoader:
     def _decode(self, view: View) -> Decoded:
         pixels = read_image(view.image_path, (view.width, view.height))
         if view.silhouette is not None:
-            pixels = cut_out(pixels, view.silhouette)
+            pixels = image_maps.cut_out(pixels, view.silhouette)
         mask = None
         if view.mask_path is not None:
             mask = read_mask(view.mask_path)
@@ -393,21 +381,21 @@ class ImageLoader:
         maps: dict[str, Tensor] = {}
         lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
         if view.motion_mask_path is not None:
-            read = read_labels if view.motion_mask_labels else read_mask
+            read = image_maps.read_labels if view.motion_mask_labels else read_mask
             moves = read(view.motion_mask_path).float()
             _require_size(view, view.motion_mask_path, moves.shape, "motion mask")
             if lens_map is not None:
                 moves = undistort(moves[..., None], lens_map)[..., 0]
             maps["moves"] = area_downscale(moves[..., None], *size)[..., 0]
         if self._with_maps and view.depth_path is not None:
-            positions = nearest_positions(*size, None if lens_map is None else lens_map.grid)
-            maps["depth"] = _nearest(read_depth(view.depth_path), positions)
+            positions = image_maps.nearest_positions(*size, None if lens_map is None else lens_map.grid)
+            maps["depth"] = _nearest(image_maps.read_depth(view.depth_path), positions)
             if lens_map is not None:
-                maps["depth"] *= _nearest(lens_map.valid.float(), nearest_positions(*size))
+                maps["depth"] *= _nearest(lens_map.valid.float(), image_maps.nearest_positions(*size))
         if self._with_maps and view.flow_path is not None:
-            flow = read_flow(view.flow_path)
+            flow = image_maps.read_flow(view.flow_path)
             _require_size(view, view.flow_path, flow.shape, "flow field")
-            maps["flow"] = flow_at(flow, view, size, lens_map)
+            maps["flow"] = image_maps.flow_at(flow, view, size, lens_map)
         return maps
 
     def _lens_map(self, view: View) -> LensMap:
@@ -461,7 +449,7 @@ def _require_size(view: View, path: Path, shape: Sequence[int], what: str) -> No
 
 
 def _nearest(values: Tensor, positions: Tensor) -> Tensor:
-    return taken_at(values[..., None], positions)[..., 0]
+    return image_maps.taken_at(values[..., None], positions)[..., 0]
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:

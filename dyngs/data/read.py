@@ -9,33 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.config import DataConfig
+from dyngs.data import times
 from dyngs.data.body_frames import with_fitted_body
 from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View, all_views, each_view
 from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import read_header
 from dyngs.data.images.lens import wide_pinhole
-from dyngs.data.readers import (
-    blender,
-    camera_folders,
-    colmap,
-    nerfies,
-    neuman,
-    people_snapshot,
-    zju_mocap,
-)
+from dyngs.data.readers import blender, camera_folders, colmap, nerfies, neuman, people_snapshot, zju_mocap
 from dyngs.data.scene_space import recenter
-from dyngs.data.times import (
-    clip_seconds,
-    hold_out_frames,
-    select_frames,
-    sequence_warnings,
-    span_in_files,
-    split_by_camera,
-    still_if_constant,
-    times_by_name,
-    times_of_frames,
-    unit_times,
-)
 from dyngs.errors import DyngsError, NoCaptureError, reading
 from dyngs.files.containment import images_up_to, inside, staying_within
 from dyngs.files.wrong_place import command_for
@@ -139,16 +120,16 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     if not splits.get("train"):
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed images")
     if capture.body is not None:  # people are drawn in the poses of their frames, which are found by their times
-        splits = times_of_frames(splits)
+        splits = times.times_of_frames(splits)
     new_poses = splits.pop("pose", None)
     if options.train_cameras is not None:
-        splits = split_by_camera(capture.root, splits, options.train_cameras)
+        splits = times.split_by_camera(capture.root, splits, options.train_cameras)
         said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
         capture = replace(capture, warnings=said)
     by_name: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
-        splits, line = times_by_name(capture.root, splits, rate)
+        splits, line = times.times_by_name(capture.root, splits, rate)
         by_name, capture = [line], replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
@@ -156,15 +137,15 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         )
     written = splits
     # People move by frame number: of their captures, times within [0, 1] are left as they are.
-    splits, notes = unit_times(capture.root, splits, stretch=capture.body is None)
+    splits, notes = times.unit_times(capture.root, splits, stretch=capture.body is None)
     if options.frames is not None:
-        splits = select_frames(capture.root, splits, options.frames)
-    splits, constant = still_if_constant(splits)
-    notes += [*constant, *sequence_warnings(splits)]
+        splits = times.select_frames(capture.root, splits, options.frames)
+    splits, constant = times.still_if_constant(splits)
+    notes += [*constant, *times.sequence_warnings(splits)]
     if options.pose_frames is not None:
         capture, splits, new_poses = _with_poses_held_out(capture, splits, new_poses, options.pose_frames)
-    span = span_in_files(written, splits)
-    seconds = span[1] - span[0] if capture.in_seconds and span else clip_seconds(splits, capture.fps)
+    span = times.span_in_files(written, splits)
+    seconds = span[1] - span[0] if capture.in_seconds and span else times.clip_seconds(splits, capture.fps)
     if "test" not in splits:
         views, every = splits["train"], options.test_every
         splits["test"] = views[::every] if every else ()
@@ -224,7 +205,7 @@ def _with_poses_held_out(
         raise DyngsError(
             f"{capture.root}: has a clip of new poses of its own; remove data.pose_frames={frames}, or the files of it"
         )
-    splits, held = hold_out_frames(capture.root, splits, frames)
+    splits, held = times.hold_out_frames(capture.root, splits, frames)
     return capture.replace(body={**capture.body, "pose": capture.body["train"]}), splits, held
 
 

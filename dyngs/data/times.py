@@ -409,7 +409,6 @@ def taken_frames(
 
 
 def _nearest(clock: np.ndarray, steps: np.ndarray, same: float) -> Taken:
-    """Return the frames that are nearest to the time steps, each at most once."""
     after = np.clip(np.searchsorted(clock, steps), 1, max(len(clock) - 1, 1))
     numbers = np.where(steps - clock[after - 1] <= clock[after] - steps, after - 1, after)
     seconds = clock[numbers]

@@ -9,13 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.capture.multi_video.films import (
-    VIDEOS_FILE,
-    Film,
-    open_film,
-    read_given,
-    shrunk_grey,
-)
+from dyngs.capture.multi_video.films import VIDEOS_FILE, Film, open_film, read_given, shrunk_grey
 from dyngs.capture.multi_video.lags import motion_of
 from dyngs.capture.multi_video.steadiness import STANDS, displaced_by, displacement
 from dyngs.data.images.video import opened_video, orientation_of, read_frames, videos_in
@@ -71,7 +65,6 @@ def video_facts(path: Path) -> VideoFacts:
 
 
 def _look(film: Film) -> tuple[np.ndarray, np.ndarray]:
-    """Return small images of the frames, and the sharpness of each."""
     small, sharpness = [], []
     for rgb in islice(read_frames(film.path), min(MAX_FRAMES, len(film.seconds))):
         small.append(shrunk_grey(rgb))
@@ -151,7 +144,7 @@ def _next_of_folder(folder: Path, reports: Sequence[VideoFacts]) -> list[str]:
         return [f"next: take {', '.join(moving[:5])} out: of several videos, only fixed cameras get poses"]
     names = [found.film.name for found in reports]
     rates = {round(found.film.rate, 2) for found in reports}
-    known = "found by sound or motion" if read_given(folder, names).starts is None else f"as {VIDEOS_FILE} says"
+    known = "found by sound or motion" if read_given(folder, names)[0] is None else f"as {VIDEOS_FILE} says"
     return [
         f"{len(names)} fixed cameras, {' and '.join(f'{rate:g}' for rate in sorted(rates))} frames per second; "
         f"offsets between them: {known}",

@@ -118,7 +118,6 @@ def _is_better(one: FixedModel, other: FixedModel) -> bool:
 
 
 def _attempt(work: Path, images: Path, affine: bool, shared: bool, num_threads: int) -> pycolmap.Reconstruction | None:
-    """Return the best model of one kind of features, None without any."""
     import pycolmap
 
     work.mkdir(parents=True)

@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.multi_video.camera_poses import FixedModel, camera_name, fixed_model, image_without_movers
-from dyngs.capture.multi_video.films import (
-    VIDEOS_FILE,
-    Film,
-    checked_starts,
-    open_film,
-    read_given,
-    small_images,
-)
+from dyngs.capture.multi_video.films import VIDEOS_FILE, Film, checked_starts, open_film, read_given, small_images
 from dyngs.capture.multi_video.lags import Watcher, motion_of
 from dyngs.capture.multi_video.starts import found_starts, given_starts
 from dyngs.capture.multi_video.steadiness import STANDS, displaced_by
@@ -51,7 +44,6 @@ def poses_of_videos(
     Args:
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
-        options: time steps, offsets, threads.
 
     Raises:
         DyngsError: a camera that moves, poses or offsets that cannot be found, with what to do; an ``out`` in use.
@@ -73,14 +65,12 @@ def poses_of_videos(
 
 
 def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgress) -> list[str]:
-    """Write the capture in the folder ``work`` and return what was found."""
     films = [open_film(inside(path)) for path in videos_in(source)]
     if len(films) < 2:
         raise DyngsError(
             f"{source}: holds {len(films)} videos, two or more are needed; give one video as the file itself"
         )
-    given = read_given(source, [film.name for film in films])
-    starts = given.starts
+    starts, held_out = read_given(source, [film.name for film in films])
     if options.starts is not None:
         starts = checked_starts(options.starts, [film.name for film in films], "--start")
     small = small_images(films, report)
@@ -95,8 +85,8 @@ def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgre
     lines.append(line)
     names = _write_images(work, films, taken, report)
     _write_model(work, films, names, found.model)
-    if given.test is not None:
-        test = [film.name for film in films if film.name in given.test]
+    if held_out is not None:
+        test = [film.name for film in films if film.name in held_out]
     else:
         test = [films[0].name] if len(films) >= MIN_CAMERAS_TO_HOLD_OUT else []
     seconds = {
@@ -106,8 +96,8 @@ def _made_in(work: Path, source: Path, options: SfmOptions, report: ReportProgre
     }
     write_seconds(work, seconds)
     if test:
-        held_out = [name for name in seconds if name.partition("/")[0] in test]
-        write_text(work / "sparse" / "0" / TEST_LIST, "".join(f"{name}\n" for name in held_out))
+        listed = [f"{name}\n" for name in seconds if name.partition("/")[0] in test]
+        write_text(work / "sparse" / "0" / TEST_LIST, "".join(listed))
         lines.append(f"held out for testing: {first_few(test)}")
     rounded = {film.name: round(float(start), 6) for film, start in zip(films, begun, strict=True)}
     write_text(work / VIDEOS_FILE, json.dumps({"starts": rounded, "test": test}, indent=1) + "\n")
@@ -221,7 +211,6 @@ def _posed(
 
 
 def _watcher(film: Film, grey: np.ndarray, model: pycolmap.Reconstruction) -> Watcher:
-    """Return a camera with the rays of its small images, and the motion in them."""
     image = next(image for image in model.images.values() if camera_name(image) == film.name)
     camera = model.cameras[image.camera_id]
     height, width = grey.shape[1:]

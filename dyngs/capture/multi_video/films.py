@@ -64,23 +64,17 @@ VIDEOS_FILE = "videos.json"
 MAX_SECONDS = 86_400.0
 
 
-@dataclass(frozen=True)
-class Given:
-    """Camera to the second, in one clock, at which its video begins; cameras held out for testing; None: not known."""
+def read_given(folder: Path, names: Sequence[str]) -> tuple[dict[str, float] | None, tuple[str, ...] | None]:
+    """Return when the videos begin, by camera, in one clock, and the cameras for testing; None: not known.
 
-    starts: dict[str, float] | None = None
-    test: tuple[str, ...] | None = None
-
-
-def read_given(folder: Path, names: Sequence[str]) -> Given:
-    """Read ``videos.json``: ``{"starts": {"cam00": 0, "cam01": 1.25}, "test": ["cam00"]}``; all keys are optional.
+    By ``videos.json``: ``{"starts": {"cam00": 0, "cam01": 1.25}, "test": ["cam00"]}``; all keys are optional.
 
     ``"starts": 0`` says that all videos begin at once. Raises DyngsError: a camera that is not there or missing, or
     something that is no number.
     """
     path = folder / VIDEOS_FILE
     if not path.is_file():
-        return Given()
+        return None, None
     fields = read_json_object(path)
     unknown = sorted(fields.keys() - {"starts", "test"})
     if unknown:
@@ -95,9 +89,8 @@ def read_given(folder: Path, names: Sequence[str]) -> Given:
         starts = dict.fromkeys(names, 0.0)
     elif starts is not None and not isinstance(starts, dict):
         raise DyngsError(f"{path}: 'starts' must map cameras to seconds, or be 0, got {starts!r:.40}")
-    return Given(
-        None if starts is None else checked_starts(starts, names, str(path)), None if test is None else tuple(test)
-    )
+    seconds = None if starts is None else checked_starts(starts, names, str(path))
+    return seconds, None if test is None else tuple(test)
 
 
 def checked_starts(starts: Mapping[str, object], names: Sequence[str], where: str) -> dict[str, float]:

@@ -221,7 +221,6 @@ def _removed(kept: frozenset[Path], too_much: float) -> int:
 
 
 def _our_folders() -> list[Path]:
-    """Folders of the cache that carry our mark and are no links."""
     cache = cache_folder("frames")
     return [folder for folder in cache.iterdir() if _stored_info(folder)] if cache.is_dir() else []
 
@@ -248,7 +247,6 @@ def _remove(folder: Path) -> int:
 
 
 def _own_files(folder: Path) -> list[Path]:
-    """Return the regular files of a folder that are named like ours."""
     with os.scandir(folder) as entries:
         ours = [x for x in entries if x.is_file(follow_symlinks=False) and _OUR_FILES.fullmatch(x.name)]
     return [Path(found.path) for found in ours]

@@ -139,7 +139,6 @@ def _as_colours(
     size: tuple[int, int] | None,
     upright: bool,
 ) -> Tensor:
-    """Return ``read_image`` of decoded pixels."""
     header = _header(spec)
     if upright or (size is not None and header.size_for(size) != header.size):
         pixels = rotated_upright(pixels, header.tags.orientation)

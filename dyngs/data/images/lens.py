@@ -69,14 +69,14 @@ def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Te
         return points
     k = torch.as_tensor(intrinsics, dtype=torch.float64, device=points.device)
     focal, center = k.diagonal()[:2], k[:2, 2]
-    wanted = (points.double() - center) / focal
-    found = wanted / lens.focal_ratio
+    target = (points.double() - center) / focal
+    found = target / lens.focal_ratio
     if lens.model == "fisheye":
         found = _straightened_fisheye(lens, found)
     else:
         for _ in range(_ITERATIONS):
-            found = found + (wanted - distort(lens, found)) / lens.focal_ratio
-    close = ((distort(lens, found) - wanted) * focal).norm(dim=-1, keepdim=True) < _CLOSE_PX
+            found = found + (target - distort(lens, found)) / lens.focal_ratio
+    close = ((distort(lens, found) - target) * focal).norm(dim=-1, keepdim=True) < _CLOSE_PX
     return torch.where(close, found * focal + center, torch.nan).to(points.dtype)
 
 
@@ -117,7 +117,7 @@ def wide_pinhole(lens: Lens, intrinsics: np.ndarray, width: int, height: int) ->
 
 
 def _undistorted_grid(lens: Lens, intrinsics: np.ndarray, size: tuple[int, int], fractions: Tensor) -> Tensor:
-    """Return (N, N, 2) the places in the pinhole image, px, of a grid of places in the stored one."""
+    """Return (N, N, 2) the positions in the pinhole image, px, of a grid in the stored one."""
     points = torch.stack(torch.meshgrid(fractions, fractions, indexing="xy"), dim=-1) * fractions.new_tensor(size)
     return undistorted_points(lens, intrinsics, points)
 

@@ -32,7 +32,6 @@ def read_blender(root: Path) -> Capture:
 
 
 def _capture_of(root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]) -> Capture:
-    """Return the capture with the points, frame rate and tracks of a transforms file."""
     points, path, notes = find_points(file)
     tracks, lines = tracks_path_of(file), (*warnings, *notes)
     return Capture(root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines)

@@ -252,7 +252,6 @@ def read_llff(root: Path) -> Capture:
 
 
 def _read_rows(path: Path) -> np.ndarray:
-    """Read the (V, 17) float64 rows of ``poses_bounds.npy``."""
     rows = read_npy(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise DyngsError(f"{path}: must have 17 columns, one row per camera; got shape {rows.shape}")
@@ -277,7 +276,6 @@ def _llff_calibration(row: np.ndarray) -> dict[str, object]:
 
 
 def _gaps(names: list[str]) -> str:
-    """Say which numbers are missing between the first and the last name."""
     numbers = {int(digits) for name in names for digits in re.findall(r"\d+$", name)}
     missing = sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
     return f", without number {', '.join(map(str, missing[:5]))}" if 0 < len(missing) < len(numbers) else ""

@@ -146,8 +146,8 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     unknown = sorted(listed - set(names))
     notes = [f"{path}: {len(unknown)} listed images have no pose, first {unknown[0]:.80}"] if unknown else []
     train, test = (
-        tuple(view for name, view in zip(names, views, strict=True) if (name in listed) == wanted)
-        for wanted in (False, True)
+        tuple(view for name, view in zip(names, views, strict=True) if (name in listed) == is_test)
+        for is_test in (False, True)
     )
     return ({"train": train, "test": test} if test else {"train": train}), notes
 

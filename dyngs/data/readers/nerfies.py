@@ -13,7 +13,7 @@ from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, header_if_readable
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
 from dyngs.errors import DyngsError
-from dyngs.files.fields import is_number, read_json_object
+from dyngs.files.fields import entry, is_number, numbers_of, read_json_object
 from dyngs.files.numpy_files import read_npy
 
 
@@ -117,17 +117,7 @@ def _warp_id(own: dict[str, object]) -> object:
 
 
 def _numbers(path: Path, fields: dict[str, object], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the finite float64 numbers at ``key`` of exactly this shape."""
-    try:
-        value = np.array(fields[key], dtype=np.float64)
-    except KeyError:
-        raise DyngsError(f"{path}: the key '{key}' is missing") from None
-    except (TypeError, ValueError, OverflowError):
-        value = np.zeros(0)
-    if value.shape != shape or not np.isfinite(value).all():
-        wanted = "x".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
-        raise DyngsError(f"{path}: '{key}' must hold {wanted}; export it again")
-    return value
+    return numbers_of(f"{path}: '{key}'", entry(path, fields, key), shape)
 
 
 def _scene(path: Path) -> _Scene:

@@ -67,7 +67,6 @@ def _video(root: Path) -> Path:
 
 
 def _calibration(path: Path) -> dict[str, object]:
-    """Return the camera as the fields of a frame in a transforms file."""
     fields = read_pickle(inside(path))
 
     def numbers(key: str, count: int) -> np.ndarray:

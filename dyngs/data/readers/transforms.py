@@ -193,7 +193,6 @@ def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
 
 
 def _named_file(root: Path, frame: FrameEntry, key: str) -> Path | None:
-    """Return the file that a frame names at ``key``, None where it names none."""
     written = frame.text(key)
     return _below(root, written, frame.where) if written else None
 
@@ -268,7 +267,6 @@ def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
 
 
 def _focal(source: Mapping[str, object], axis: str, size: int, where: str) -> float | None:
-    """Focal length in pixels along one axis, None where the source does not give it."""
     focal = _number(source.get(f"fl_{axis}"), f"fl_{axis}", where)
     # An angle beside an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
     if focal is None and not any(source.get(key) is not None for key in ("fl_x", "fl_y")):

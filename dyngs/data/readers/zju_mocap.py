@@ -67,7 +67,6 @@ def read_zju_mocap(root: Path) -> Capture:
 
 
 def _annotated_shots(path: Path) -> list[tuple[int, FrameEntry]]:
-    """Return frame number and entry of each image."""
     fields = read_pickled_array(inside(path))
     cams = {key: _items(f"{path}, cams", entry(path, fields, "cams"), key) for key in ("K", "D", "R", "T")}
     counts = {key: len(values) for key, values in cams.items()}
@@ -186,7 +185,7 @@ def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
 
 
 def _frame_number(path: Path, name: str) -> int:
-    """FrameEntry number of ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
+    """Frame number of ``000123.jpg``, ``frame_000123`` or ``Camera (1)_0123_2019-08-23_16.592.jpg``."""
     stem = PurePosixPath(name.replace("\\", "/")).name
     found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem)
     if not found:
@@ -195,7 +194,6 @@ def _frame_number(path: Path, name: str) -> int:
 
 
 def _by_name(path: Path) -> dict[str, dict[str, object]]:
-    """Read a pickle of a dictionary from image names to dictionaries."""
     fields = read_pickle(inside(path))
     if not isinstance(fields, dict) or not fields or not all(isinstance(own, dict) for own in fields.values()):
         raise DyngsError(f"{path}: must be a dictionary from image names to parameters; export it again")

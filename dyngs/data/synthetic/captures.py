@@ -117,7 +117,6 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
 def _write_split(
     out: Path, split: str, shots: Sequence[_Shot], scene_of: Callable[[_Shot], Scene], options: ImageOptions
 ) -> None:
-    """Write the images of one split, then its JSON; nothing where it has no images."""
     if not shots:
         return
     frames = []
@@ -188,7 +187,6 @@ def _room_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
 
 
 def _even_times(count: int) -> list[float]:
-    """Return ``count`` times from 0 to 1, both included; a single one is 0."""
     return [i / max(count - 1, 1) for i in range(count)]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.capture.multi_video.films import VIDEOS_FILE, Given, read_given
+from dyngs.capture.multi_video.films import VIDEOS_FILE, read_given
 from dyngs.errors import DyngsError
 
 NAMES = ["left", "right"]
@@ -19,16 +19,16 @@ def _written(folder: Path, value: object) -> Path:
 
 
 def test_nothing_is_known_without_the_file(tmp_path: Path) -> None:
-    assert read_given(tmp_path, NAMES) == Given()
+    assert read_given(tmp_path, NAMES) == (None, None)
 
 
 def test_starts_and_test_cameras(tmp_path: Path) -> None:
     _written(tmp_path, {"starts": {"left": 0, "right": 1.25}, "test": ["left"]})
-    assert read_given(tmp_path, NAMES) == Given({"left": 0.0, "right": 1.25}, ("left",))
+    assert read_given(tmp_path, NAMES) == ({"left": 0.0, "right": 1.25}, ("left",))
 
 
 def test_all_began_at_once(tmp_path: Path) -> None:
-    assert read_given(_written(tmp_path, {"starts": 0}), NAMES).starts == {"left": 0.0, "right": 0.0}
+    assert read_given(_written(tmp_path, {"starts": 0}), NAMES)[0] == {"left": 0.0, "right": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_frames_are_chosen(root: Path) -> None:
         ("camera/000002.json", {"orientation": np.diag([1, 1, -1]).tolist()}, "mirrored"),
         ("camera/000002.json", {"position": [0, 0, float("nan")]}, "'position' must hold 3 finite numbers"),
         ("camera/000002.json", {"focal_length": -3}, "fl_x must be positive"),
-        ("camera/000002.json", {"focal_length": None}, "'focal_length' must hold a finite number"),
+        ("camera/000002.json", {"focal_length": None}, "'focal_length' must hold finite numbers"),
         ("camera/000002.json", {"image_size": [0, 0]}, "'image_size' must be positive"),
         ("camera/000002.json", {"image_size": [160, 12]}, "but its intrinsics are for 160x12"),
     ],
