@@ -184,12 +184,11 @@ def with_background_masks(
 ) -> Capture:
     """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is made.
 
+    Raises DyngsError: a camera that moves, too few images, or nobody who stands out; says what to add.
+
     Args:
         empty: an image without the person, or a folder of one for each camera, whose name ends in the camera's number
             (or is that of any image of it); None: the median over time.
-
-    Raises:
-        DyngsError: a camera that moves, too few images, or nobody who stands out; says what to add.
     """
     cameras = _fixed_cameras(capture)
     plates = {} if empty is None else _plates(empty, cameras)

@@ -35,16 +35,14 @@ def is_plain_clip(source: Path) -> bool:
 def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture:
     """Read a clip of one fixed camera; ``options.root`` is a video, or a folder of images in the order of names.
 
-    The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else ``FOCAL`` times
-    the longest side. The world is y up if the camera is level, the camera stands at its origin. Without
-    ``data.frames``, ``MOST_FRAMES`` are taken, evenly spread.
+    The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else ``FOCAL`` times the
+    longest side. The world is y up if the camera is level, the camera stands at its origin. Without ``data.frames``,
+    ``MOST_FRAMES`` are taken, evenly spread. Raises DyngsError: no clip, images of different sizes, or no mask for an
+    image.
 
     Args:
         masks: folder of masks (white = the person), named as the images, or ``frame_000012.png`` for frame 12 of a
             video; None: alpha, if the images have it.
-
-    Raises:
-        DyngsError: no clip, images of different sizes, or no mask for an image.
     """
     source = options.root
     with staying_within(source if source.is_dir() else source.parent, options.follow_links), reading(source):

@@ -109,15 +109,12 @@ def estimate_poses(
 
     Work is done in a hidden folder beside ``out``; the capture is renamed at the end, so ``out`` is complete or absent.
     A stopped run leaves that folder, and the next one with the same images and options goes on with its features and
-    matches. Of several models the one with most images is kept.
+    matches. Of several models the one with most images is kept. Raises DyngsError: too few images, an ``out`` in use, a
+    camera that stands still or only rotates, or nothing could be registered, with advice.
 
     Args:
         source: a folder of photos (subfolders included) or a video file.
         out: a folder that does not exist, or is empty.
-
-    Raises:
-        DyngsError: too few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
-            registered, with advice.
     """
     require_new_folder(out)
     if not source.exists():

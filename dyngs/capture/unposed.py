@@ -32,15 +32,13 @@ def with_poses(
     """Return the options with a capture that has poses as their folder: the same one, unless it has none.
 
     Photos and videos without poses go through structure from motion once; the same ones are found in the user's cache
-    from then on. Of a folder that holds ``images``, those are the photos: masks and maps next to them are not.
+    from then on. Of a folder that holds ``images``, those are the photos: masks and maps next to them are not. Raises
+    DyngsError: photos without times where they are needed, several videos where nothing is to move, or poses that
+    cannot be found.
 
     Args:
         data: its ``root`` is a capture of any format, a folder of photos, or a video.
         needs_times: something is to move, so photos must have an order.
-
-    Raises:
-        DyngsError: photos without times where they are needed, several videos where nothing is to move, or poses that
-            cannot be found.
     """
     if not is_unposed(data):
         return data

@@ -30,14 +30,13 @@ def body_frames(
 ) -> BodyFrames:
     """Return checked body parameters, sorted by frame; arrays may have any shape with one row per frame.
 
+    Raises DyngsError: counts that differ, another width, NaN, a scale that is not positive, a frame twice.
+
     Args:
         frames: F distinct numbers.
         poses: F rows of 72, 156 or 165 numbers; ``trans`` and ``turns``: of 3.
         betas: (B,), or one such row per frame, of which the mean is taken.
         scale: one number, or one per frame.
-
-    Raises:
-        DyngsError: counts that differ, another width, NaN, a scale that is not positive, a frame twice.
     """
     order = np.argsort(np.asarray(frames, dtype=np.int64), kind="stable")
     numbers = tuple(int(frames[i]) for i in order)

@@ -381,14 +381,11 @@ def taken_frames(
     """Return the frames of each video at the time steps that all of them show, and a line on how many.
 
     Time steps are frames of the video with the fewest per second. Of the others the nearest frame is taken, at its own
-    time if that differs.
+    time if that differs. Raises DyngsError: no two time steps that all videos show.
 
     Args:
         clocks: of each video the seconds (F,) of its frames, in one clock; ``rates``: frames per second.
         most: time steps at most, evenly spaced; None: ``MOST_STEPS``, fewer where there are many cameras.
-
-    Raises:
-        DyngsError: no two time steps that all videos show.
     """
     first, last = max(clock[0] for clock in clocks), min(clock[-1] for clock in clocks)
     slowest = min(range(len(clocks)), key=lambda i: (rates[i], i))

@@ -39,14 +39,12 @@ def poses_of_videos(
     """Make a capture of a folder of videos that ran at once, of fixed cameras; return what was found, as lines.
 
     All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is complete or absent. It is in
-    COLMAP's layout, with ``times.json``, and ready to be trained on.
+    COLMAP's layout, with ``times.json``, and ready to be trained on. Raises DyngsError: a camera that moves, poses or
+    offsets that cannot be found, with what to do; an ``out`` in use.
 
     Args:
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
-
-    Raises:
-        DyngsError: a camera that moves, poses or offsets that cannot be found, with what to do; an ``out`` in use.
     """
     require_new_folder(out)
     work = temporary_folder_beside(out)
