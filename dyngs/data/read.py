@@ -116,6 +116,33 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
 
 
 def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Capture:
+    capture, notes = _with_splits(capture, options)
+    splits = _wide(capture.splits) if options.undistort == "wide" else capture.splits
+    for view in all_views(splits):
+        _check_places(view)
+    splits, tracks, absent = _present_priors(splits, capture.tracks_path)
+    if decode_videos:
+        frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
+        decode_frames(capture.root, frames, options.frame_cache_mb)
+    seen = all_views(splits)
+    missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
+    lacking = [f"{len(missing)} of {len(seen)} images are missing, first {missing[0]}"] if missing else []
+    points, more = _finite_points(capture.points)
+    warnings = [*capture.warnings, *_check_names(capture.root, splits)]
+    capture = replace(
+        capture,
+        splits=splits,
+        points=points,
+        tracks_path=tracks,
+        points_file=capture.points_file if points is not None else None,
+        has_alpha=_first_has_alpha(splits["train"]),
+        warnings=(*warnings, *lacking, *notes, *more, *absent),
+    )
+    return recenter(capture if options.body is None else with_fitted_body(capture, options.body))
+
+
+def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[str]]:
+    """Return the capture with final splits and times, and lines about these."""
     splits: Splits = {name: tuple(sorted(views, key=lambda view: view.name)) for name, views in capture.splits.items()}
     if not splits.get("train"):
         raise DyngsError(f"{capture.root}: the {capture.format} capture has no training views; add posed images")
@@ -155,31 +182,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
-    if options.undistort == "wide":
-        splits = _wide(splits)
-    for view in all_views(splits):
-        _check_places(view)
-    splits, tracks, absent = _present_priors(splits, capture.tracks_path)
-    if decode_videos:
-        frames = {view.image_path: view.video for view in all_views(splits) if view.video is not None}
-        decode_frames(capture.root, frames, options.frame_cache_mb)
-    seen = all_views(splits)
-    missing = [view.image_path for view in seen if view.video is None and not view.image_path.is_file()]
-    lacking = [f"{len(missing)} of {len(seen)} images are missing, first {missing[0]}"] if missing else []
-    points, more = _finite_points(capture.points)
-    warnings = [*capture.warnings, *_check_names(capture.root, splits)]
-    capture = replace(
-        capture,
-        splits=splits,
-        points=points,
-        tracks_path=tracks,
-        points_file=capture.points_file if points is not None else None,
-        has_alpha=_first_has_alpha(splits["train"]),
-        span=span,
-        seconds=seconds,
-        warnings=(*warnings, *lacking, *by_name, *notes, *more, *absent),
-    )
-    return recenter(capture if options.body is None else with_fitted_body(capture, options.body))
+    return replace(capture, splits=splits, span=span, seconds=seconds), [*by_name, *notes]
 
 
 def _wide(splits: Splits) -> Splits:
