@@ -20,13 +20,12 @@ _BLURRED = 0.4
 
 @dataclass(frozen=True)
 class FrameMeasures:
-    """Measures of each frame of a video.
+    """Measures (F,) of each frame of a video.
 
     Attributes:
-        sharpness: (F,) variance of the Laplacian of the brightness.
-        motion: (F,) motion of most of the image since the frame before, as a fraction of its width; 0 for the first.
-        most: (F,) the same of the part of the image that moves most.
-        away: (F,) motion of most of the image since the first frame: noise does not add up in it.
+        sharpness: variance of the Laplacian of the brightness.
+        motion: of most of the image since the frame before, as a fraction of its width; ``most``: of what moves most.
+        away: motion of most of the image since the first frame: noise does not add up in it.
     """
 
     sharpness: np.ndarray

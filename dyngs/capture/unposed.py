@@ -61,14 +61,13 @@ def with_poses(
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
     if folder.is_dir():
         say(f"{source} has no poses; those of before are in {folder}")
-        note_sources(folder, data.root)
-        return data.model_copy(update={"root": folder})
-    say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
-    options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
-    if videos:
-        say(poses_of_videos(source, folder, options, report))
     else:
-        say(estimate_poses(source, folder, options, report).summary())
+        say(f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}")
+        options = SfmOptions(masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels)
+        if videos:
+            say(poses_of_videos(source, folder, options, report))
+        else:
+            say(estimate_poses(source, folder, options, report).summary())
     note_sources(folder, data.root)
     return data.model_copy(update={"root": folder})
 

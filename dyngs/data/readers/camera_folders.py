@@ -267,12 +267,8 @@ def _llff_calibration(row: np.ndarray) -> dict[str, object]:
     down, right, backward, position, (height, width, focal) = matrix.T
     world_from_cam = np.eye(4)
     world_from_cam[:3] = np.stack([right, down, -backward, position], axis=1)
-    return {
-        "fl_x": float(focal),
-        "w": float(width),
-        "h": float(height),
-        "transform_matrix": (world_from_cam @ OPENGL_FROM_OPENCV).tolist(),
-    }
+    pose = (world_from_cam @ OPENGL_FROM_OPENCV).tolist()
+    return {"fl_x": float(focal), "w": float(width), "h": float(height), "transform_matrix": pose}
 
 
 def _gaps(names: list[str]) -> str:
