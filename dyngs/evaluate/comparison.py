@@ -29,21 +29,15 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Cost:
-    """Quality, size and speed of a run.
-
-    Attributes:
-        psnr_train, psnr_test: means over at most 20 views, dB; None without such a split.
-        fps: one over the median time of drawing a view, deformation included.
-        megabytes: float32 parameters, the field and masks, in 1e6 bytes.
-        stored: size of the file in 1e6 bytes, where the run is only there as one; else None.
-    """
+    """Quality, size and speed of a run."""
 
     num_gaussians: int
+    # ``psnr_train, psnr_test``: means over at most 20 views, dB; None without such a split
     psnr_train: float | None
     psnr_test: float | None
-    fps: float
-    megabytes: float
-    stored: float | None = None
+    fps: float  # one over the median time of drawing a view, deformation included
+    megabytes: float  # float32 parameters, the field and masks, in 1e6 bytes
+    stored: float | None = None  # size of the file in 1e6 bytes, where the run is only there as one; else None
 
 
 def compared(

@@ -18,18 +18,12 @@ from dyngs.ops.device import finish
 
 @dataclass(frozen=True)
 class Drawing:
-    """A scene and how it is drawn.
-
-    Attributes:
-        options: as in training, without depth.
-        background: (3,) colour.
-        scale: width and height drawn, relative to those of the image.
-    """
+    """A scene and how it is drawn."""
 
     scene: Renderable
-    options: DrawOptions
-    background: Tensor
-    scale: float = 1.0
+    options: DrawOptions  # as in training, without depth
+    background: Tensor  # (3,) colour
+    scale: float = 1.0  # width and height drawn, relative to those of the image
 
     @torch.no_grad()
     def image(self, cameras: Cameras, time: float | None) -> Tensor:
@@ -47,12 +41,7 @@ def seconds_in_turn(drawings: Sequence[Drawing], images: Sequence[Image], rounds
     """Return the seconds (D, ``rounds`` * I) that each of D drawings takes for each image.
 
     All draw each image in turn, starting with another one each time, so that other load on the machine affects all
-    alike.
-
-    Args:
-        drawings: at least one.
-        images: I; their cameras and times are drawn.
-        rounds: drawings of each image.
+    alike. ``images``: I; their cameras and times are drawn.
     """
     seconds = np.zeros((len(drawings), rounds * len(images)))
     for drawing in drawings:

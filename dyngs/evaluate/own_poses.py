@@ -31,16 +31,11 @@ from dyngs.training.corrections.camera_fit import fitted_to_image
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """Scores from poses that were fitted to the tested images; None where that was not done.
+    """Scores from poses that were fitted to the tested images; None where that was not done."""
 
-    Attributes:
-        psnr: from cameras, or of a person from body poses, fitted to the whole images.
-        to_images: of a person, all scores of these.
-        to_silhouettes: of a person, from poses fitted to the silhouettes alone; None without silhouettes.
-    """
-
-    psnr: float | None = None
-    to_images: PoseScores | None = None
+    psnr: float | None = None  # from cameras, or of a person from body poses, fitted to the whole images
+    to_images: PoseScores | None = None  # of a person, all scores of these
+    # of a person, from poses fitted to the silhouettes alone; None without silhouettes
     to_silhouettes: PoseScores | None = None
 
 

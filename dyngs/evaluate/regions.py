@@ -39,12 +39,8 @@ class Regions:
     The foreground is where the true image is not fully transparent. What moves is known, in this order, from motion
     masks that the views come with, and from the truth's change over time before cameras that stand still: where it
     differs by ``CHANGE`` from the camera's median over time, less single pixels. What is left does not move. Where
-    there is a foreground, both are parts of it, so that an empty background counts nowhere.
-
-    Args:
-        views: the split.
-        loader: images of ``views``, in their order.
-        background: (3,) colour behind the truth.
+    there is a foreground, both are parts of it, so that an empty background counts nowhere. ``loader``: images of
+    ``views``, in their order. ``background``: (3,) colour behind the truth.
     """
 
     def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:

@@ -36,32 +36,16 @@ from dyngs.runs.opened import scene_of_split, split_views
 
 @dataclass(frozen=True)
 class EvalReport:
-    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see docs/formats.md.
-
-    Attributes:
-        width, height: size of the first view in pixels.
-        psnr, ssim, flip, lpips and the like: means over the views of what ``ViewScore`` holds, None where one has none.
-        psnr_foreground, psnr_moving, psnr_static: means over the views that have such a region (``Regions``).
-        model_mb: float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per
-            Gaussian.
-        field_mb: of these, the field's.
-        colour_floats: numbers per Gaussian that its colour takes, with its fraction of a network.
-        fps: one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and
-            metrics not counted.
-        deform_fraction: median fraction of that time that the deformation takes.
-        stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
-        reasons: metric name to why it is None.
-        notes: anything else that a reader of the numbers should know.
-        moving_from: how it was found what moves, None where it was not.
-        track_error_px, track_within_5px, track_motion_px: see ``TrackScores``.
-        psnr_own_poses, own_poses, silhouette_poses: see ``PoseRefinement``; None where that was not requested.
-    """
+    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see docs/formats.md."""
 
     split: str
     num_views: int
+    # ``width, height``: size of the first view in pixels
     width: int
     height: int
     background: str
+    # ``psnr, ssim, flip, lpips and the like``: means over the views of what ``ViewScore`` holds, None where one has
+    # none
     psnr: float
     ssim: float
     flip: float | None
@@ -70,31 +54,37 @@ class EvalReport:
     num_gaussians: int
     num_moving: int
     moving_fraction: float
+    # float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per Gaussian
     model_mb: float
-    field_mb: float
-    colour_floats: float
+    field_mb: float  # of these, the field's
+    colour_floats: float  # numbers per Gaussian that its colour takes, with its fraction of a network
+    # one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and metrics not
+    # counted
     fps: float
-    deform_fraction: float
+    deform_fraction: float  # median fraction of that time that the deformation takes
     seconds_train: float
     step: int
     flicker: float | None = None
     flicker_error: float | None = None
     psnr_per_time: tuple[TimeScore, ...] = ()
-    reasons: dict[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    reasons: dict[str, str] = field(default_factory=dict)  # metric name to why it is None
+    notes: tuple[str, ...] = ()  # anything else that a reader of the numbers should know
     per_view: tuple[ViewScore, ...] = ()
     psnr_person: float | None = None
     ssim_person: float | None = None
-    stored_mb: float | None = None
+    stored_mb: float | None = None  # size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others
+    # ``psnr_foreground, psnr_moving, psnr_static``: means over the views that have such a region (``Regions``)
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
-    moving_from: str | None = None
+    moving_from: str | None = None  # how it was found what moves, None where it was not
+    # ``track_error_px, track_within_5px, track_motion_px``: see ``TrackScores``
     track_error_px: float | None = None
     track_within_5px: float | None = None
     track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
+    # ``psnr_own_poses, own_poses, silhouette_poses``: see ``PoseRefinement``; None where that was not requested
     psnr_own_poses: float | None = None
     psnr_black: float | None = None
     ssim_black: float | None = None
@@ -120,16 +110,11 @@ def evaluate_run(
 ) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
-    Args:
-        run_dir: folder of a run with at least one checkpoint.
-        split: "test", "val", "train" or "pose".
-        lpips_net: "alex", "vgg" or "squeeze".
-        threads: for rendering and metrics; 0 leaves the number as it is.
-        refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
-            images themselves; always done for a run that refined its cameras.
-        device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
-        data_root: where the capture lies by now, if it was moved.
-        capture: of the run, if it was read already.
+    ``run_dir``: folder of a run with at least one checkpoint. ``threads``: for rendering and metrics; 0 leaves the
+    number as it is. ``refine_poses``: also score from poses, of a person's body, otherwise of the cameras, that were
+    refined on the images themselves; always done for a run that refined its cameras. ``device``: "auto", "cpu" or
+    "cuda": draws the views, and compares images, but for FLIP. ``data_root``: where the capture lies by now, if it was
+    moved. ``capture``: of the run, if it was read already.
     """
     draws_on = device_for(device)
     _require_possible(run_dir, split, refine_poses)

@@ -67,11 +67,6 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
     straight line between its neighbours: 2 |w R_{k-1} + (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} -
     t_{k-1}), which is the same for even ones. Of more than 60 moments, 20 triples of neighbours are taken, evenly
     spaced. A scene in which nothing moves has 0.
-
-    Args:
-        drawing: what is drawn.
-        cameras: one camera.
-        times: distinct, ascending; those of training.
     """
     if drawing.scene.is_static:
         return MetricValue(0.0)

@@ -64,11 +64,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class PoseScores:
-    """Means over views of a person in poses that were fitted to these views themselves; names as in ``ViewScore``.
-
-    Attributes:
-        updates: mean number of updates that the pose of a moment took.
-    """
+    """Means over views of a person in poses that were fitted to these views themselves; names as in ``ViewScore``."""
 
     psnr: float
     ssim: float
@@ -78,7 +74,7 @@ class PoseScores:
     psnr_black: float | None
     ssim_black: float | None
     lpips_black: float | None
-    updates: float
+    updates: float  # mean number of updates that the pose of a moment took
     per_view: tuple[ViewScore, ...]
 
 
@@ -92,13 +88,9 @@ def score_views(
 ) -> tuple[list[ViewScore], dict[str, str]]:
     """Return scores of the Gaussians against images, and the reasons for metrics that are None.
 
-    Args:
-        scene: what to draw, at the time of each image; on the device of all else.
-        images: truth and camera of each view, drawn one at a time.
-        options: as in training, without depth.
-        background: (3,) colour behind both the truth and the render.
-        lpips: from ``load_lpips``.
-        regions: of the split of the images; None: they are not measured.
+    ``scene``: what to draw, at the time of each image; on the device of all else. ``images``: truth and camera of each
+    view, drawn one at a time. ``background``: (3,) colour behind both the truth and the render. ``lpips``: from
+    ``load_lpips``. ``regions``: of the split of the images; None: they are not measured.
     """
     scores: list[ViewScore] = []
     reasons: dict[str, str] = {}

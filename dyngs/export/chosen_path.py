@@ -31,33 +31,26 @@ _RING = 24
 
 @dataclass(frozen=True)
 class PathOptions:
-    """Cameras and times to render.
+    """Cameras and times to render."""
 
-    Attributes:
-        path: "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None:
-            one fixed camera.
-        num_frames: frames of a path that is not a file; None: as many as a motion has, else 120.
-        size: width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file.
-        times: scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view
-            for a fixed camera, from 0 to 1 along a path.
-        view: the view of the fixed camera: its name, the name of its image, or its number from 0.
-        split: split of that view; None: test, or val or train if there is none.
-    """
-
+    # "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None: one
+    # fixed camera
     path: str | None = "orbit"
-    num_frames: int | None = None
+    num_frames: int | None = None  # frames of a path that is not a file; None: as many as a motion has, else 120
+    # width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file
     size: tuple[int, int] | None = None
+    # scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view for a
+    # fixed camera, from 0 to 1 along a path
     times: tuple[float, ...] | None = None
-    view: str | None = None
-    split: str | None = None
+    view: str | None = None  # the view of the fixed camera: its name, the name of its image, or its number from 0
+    split: str | None = None  # split of that view; None: test, or val or train if there is none
 
 
 def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     """Return the cameras and times along which a scene is rendered, with notes about defaults that were chosen.
 
-    Raises:
-        DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what a
-            file cannot have.
+    Raises DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what
+    a file cannot have.
     """
     scene, times = opened.renderable, options.times
     if opened.captured is None:
@@ -77,14 +70,9 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
 def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
     """Return the view called ``name``, by default the first one.
 
-    Args:
-        capture: with at least one view.
-        name: name of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0;
-            names take precedence over numbers.
-        split: "test", "val" or "train"; None looks for a name in all, for a number in the first that has views.
-
-    Raises:
-        DyngsError: no such view, or no such split.
+    ``name``: name of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0; names
+    take precedence over numbers. ``split``: "test", "val" or "train"; None looks for a name in all, for a number in the
+    first that has views. Raises DyngsError: no such view, or no such split.
     """
     order = [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
     candidates = [split_views(capture, s) for s in order]

@@ -32,34 +32,22 @@ _DEPTH_SAMPLES = 8
 
 @dataclass(frozen=True)
 class Frame:
-    """One rendered image, float32.
+    """One rendered image, float32."""
 
-    Attributes:
-        rgb: (H, W, 3), composited on the background, clamped to [0, 1].
-        alpha: (H, W) in [0, 1].
-        depth: (H, W) expected depth, 0 where nothing is hit; None if it was not rendered.
-    """
-
-    rgb: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray | None
+    rgb: np.ndarray  # (H, W, 3), composited on the background, clamped to [0, 1]
+    alpha: np.ndarray  # (H, W) in [0, 1]
+    depth: np.ndarray | None  # (H, W) expected depth, 0 where nothing is hit; None if it was not rendered
 
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Files to write in addition to the colour images.
+    """Files to write in addition to the colour images."""
 
-    Attributes:
-        depth: ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis).
-        alpha: ``NAME_alpha.png``, white = opaque.
-        video: MP4 of the colour images in order.
-        fps: frames per second of the video.
-    """
-
+    # ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis)
     depth: bool = False
-    alpha: bool = False
-    video: Path | None = None
-    fps: float = 30.0
+    alpha: bool = False  # ``NAME_alpha.png``, white = opaque
+    video: Path | None = None  # MP4 of the colour images in order
+    fps: float = 30.0  # frames per second of the video
 
 
 def render_frame(
@@ -67,11 +55,8 @@ def render_frame(
 ) -> Frame:
     """Render one camera, without gradients.
 
-    Args:
-        scene: scene to render.
-        camera: one camera.
-        time: in [0, 1], or the scene at that time, so that it is not computed again.
-        options: None: those of the scene; ``depth`` other than "none" fills ``Frame.depth``.
+    ``time``: in [0, 1], or the scene at that time, so that it is not computed again. ``options``: None: those of the
+    scene; ``depth`` other than "none" fills ``Frame.depth``.
     """
     with torch.no_grad():
         rendering = scene.render(camera, time, options=options)
@@ -102,15 +87,10 @@ def write_path_images(
 ) -> list[Path]:
     """Render a scene along a path to ``frame_0000.png`` and so on, and to a video if requested; return the paths.
 
-    Args:
-        opened: scene to render. Images of its capture are not overwritten.
-        path: F >= 1 cameras and times, in the order of the video.
-        out_dir: folder for the images; None writes only the video.
-        output: depth, alpha, video. Depth colours share one range over the full path.
-        report: is told of each frame.
-
-    Raises:
-        DyngsError: no cameras, nothing to write, or a file cannot be written.
+    ``opened``: scene to render. Images of its capture are not overwritten. ``path``: F >= 1 cameras and times, in the
+    order of the video. ``out_dir``: folder for the images; None writes only the video. ``output``: depth, alpha, video.
+    Depth colours share one range over the full path. Raises DyngsError: no cameras, nothing to write, or a file cannot
+    be written.
     """
     if len(path) == 0:
         raise DyngsError("the camera path has no cameras")
@@ -137,19 +117,10 @@ def write_split_images(
 ) -> list[Path]:
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
 
-    The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that
-    of training, black if that was random.
-
-    Args:
-        opened: a run.
-        split: "test", "val" or "train".
-        out_dir: folder for the images, which are named after the views (``file_stems``).
-        output: depth, alpha, video (views of one size only).
-        report: is told of each view.
-        device: draws.
-
-    Raises:
-        DyngsError: no such split, unreadable images, a file cannot be written.
+    The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that of
+    training, black if that was random. ``out_dir``: folder for the images, which are named after the views
+    (``file_stems``). ``output``: depth, alpha, video (views of one size only). Raises DyngsError: no such split,
+    unreadable images, a file cannot be written.
     """
     inputs = inputs_of(opened)
     inputs.require_output(out_dir)

@@ -33,17 +33,11 @@ _FOREVER = 1e4
 
 @dataclass(frozen=True)
 class MovingFile:
-    """A file that was written.
+    """A file that was written."""
 
-    Attributes:
-        path: of it.
-        splats: what it is meant to hold at each time.
-        notes: a line about each thing that the format could not hold.
-    """
-
-    path: Path
-    splats: tuple[SplatFile, ...]
-    notes: tuple[str, ...]
+    path: Path  # of it
+    splats: tuple[SplatFile, ...]  # what it is meant to hold at each time
+    notes: tuple[str, ...]  # a line about each thing that the format could not hold
 
 
 def write_moving(
@@ -51,15 +45,9 @@ def write_moving(
 ) -> MovingFile:
     """Write a run at T times as one .4dgs, each shown for 1/30 s.
 
-    Args:
-        opened: a trained model.
-        path: output file; an old one is replaced when the new one is complete.
-        times: T >= 1 times in [0, 1].
-        part: all Gaussians, or only the moving or static ones.
-        how: axes.
-
-    Raises:
-        DyngsError: the package is missing, the part is empty, or the file cannot be written.
+    ``path``: output file; an old one is replaced when the new one is complete. ``times``: T >= 1 times in [0, 1].
+    ``part``: all Gaussians, or only the moving or static ones. Raises DyngsError: the package is missing, the part is
+    empty, or the file cannot be written.
     """
     inputs_of(opened).require_output(path)
     model, delta = _packages(path)
@@ -81,8 +69,7 @@ def write_moving(
 def read_moment(path: Path, index: int) -> SplatFile:
     """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package fourdgs.
 
-    Raises:
-        DyngsError: the package is missing, or values that are not finite.
+    Raises DyngsError: the package is missing, or values that are not finite.
     """
     _packages(path)
     reader = import_module("fourdgs.keyframe_delta_file")

@@ -29,19 +29,12 @@ MISSED = 1.05
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A stored run.
+    """A stored run."""
 
-    Attributes:
-        path: of the file.
-        precision: steps, and how much the images change.
-        num_bytes: of the file.
-        num_bytes_exact: of the same tensors before, 4 bytes per value.
-    """
-
-    path: Path
-    precision: Precision
-    num_bytes: int
-    num_bytes_exact: int
+    path: Path  # of the file
+    precision: Precision  # steps, and how much the images change
+    num_bytes: int  # of the file
+    num_bytes_exact: int  # of the same tensors before, 4 bytes per value
 
 
 def write_scene_file(
@@ -53,17 +46,12 @@ def write_scene_file(
 ) -> SceneFile:
     """The file in the folder ``out``, with the run's ``config.yaml`` beside it: together a run that can be drawn.
 
-    Args:
-        run_dir: a run with a checkpoint.
-        out: a folder, made where it is missing; it may be the run's own, or hold a former export of that run.
-        max_change: root mean square over all values of some training images, grey levels of 255. None: what lowers
-            their PSNR by ``LOSS_DB``, if it is independent of the model's own errors.
-        field_step: how many times as coarsely as that the field is rounded.
-        data_root: where the capture lies by now, if it was moved.
-
-    Raises:
-        DyngsError: no such run, ``out`` holds another one, the images would change by more than ``max_change``, or
-            the file cannot be written. Nothing is written then.
+    ``out``: a folder, made where it is missing; it may be the run's own, or hold a former export of that run.
+    ``max_change``: root mean square over all values of some training images, grey levels of 255. None: what lowers
+    their PSNR by ``LOSS_DB``, if it is independent of the model's own errors. ``field_step``: how many times as
+    coarsely as that the field is rounded. ``data_root``: where the capture lies by now, if it was moved. Raises
+    DyngsError: no such run, ``out`` holds another one, the images would change by more than ``max_change``, or the file
+    cannot be written. Nothing is written then.
     """
     config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)
@@ -86,8 +74,7 @@ def write_scene_file(
 def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], after: Sequence[Tensor]) -> Precision:
     """The precision with the change from the images ``before`` to those of the file.
 
-    Raises:
-        DyngsError: it is more than what is allowed.
+    Raises DyngsError: it is more than what is allowed.
     """
     change = GREY_LEVELS * math.sqrt(mean_square_change(before, after))
     if precision.allowed is not None and not change <= MISSED * precision.allowed:

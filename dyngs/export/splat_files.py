@@ -27,17 +27,12 @@ Part = Literal["all", "moving", "still"]
 
 @dataclass(frozen=True)
 class Writing:
-    """How Gaussians are written.
+    """How Gaussians are written."""
 
-    Attributes:
-        turn: unit quaternion wxyz, from the axes of the capture to those of the file.
-        up: axis that then points up, such as "-y"; None: not known.
-        sh_degree: degree of the harmonics in the file; None: as they are, up to what the format holds.
-    """
-
+    # unit quaternion wxyz, from the axes of the capture to those of the file
     turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    up: str | None = None
-    sh_degree: int | None = None
+    up: str | None = None  # axis that then points up, such as "-y"; None: not known
+    sh_degree: int | None = None  # degree of the harmonics in the file; None: as they are, up to what the format holds
 
 
 AS_THEY_ARE = Writing()
@@ -48,15 +43,9 @@ def writing_of(
 ) -> tuple[Writing, str]:
     """Return how a scene is written, and a line about which way is up in the file.
 
-    Args:
-        opened: the scene.
-        target: axis that viewers of the format take for up.
-        up: axis that is requested instead; "keep": nothing is turned.
-        from_up: axis that is up in the scene; None: found as ``up_of`` does.
-        sh_degree: degree of the harmonics in the file.
-
-    Raises:
-        DyngsError: no such axis.
+    ``target``: axis that viewers of the format take for up. ``up``: axis that is requested instead; "keep": nothing is
+    turned. ``from_up``: axis that is up in the scene; None: found as ``up_of`` does. ``sh_degree``: degree of the
+    harmonics in the file. Raises DyngsError: no such axis.
     """
     if up == "keep":
         return Writing(sh_degree=sh_degree), "axes are those of the capture"
@@ -88,17 +77,9 @@ def write_run_splats(
     """Write a run as a file of Gaussians; its suffix names the format.
 
     A 3D filter is fused, and colours of a network become harmonics; the header, where the format has one, states the
-    render mode, and the time if something moves.
-
-    Args:
-        opened: a trained model.
-        path: output file; an old one is replaced when the new one is complete.
-        time: scene time in [0, 1].
-        part: all Gaussians, or only the moving or static ones.
-        how: axes, degree of the harmonics.
-
-    Raises:
-        DyngsError: the part is empty, an unknown suffix, or the file cannot be written.
+    render mode, and the time if something moves. ``path``: output file; an old one is replaced when the new one is
+    complete. ``time``: scene time in [0, 1]. ``part``: all Gaussians, or only the moving or static ones. Raises
+    DyngsError: the part is empty, an unknown suffix, or the file cannot be written.
     """
     inputs_of(opened).require_output(path)
     return _write(opened, scene_part(opened.scene, part), path, time, how)
@@ -115,18 +96,9 @@ def write_run_sequence(
     """Write a sequence ``frame_0000.ply`` and so on, one file per time, for players.
 
     All files are written into a hidden folder first and appear together, so that a failed export leaves no incomplete
-    sequence behind.
-
-    Args:
-        opened: a trained model.
-        folder: output folder, created if missing. Files of an earlier sequence of the same length are replaced.
-        times: T >= 1 times in [0, 1].
-        part: as in ``write_run_splats``.
-        how: axes, degree of the harmonics.
-        suffix: of the files, names the format.
-
-    Raises:
-        DyngsError: the part is empty, the folder holds other such files, or the files cannot be written.
+    sequence behind. ``folder``: output folder, created if missing. Files of an earlier sequence of the same length are
+    replaced. ``times``: T >= 1 times in [0, 1]. ``part``: as in ``write_run_splats``. ``suffix``: of the files, names
+    the format. Raises DyngsError: the part is empty, the folder holds other such files, or the files cannot be written.
     """
     scene = scene_part(opened.scene, part)
     names = frame_names(len(times), suffix)
@@ -191,8 +163,7 @@ def _write(opened: Opened, scene: Scene, path: Path, time: float, how: Writing) 
 def _require_no_others(folder: Path, names: Sequence[str], suffix: str) -> None:
     """Check that the folder holds no files that players would take for frames.
 
-    Raises:
-        DyngsError: there is a file that is not among ``names``, or the folder is a file.
+    Raises DyngsError: there is a file that is not among ``names``, or the folder is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")

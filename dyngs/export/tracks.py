@@ -20,20 +20,14 @@ MAX_BYTES = 4_000_000_000
 
 @dataclass(frozen=True)
 class Tracks:
-    """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays of the file.
+    """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays of the file."""
 
-    Attributes:
-        positions: (N, T, 3) in the coordinates of the capture, float32; float64 if the scene was rebased because it is
-            far from its origin, where float32 is too coarse.
-        times: (T,) float64 in [0, 1].
-        moving: (N,) bool, false if the position never changes.
-        ids: (N,) int64 index of each Gaussian in the model, which is also its row in an exported .ply.
-    """
-
+    # (N, T, 3) in the coordinates of the capture, float32; float64 if the scene was rebased because it is far from its
+    # origin, where float32 is too coarse
     positions: np.ndarray
-    times: np.ndarray
-    moving: np.ndarray
-    ids: np.ndarray
+    times: np.ndarray  # (T,) float64 in [0, 1]
+    moving: np.ndarray  # (N,) bool, false if the position never changes
+    ids: np.ndarray  # (N,) int64 index of each Gaussian in the model, which is also its row in an exported .ply
 
 
 def tracks_of(
@@ -41,14 +35,9 @@ def tracks_of(
 ) -> Tracks:
     """Return the tracks of a scene.
 
-    Args:
-        scene: N Gaussians at any time.
-        times: T >= 1 in [0, 1].
-        world_offset: (3,); coordinates of the model plus offset are those of the capture.
-        part: "all", or "moving" for only the moving ones.
-
-    Raises:
-        DyngsError: nothing moves, or the positions would take more than 4 GB.
+    ``times``: T >= 1 in [0, 1]. ``world_offset``: (3,); coordinates of the model plus offset are those of the capture.
+    ``part``: "all", or "moving" for only the moving ones. Raises DyngsError: nothing moves, or the positions would take
+    more than 4 GB.
     """
     device = scene.gaussians.means.device
     moves = torch.zeros(len(scene), dtype=torch.bool, device=device)
@@ -71,8 +60,7 @@ def tracks_of(
 def write_tracks(path: Path, tracks: Tracks) -> Path:
     """Write tracks as uncompressed .npz, atomically: one array per field of ``Tracks``, no pickle. Return the path.
 
-    Raises:
-        DyngsError: non-finite positions, or the file cannot be written.
+    Raises DyngsError: non-finite positions, or the file cannot be written.
     """
     if not np.isfinite(tracks.positions).all():
         raise DyngsError(f"{path}: not written, some positions are not finite")

@@ -28,11 +28,9 @@ class VideoWriter:
     def __init__(self, path: Path, fps: float = 30.0, quality: int = 18, threads: int = 1) -> None:
         """Prepare a writer; nothing is written yet.
 
-        Args:
-            path: output file; its suffix chooses the container, only ``.mp4`` is tested.
-            fps: frames per second, more than 0.
-            quality: x264's constant rate factor, 0 (lossless) to 51; 18 is visually lossless.
-            threads: of the encoder; the bytes depend on their number.
+        ``path``: output file; its suffix chooses the container, only ``.mp4`` is tested. ``fps``: frames per second,
+        more than 0. ``quality``: x264's constant rate factor, 0 (lossless) to 51; 18 is visually lossless. ``threads``:
+        of the encoder; the bytes depend on their number.
         """
         if not 0 < fps <= 1000:
             raise DyngsError(f"cannot write {path}: fps must be in (0, 1000], got {fps:g}")

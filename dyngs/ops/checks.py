@@ -72,10 +72,8 @@ def check_size(width: int, height: int) -> None:
 def check_memory(size: int, what: str, like: Tensor) -> None:
     """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and RLIMIT_AS leave free.
 
-    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit.
-
-    Raises:
-        DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
+    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit. Raises DyngsError:
+    with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
     """
     if shapes_only() or like.device.type != "cpu" or size <= UNASKED:
         return

@@ -56,16 +56,10 @@ def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mas
     window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both images are multiplied by it, and
     both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``; a mask of
     zeros gives a loss of 0. In float32 on the CPU only first derivatives exist. Images may have any finite values:
-    where they go beyond about 2, SSIM is computed in float64.
-
-    Args:
-        rendered: (H, W, 3) image x, any strides. Half precision is computed in float32.
-        target: (H, W, 3) image y, a constant: no gradient flows to it.
-        ssim_weight: fraction of the SSIM part, in [0, 1]; at 0 no SSIM is computed.
-        mask: (H, W) weights in [0, 1], a constant.
-
-    Raises:
-        DyngsError: shapes that do not fit, an empty image, or integer images.
+    where they go beyond about 2, SSIM is computed in float64. ``rendered``: (H, W, 3) image x, any strides. Half
+    precision is computed in float32. ``target``: (H, W, 3) image y, a constant: no gradient flows to it.
+    ``ssim_weight``: fraction of the SSIM part, in [0, 1]; at 0 no SSIM is computed. ``mask``: (H, W) weights in [0, 1],
+    a constant. Raises DyngsError: shapes that do not fit, an empty image, or integer images.
     """
     _check(rendered, target, mask)
     x, y, m = _in_common_precision(rendered, target, mask)

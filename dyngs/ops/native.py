@@ -39,13 +39,8 @@ def built_isas() -> tuple[str, ...]:
 def choose_isa(built: tuple[str, ...], newest: str, requested: str | None) -> str:
     """Return the instruction set to load.
 
-    Args:
-        built: instruction sets that were compiled, oldest first.
-        newest: that this processor runs.
-        requested: value of ``DYNGS_ISA``; None where unset.
-
-    Raises:
-        DyngsError: the processor runs none of these, or not the requested one.
+    ``built``: instruction sets that were compiled, oldest first. ``requested``: value of ``DYNGS_ISA``; None where
+    unset. Raises DyngsError: the processor runs none of these, or not the requested one.
     """
     usable = [isa for isa in built if isa <= newest]
     if not usable:
@@ -85,11 +80,7 @@ def has_cuda_core() -> bool:
 
 @cache
 def cuda_core() -> ModuleType:
-    """Return the compiled core for CUDA GPUs.
-
-    Raises:
-        DyngsError: it was not built, or cannot be loaded.
-    """
+    """Return the compiled core for CUDA GPUs. Raises DyngsError: it was not built, or cannot be loaded."""
     try:
         return import_module(_CUDA_CORE)
     except ImportError as error:
@@ -100,8 +91,7 @@ def cuda_core() -> ModuleType:
 def core_for(x: Tensor) -> ModuleType:
     """Return the compiled core that computes where ``x`` lies; on a GPU it goes on in torch's current stream there.
 
-    Raises:
-        DyngsError: ``x`` is float64 on a GPU.
+    Raises DyngsError: ``x`` is float64 on a GPU.
     """
     if x.device.type == "cpu":
         return core
@@ -212,8 +202,7 @@ def array(x: Tensor) -> object:
 def writable(x: Tensor) -> object:
     """Return ``x`` as ``array`` does, for a kernel that writes to it; autograd then counts ``x`` as changed.
 
-    Raises:
-        DyngsError: ``x`` is not contiguous, so that the kernel would write to a copy.
+    Raises DyngsError: ``x`` is not contiguous, so that the kernel would write to a copy.
     """
     if not x.is_contiguous():
         raise DyngsError("a tensor that is updated in place must be contiguous; call .contiguous() first")

@@ -90,17 +90,12 @@ weight and bias of each layer, flat; ``skip`` 0 means none."""
 def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
     """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable in all of them.
 
-    Only first derivatives exist. A row with NaN gives an output row of NaN and leaves the other rows alone;
-    gradients by the layers are sums over all rows, so a NaN in one reaches them.
-
-    Args:
-        x: (M, K) inputs, any strides; M may be 0. Half precision is computed in float32.
-        layers: first to last, at least one; each takes the width that the one before gives.
-        skip: layer, from 1 on, whose input is the hidden activations followed by ``x``: its weight is
-            (out, width + K). As in NeRF (Mildenhall et al. 2020, figure 7), there for the layer after the fifth.
-
-    Raises:
-        DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
+    Only first derivatives exist. A row with NaN gives an output row of NaN and leaves the other rows alone; gradients
+    by the layers are sums over all rows, so a NaN in one reaches them. ``x``: (M, K) inputs, any strides; M may be 0.
+    Half precision is computed in float32. ``layers``: first to last, at least one; each takes the width that the one
+    before gives. ``skip``: layer, from 1 on, whose input is the hidden activations followed by ``x``: its weight is
+    (out, width + K). As in NeRF (Mildenhall et al. 2020, figure 7), there for the layer after the fifth. Raises
+    DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
     """
     widths = _checked_widths(x, layers, skip)
     dtype = reduce(torch.promote_types, (t.dtype for layer in layers for t in (layer.weight, layer.bias)), x.dtype)

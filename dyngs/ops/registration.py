@@ -38,15 +38,12 @@ _kernels: dict[str, set[str]] = {}
 
 @dataclass(frozen=True)
 class Gradient:
-    """Formula of the first derivatives of an op, as of a ``torch.autograd.Function``.
+    """Formula of the first derivatives of an op, as of a ``torch.autograd.Function``."""
 
-    Attributes:
-        save: called as ``save(ctx, inputs, output)`` after the forward pass, keeps what the formula needs.
-        backward: called as ``backward(ctx, *gradients of the outputs)``, returns one gradient per input; for an input
-            that is a list of tensors, a list.
-    """
-
+    # called as ``save(ctx, inputs, output)`` after the forward pass, keeps what the formula needs
     save: Callable[[Any, tuple[Any, ...], Any], None]
+    # called as ``backward(ctx, *gradients of the outputs)``, returns one gradient per input; for an input that is a
+    # list of tensors, a list
     backward: Callable[..., Any]
 
 
@@ -60,14 +57,10 @@ def register(
 ) -> Callable[P, R]:
     """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments.
 
-    On a device without an implementation it raises ``DyngsError``, which names the device.
-
-    Args:
-        name: of the op.
-        kernel: the implementation; its type hints give the schema. No result may share memory with an input.
-        devices: for whose tensors ``kernel`` is; CUDA counts only where its core was built.
-        mutates: arguments that ``kernel`` writes to.
-        gradient: None: not differentiable.
+    On a device without an implementation it raises ``DyngsError``, which names the device. ``kernel``: the
+    implementation; its type hints give the schema. No result may share memory with an input. ``devices``: for whose
+    tensors ``kernel`` is; CUDA counts only where its core was built. ``mutates``: arguments that ``kernel`` writes to.
+    ``gradient``: None: not differentiable.
     """
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
     qualified = f"{NAMESPACE}::{name}"
@@ -114,10 +107,7 @@ def shapes_only() -> bool:
 def launch(like: Tensor, name: str, *arguments: object) -> Any:
     """Return what the function ``name`` of the core gives; None, without calling it, where only shapes are needed.
 
-    Args:
-        like: lies where the function computes.
-        name: of the function.
-        arguments: tensors, those written to included, are passed as arrays, also those in tuples and lists.
+    ``arguments``: tensors, those written to included, are passed as arrays, also those in tuples and lists.
     """
     if _mode.shapes_only:
         return None

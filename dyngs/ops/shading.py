@@ -21,29 +21,18 @@ from dyngs.ops.registration import Gradient, launch, register
 
 @dataclass(frozen=True)
 class Sight:
-    """N Gaussians and a camera centre; no gradient reaches any of them.
+    """N Gaussians and a camera centre; no gradient reaches any of them."""
 
-    Attributes:
-        means: (N, 3) world units.
-        quats: (N, 4) rotations wxyz, of any length.
-        log_scales: (N, 3).
-        rows: (M,) int64, the Gaussians that are seen.
-        eye: (3,) camera centre, world units.
-        box: (2, 3) centre and half sides of the scene.
-        rest: (N, 3) means at rest and the (3, 3) rotation from rest to the world; None: ``means``, no rotation.
-        time: in [0, 1]; None: not an input.
-        normals: whether the shortest axis of each Gaussian is an input.
-    """
-
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    rows: Tensor
-    eye: Tensor
-    box: Tensor
+    means: Tensor  # (N, 3) world units
+    quats: Tensor  # (N, 4) rotations wxyz, of any length
+    log_scales: Tensor  # (N, 3)
+    rows: Tensor  # (M,) int64, the Gaussians that are seen
+    eye: Tensor  # (3,) camera centre, world units
+    box: Tensor  # (2, 3) centre and half sides of the scene
+    # (N, 3) means at rest and the (3, 3) rotation from rest to the world; None: ``means``, no rotation
     rest: tuple[Tensor, Tensor] | None = None
-    time: float | None = None
-    normals: bool = True
+    time: float | None = None  # in [0, 1]; None: not an input
+    normals: bool = True  # whether the shortest axis of each Gaussian is an input
 
 
 def num_inputs(*, sees_time: bool, sees_normals: bool) -> int:
@@ -86,12 +75,8 @@ shading_op = register("shading_inputs", _shading, gradient=Gradient(_save, _back
 def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
     """Return (M, K) inputs of a colour network, differentiable in ``base`` alone; see ``reference_inputs``.
 
-    Args:
-        sight: all of the dtype and on the device of ``base``.
-        base: (M, 3) base colours of the rows that are seen.
-
-    Raises:
-        IndexError: a row that does not exist.
+    ``sight``: all of the dtype and on the device of ``base``. ``base``: (M, 3) base colours of the rows that are seen.
+    Raises IndexError: a row that does not exist.
     """
     rest, turn = (None, None) if sight.rest is None else (x.detach() for x in sight.rest)
     means, quats, log_scales, eye, box = (

@@ -45,8 +45,7 @@ def is_compressed(header: PlyHeader) -> bool:
 def read_compressed(header: PlyHeader, file: BinaryIO, path: Path) -> Gaussians:
     """Return the Gaussians of a compressed .ply; colours and logits may be infinite.
 
-    Raises:
-        DyngsError: properties or chunks are missing, or the file is cut off.
+    Raises DyngsError: properties or chunks are missing, or the file is cut off.
     """
     missing = [name for name in _PACKED if name not in header.vertex_names]
     if missing or "chunk" not in header.names:

@@ -43,17 +43,12 @@ def write_ply(
 ) -> Path:
     """Write Gaussians as .ply, atomically: an old file stays until the new one is complete. Return the path.
 
-    Args:
-        path: file to write; its folder is created.
-        gaussians: N >= 1 Gaussians, SH degree 0 to 4; any 3D filter must be fused into them already.
-        mode: noted in the header, as viewers must render an antialiased model with opacity compensation.
-        comments: further header comments, one line of ASCII each.
-        eps2d: 2D low-pass variance (px^2) to note in the header.
-        world_offset: (3,) offset to note in the header; zeros are not noted.
-        columns: further properties (N,) by name, written as float32 after all others; ``read_ply`` skips them.
-
-    Raises:
-        DyngsError: no Gaussians, non-finite values, or the file cannot be written.
+    ``path``: file to write; its folder is created. ``gaussians``: N >= 1 Gaussians, SH degree 0 to 4; any 3D filter
+    must be fused into them already. ``mode``: noted in the header, as viewers must render an antialiased model with
+    opacity compensation. ``comments``: further header comments, one line of ASCII each. ``eps2d``: 2D low-pass variance
+    (px^2) to note in the header. ``world_offset``: (3,) offset to note in the header; zeros are not noted. ``columns``:
+    further properties (N,) by name, written as float32 after all others; ``read_ply`` skips them. Raises DyngsError: no
+    Gaussians, non-finite values, or the file cannot be written.
     """
     path = Path(path)
     more = columns or {}
@@ -75,14 +70,10 @@ def write_ply(
 def read_ply(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFile:
     """Read a 3DGS .ply, plain or compressed by SuperSplat, binary or ascii, with properties in any order.
 
-    Args:
-        path: the file, with or without normals and extra properties. Scalar types other than float32 are converted;
-            elements other than ``vertex`` are skipped.
-        nonfinite: as in ``dyngs.splats.formats.read_splats``.
-
-    Raises:
-        DyngsError: not a splat file, truncated, empty or non-finite; nothing large is allocated before the vertex
-            count has been compared with the size of the file.
+    ``path``: the file, with or without normals and extra properties. Scalar types other than float32 are converted;
+    elements other than ``vertex`` are skipped. ``nonfinite``: as in ``dyngs.splats.formats.read_splats``. Raises
+    DyngsError: not a splat file, truncated, empty or non-finite; nothing large is allocated before the vertex count has
+    been compared with the size of the file.
     """
     path = Path(path)
     with reading(path):

@@ -44,19 +44,12 @@ class _Element:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The header of a .ply that has a ``vertex`` element.
+    """The header of a .ply that has a ``vertex`` element."""
 
-    Attributes:
-        byte_order: "<", ">" or None for ascii.
-        elements: all elements in file order.
-        comments: comments of the header.
-        data_start: offset of the first byte after the header.
-    """
-
-    byte_order: str | None
-    elements: tuple[_Element, ...]
-    comments: tuple[str, ...]
-    data_start: int
+    byte_order: str | None  # "<", ">" or None for ascii
+    elements: tuple[_Element, ...]  # all elements in file order
+    comments: tuple[str, ...]  # comments of the header
+    data_start: int  # offset of the first byte after the header
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,8 +64,7 @@ class PlyHeader:
     def read_element(self, file: BinaryIO, path: Path, name: str = "vertex") -> np.ndarray:
         """Read an element as a structured array (N,).
 
-        Raises:
-            DyngsError: the file is truncated, or list properties hide where the element is.
+        Raises DyngsError: the file is truncated, or list properties hide where the element is.
         """
         index = self.names.index(name)
         wanted, earlier = self.elements[index], self.elements[:index]
@@ -116,9 +108,7 @@ def _read_ascii(file: BinaryIO, path: Path, wanted: _Element, skipped: int, avai
 def header_bytes(elements: Sequence[tuple[str, int, Sequence[tuple[str, str]]]], comments: Iterable[str] = ()) -> bytes:
     """Return the header of a binary little-endian .ply.
 
-    Args:
-        elements: name, count, and properties as (type, name), such as ("float", "x").
-        comments: one line of ASCII each.
+    ``elements``: name, count, and properties as (type, name), such as ("float", "x").
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     for comment in comments:

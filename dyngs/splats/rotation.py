@@ -33,11 +33,8 @@ def turned(
 ) -> Gaussians:
     """Return the Gaussians rotated about the origin, then scaled, then shifted.
 
-    Args:
-        gaussians: N Gaussians, harmonics of degree 0 to 4.
-        rotation: (4,) unit quaternion wxyz.
-        scale: positive factor of positions and sizes.
-        shift: (3,) added to the centres; None: nothing.
+    ``gaussians``: N Gaussians, harmonics of degree 0 to 4. ``rotation``: (4,) unit quaternion wxyz. ``scale``: positive
+    factor of positions and sizes. ``shift``: (3,) added to the centres; None: nothing.
     """
     if rotation == _NO_TURN and scale == 1 and shift is None:
         return gaussians
@@ -59,11 +56,7 @@ def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
 
     A rotation mixes the harmonics of one degree only among themselves; how, is solved for from their values in many
-    directions.
-
-    Args:
-        sh: (N, K, 3), degree 0 to 4.
-        matrix: (3, 3) rotation, float64.
+    directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation, float64.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
     if degree == 0:
@@ -112,11 +105,7 @@ def product(
 
 
 def axis_of(text: str) -> tuple[float, float, float]:
-    """Return the unit vector of an axis name such as "-y".
-
-    Raises:
-        DyngsError: no such axis.
-    """
+    """Return the unit vector of an axis name such as "-y". Raises DyngsError: no such axis."""
     if text not in AXES:
         raise DyngsError(f"no axis {text!r:.20}; use one of {', '.join(AXES)}")
     return AXES[text]

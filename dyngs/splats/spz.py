@@ -64,8 +64,7 @@ def read_spz(path: Path) -> SplatFile:
 def write_spz(path: Path, splat: SplatFile) -> None:
     """Write a .spz of version 3.
 
-    Raises:
-        DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
+    Raises DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
     """
     gaussians = splat.gaussians
     means = gaussians.means.double().numpy()

@@ -37,8 +37,7 @@ _UP = {"Y": "y", "Z": "z"}
 def read_usd(path: Path) -> SplatFile:
     """Read all Gaussians of a .usd, .usda or .usdc, placed as their prims say, at the stage's default time.
 
-    Raises:
-        DyngsError: usd-core is missing, the file refers to others, holds no Gaussians, or is damaged.
+    Raises DyngsError: usd-core is missing, the file refers to others, holds no Gaussians, or is damaged.
     """
     _packages(path)
     require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of a USD file")

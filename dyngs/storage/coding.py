@@ -24,19 +24,12 @@ _SMALLEST_DICTIONARY, _LARGEST_DICTIONARY = 2**12, 2**24
 
 @dataclass(frozen=True)
 class Packing:
-    """The way an array of integers was packed into bytes.
+    """The way an array of integers was packed into bytes."""
 
-    Attributes:
-        axis: differences along it are stored, -1: the numbers themselves.
-        by_rows: rows follow each other, otherwise columns.
-        signed: there are negative numbers: 0, -1, 1, -2 ... are stored as 0, 1, 2, 3 ...
-        planes: bytes per number; all lowest bytes come first.
-    """
-
-    axis: int
-    by_rows: bool
-    signed: bool
-    planes: int
+    axis: int  # differences along it are stored, -1: the numbers themselves
+    by_rows: bool  # rows follow each other, otherwise columns
+    signed: bool  # there are negative numbers: 0, -1, 1, -2 ... are stored as 0, 1, 2, 3
+    planes: int  # bytes per number; all lowest bytes come first
 
     def __post_init__(self) -> None:
         if not (-1 <= self.axis <= 1 and 1 <= self.planes <= _MAX_PLANES):
@@ -75,9 +68,7 @@ def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarra
 def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) -> bytes:
     """Return ``plain`` as LZMA2 without headers.
 
-    Args:
-        room: the size that it will be read with, where that is not its own.
-        quick: less small; to compare sizes.
+    ``room``: the size that it will be read with, where that is not its own.
     """
     return lzma.compress(plain, format=lzma.FORMAT_RAW, filters=_filters(1 if quick else 6, room or len(plain)))
 
@@ -85,8 +76,7 @@ def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) ->
 def decompressed(data: bytes, size: int, *, exact: bool = True) -> bytes:
     """Return the ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never takes memory for more.
 
-    Raises:
-        DyngsError: there are not so many, or something else follows them.
+    Raises DyngsError: there are not so many, or something else follows them.
     """
     decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_filters(6, size))
     try:

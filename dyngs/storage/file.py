@@ -101,21 +101,13 @@ class _Header(_Part):
 
 @dataclass(frozen=True)
 class StoredScene:
-    """Contents of a .dyngs file.
+    """Contents of a .dyngs file."""
 
-    Attributes:
-        info: about the run.
-        tensors: of a checkpoint, those that drawing needs.
-        steps: of each group of tensors that is quantised.
-        sizes: bytes of each tensor as stored.
-        num_bytes: of the file.
-    """
-
-    info: SceneInfo
-    tensors: dict[str, Tensor]
-    steps: dict[str, float]
-    sizes: dict[str, int]
-    num_bytes: int
+    info: SceneInfo  # about the run
+    tensors: dict[str, Tensor]  # of a checkpoint, those that drawing needs
+    steps: dict[str, float]  # of each group of tensors that is quantised
+    sizes: dict[str, int]  # bytes of each tensor as stored
+    num_bytes: int  # of the file
 
 
 def write_scene(path: Path, data: bytes) -> None:
@@ -127,8 +119,7 @@ def write_scene(path: Path, data: bytes) -> None:
 def read_scene(path: Path) -> StoredScene:
     """Return the scene in a file.
 
-    Raises:
-        DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
+    Raises DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
     """
     require_regular(path)
     try:
@@ -142,14 +133,9 @@ def read_scene(path: Path) -> StoredScene:
 def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
     """Return the bytes of a file; the same for what was read from it.
 
-    Args:
-        info: about the run.
-        scene: N Gaussians; what only training needs is left out.
-        steps: of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.
-        coarseness: (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are stored alike.
-
-    Raises:
-        DyngsError: a value is not finite.
+    ``scene``: N Gaussians; what only training needs is left out. ``steps``: of groups of tensors, see
+    ``dyngs.storage.precision``; others are stored in half precision. ``coarseness``: (N,) uint8 of the Gaussians, see
+    ``coarseness_of``; None: all are stored alike. Raises DyngsError: a value is not finite.
     """
     means = scene.gaussians.means.detach()
     if not bool(means.isfinite().all()):
@@ -173,11 +159,7 @@ def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarsenes
 
 
 def decoded(data: bytes) -> StoredScene:
-    """Return the scene in the bytes of a file.
-
-    Raises:
-        DyngsError: anything but what ``encoded`` makes.
-    """
+    """Return the scene in the bytes of a file. Raises DyngsError: anything but what ``encoded`` makes."""
     if data[: len(MAGIC)] != MAGIC:
         is_other = data.startswith(MAGIC[:6]) and len(data) > len(MAGIC)
         raise DyngsError("written by another version of dyngs" if is_other else "not a stored scene of dyngs")

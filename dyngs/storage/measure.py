@@ -51,17 +51,11 @@ Images = Callable[[Scene], list[Tensor]]
 
 @dataclass(frozen=True)
 class StoragePlan:
-    """Precision and coarseness with which a scene is stored.
+    """Precision and coarseness with which a scene is stored."""
 
-    Attributes:
-        precision: steps, and how much the images change.
-        coarseness: (N,) uint8 of the Gaussians, or None.
-        images: draws what was compared; None where no image can be drawn.
-    """
-
-    precision: Precision
-    coarseness: Tensor | None = None
-    images: Images | None = None
+    precision: Precision  # steps, and how much the images change
+    coarseness: Tensor | None = None  # (N,) uint8 of the Gaussians, or None
+    images: Images | None = None  # draws what was compared; None where no image can be drawn
 
 
 @dataclass(frozen=True)
@@ -75,12 +69,8 @@ class _Shot:
 def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_change: float | None) -> StoragePlan:
     """Return how exactly ``scene`` must be stored: measured where the run's capture can be read.
 
-    Args:
-        config: of the run.
-        checkpoint: of ``scene``.
-        scene: N Gaussians.
-        max_change: root mean square over all values of some training images, grey levels of 255. None: what lowers
-            their PSNR by ``LOSS_DB``, if it is independent of the scene's own errors.
+    ``checkpoint``: of ``scene``. ``max_change``: root mean square over all values of some training images, grey levels
+    of 255. None: what lowers their PSNR by ``LOSS_DB``, if it is independent of the scene's own errors.
     """
     try:
         capture = read_capture(config.data)
@@ -109,19 +99,12 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_chang
 
 @dataclass(frozen=True)
 class CoarseFile:
-    """A file in memory.
+    """A file in memory."""
 
-    Attributes:
-        data: its bytes.
-        factor: on the usual steps.
-        quality: of the scene that is read from it.
-        refused: quality at the next coarser steps; None where none were tried.
-    """
-
-    data: bytes
-    factor: float
-    quality: float
-    refused: float | None
+    data: bytes  # its bytes
+    factor: float  # on the usual steps
+    quality: float  # of the scene that is read from it
+    refused: float | None  # quality at the next coarser steps; None where none were tried
 
 
 def coarsest_file(
@@ -130,12 +113,7 @@ def coarsest_file(
     """Return the file with the coarsest steps tried at which ``quality`` is at least ``least``; None: it never is.
 
     All steps are those that ``storage_plan`` measures, times one factor. The bytes are read again before they count.
-
-    Args:
-        config: of the run.
-        checkpoint: of its scene.
-        quality: of a scene, the higher the better.
-        least: that is enough.
+    ``quality``: of a scene, the higher the better.
     """
     scene = restored_scene(checkpoint, config.model)
     plan = storage_plan(config, checkpoint, scene, None)

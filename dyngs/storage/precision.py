@@ -47,26 +47,19 @@ Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class Precision:
-    """Quantisation steps and the change of images that they cause.
+    """Quantisation steps and the change of images that they cause."""
 
-    Attributes:
-        steps: of each group of tensors; 0: it is stored as it is.
-        change: root mean square change of the images, grey levels of 255; None where none could be drawn.
-        allowed: what it was to be at most; None likewise.
-    """
-
-    steps: dict[str, float]
+    steps: dict[str, float]  # of each group of tensors; 0: it is stored as it is
+    # root mean square change of the images, grey levels of 255; None where none could be drawn
     change: float | None = None
-    allowed: float | None = None
+    allowed: float | None = None  # what it was to be at most; None likewise
 
 
 def coarseness_of(visibility: Tensor) -> Tensor:
     """Return (N,) uint8 octaves by which each Gaussian may be stored more coarsely than the most visible ones.
 
     An error of a Gaussian counts with the square of its weight in the images: half an octave per octave.
-
-    Args:
-        visibility: (N,) sums of its blending weights over images.
+    ``visibility``: (N,) sums of its blending weights over images.
     """
     if not len(visibility):
         return torch.zeros(0, dtype=torch.uint8, device=visibility.device)
@@ -89,14 +82,9 @@ def measured_precision(
 ) -> Precision:
     """Return the largest steps found that change the images by at most ``max_change``.
 
-    Args:
-        exact: from ``drawable``, and the coarseness of the Gaussians if they have any.
-        wanted: the images that count.
-        draw: draws them anew from the tensors of a checkpoint.
-        max_change: root mean square over all of their values, grey levels of 255, more than 0.
-
-    Raises:
-        DyngsError: a value is not finite.
+    ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``draw``: draws them anew from
+    the tensors of a checkpoint. ``max_change``: root mean square over all of their values, grey levels of 255, more
+    than 0. Raises DyngsError: a value is not finite.
     """
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
@@ -127,10 +115,8 @@ def rounded(
 ) -> dict[str, Tensor]:
     """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
 
-    Args:
-        exact: from ``drawable``, and the coarseness of the Gaussians if they have any.
-        steps: of groups of tensors.
-        names: of the tensors that are rounded.
+    ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``names``: of the tensors that
+    are rounded.
     """
     coarseness = checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"])) if COARSENESS in exact else None
     found = dict(exact)

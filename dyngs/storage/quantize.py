@@ -44,10 +44,7 @@ Steps = float | np.ndarray
 def to_grid(values: np.ndarray, step: Steps, rounding: float = NEAREST) -> tuple[np.ndarray, np.ndarray]:
     """Return int32 multiples of ``step`` nearest to ``values``, and where they are out of reach (there they are 0).
 
-    Args:
-        values: finite, any shape.
-        step: allowed ones.
-        rounding: ``NEAREST`` or ``SPARSE``.
+    ``rounding``: ``NEAREST`` or ``SPARSE``.
     """
     scaled = np.asarray(values, dtype=np.float64) / step
     far = ~(np.abs(scaled) < LIMIT - 1)
@@ -76,11 +73,8 @@ def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
     """Return (N, 3) int32 multiples of ``step``: vector parts of unit quaternions with an about largest scalar part.
 
     Half turns about its own axes do not change a Gaussian: of the four quaternions that they make, one with a large
-    scalar part is taken. A zero quaternion is the identity. Coded again, the result stays the same.
-
-    Args:
-        quats: (N, 4) wxyz, of any length.
-        step: at most ``ROTATION_STEP``.
+    scalar part is taken. A zero quaternion is the identity. Coded again, the result stays the same. ``quats``: (N, 4)
+    wxyz, of any length. ``step``: at most ``ROTATION_STEP``.
     """
     turned = quats.astype(np.float64)
     while True:
@@ -102,9 +96,7 @@ def rotations_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
 def sorted_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the same N Gaussians with their shortest axis first and their longest last.
 
-    Args:
-        quats: (N, 4) wxyz; zero is the identity.
-        log_scales: (N, 3).
+    ``quats``: (N, 4) wxyz; zero is the identity. ``log_scales``: (N, 3).
     """
     order = np.argsort(log_scales, axis=1, kind="stable")
     turns = np.zeros((27, 4))

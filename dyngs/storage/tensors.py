@@ -86,17 +86,11 @@ FIXED_STEPS = {
 
 @dataclass(frozen=True)
 class Coding:
-    """Kind and precision with which one tensor is stored.
+    """Kind and precision with which one tensor is stored."""
 
-    Attributes:
-        kind: of its numbers.
-        step: 0 for the kinds that have none.
-        by_coarseness: the step of row i is ``2 ** coarseness[i]`` times as large.
-    """
-
-    kind: Kind
-    step: float = 0.0
-    by_coarseness: bool = False
+    kind: Kind  # of its numbers
+    step: float = 0.0  # 0 for the kinds that have none
+    by_coarseness: bool = False  # the step of row i is ``2 ** coarseness[i]`` times as large
 
     def __post_init__(self) -> None:
         has_step = self.kind not in (Kind.EXACT, Kind.HALF)
@@ -116,24 +110,17 @@ class Coding:
 
 @dataclass(frozen=True)
 class Whole:
-    """A tensor as integers.
+    """A tensor as integers."""
 
-    Attributes:
-        numbers: int64, the shape of the tensor; (N, 3) for rotations.
-        far: (K, 2) int64, index into the flat numbers and float32 bits of the values that no whole number reaches.
-    """
-
-    numbers: np.ndarray
+    numbers: np.ndarray  # int64, the shape of the tensor; (N, 3) for rotations
+    # (K, 2) int64, index into the flat numbers and float32 bits of the values that no whole number reaches
     far: np.ndarray
 
 
 def drawable(scene: Scene) -> dict[str, Tensor]:
     """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by length.
 
-    Not those of Gaussians whose axes a field changes one by one.
-
-    Raises:
-        DyngsError: a value is not finite.
+    Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not finite.
     """
     kept = tensors_of(scene.drawing_state())
     for name, x in kept.items():
@@ -153,9 +140,7 @@ def drawable(scene: Scene) -> dict[str, Tensor]:
 def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors of a checkpoint that can be drawn, but not trained on, from stored ones.
 
-    Raises:
-        KeyError: one is missing that every scene has.
-        ValueError: the Gaussians' tensors do not fit together.
+    Raises KeyError: one is missing that every scene has. ValueError: the Gaussians' tensors do not fit together.
     """
     full = dict(tensors)
     base, rest = full.pop("gaussians.sh_base"), full.pop("gaussians.sh_rest")
@@ -167,9 +152,7 @@ def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def stored_edit(scene: Scene, means: np.ndarray) -> TopologyEdit:
     """Return the edit that puts Gaussians beside their neighbours in space, first those that a field moves.
 
-    Args:
-        scene: N Gaussians.
-        means: (N, 3) as they will be read again, which decide the order.
+    ``means``: (N, 3) as they will be read again, which decide the order.
     """
     return TopologyEdit.select(torch.from_numpy(storage_order(means, scene.offset_rows.numpy())))
 
@@ -186,12 +169,8 @@ def group_of(name: str, x: Tensor) -> str | None:
 def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness: bool = False) -> Coding:
     """Return the coding of a tensor.
 
-    Args:
-        name: of the tensor.
-        x: its values.
-        steps: group (or name, where it has none) to the largest step, 0 for none: stored as it is; a group that lacks
-            is stored in half precision.
-        by_coarseness: Gaussians have a coarseness each.
+    ``steps``: group (or name, where it has none) to the largest step, 0 for none: stored as it is; a group that lacks
+    is stored in half precision.
     """
     if name == POSITIVE or steps.get(group_of(name, x) or name) == 0:
         return Coding(Kind.EXACT)
@@ -231,8 +210,7 @@ def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) ->
 def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.ndarray | None = None) -> Tensor:
     """Return the tensor that ``to_whole`` turned into integers.
 
-    Raises:
-        ValueError, OverflowError: numbers that ``to_whole`` does not make.
+    Raises ValueError, OverflowError: numbers that ``to_whole`` does not make.
     """
     if coding.kind is Kind.ROTATION:
         return torch.from_numpy(rotations_from_grid(whole.numbers, coding.step)).to(dtype)

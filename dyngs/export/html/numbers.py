@@ -37,8 +37,7 @@ CHUNK = 256
 class Lists:
     """A block of bytes to which lists are added, and where they lie in it.
 
-    Attributes:
-        layout: by name what ``data.js`` needs to know.
+    ``layout``: by name what ``data.js`` needs to know.
     """
 
     def __init__(self) -> None:
@@ -92,10 +91,7 @@ class Lists:
 def add_scene(scene: Scene, lists: Lists, tolerance: float) -> dict[str, Any]:
     """Add the numbers of a scene to ``lists`` and return what the page needs to know about them.
 
-    Args:
-        scene: N Gaussians.
-        lists: to be added to.
-        tolerance: world units that a place may be off where motion is fitted.
+    ``tolerance``: world units that a place may be off where motion is fitted.
     """
     person, moved = avatar_of(scene), field_scene_of(scene)
     if person is not None:

@@ -42,19 +42,12 @@ _RING, _FRONT_RING = 8, 24
 
 @dataclass(frozen=True)
 class WrittenPage:
-    """A page on disk.
+    """A page on disk."""
 
-    Attributes:
-        path: of it.
-        num_bytes: its size.
-        header: what it says except for the layout.
-        notes: lines about what was chosen or left out.
-    """
-
-    path: Path
-    num_bytes: int
-    header: dict[str, Any]
-    notes: tuple[str, ...]
+    path: Path  # of it
+    num_bytes: int  # its size
+    header: dict[str, Any]  # what it says except for the layout
+    notes: tuple[str, ...]  # lines about what was chosen or left out
 
 
 def write_page(
@@ -62,16 +55,10 @@ def write_page(
 ) -> WrittenPage:
     """Write the page of a scene, atomically: where its viewer begins, and what moves.
 
-    Args:
-        opened: a scene of any kind; one with a colour network is coloured by it in the page, too.
-        path: of the file.
-        title: shown in a corner and in the title bar, any text; None: the name of the run, or of the file.
-        time: to begin with.
-        views: cameras to begin with and to go through, each a batch of one; without any, those of the capture, or
-            around the scene.
-
-    Raises:
-        DyngsError: the file cannot be written.
+    ``opened``: a scene of any kind; one with a colour network is coloured by it in the page, too. ``title``: shown in a
+    corner and in the title bar, any text; None: the name of the run, or of the file. ``views``: cameras to begin with
+    and to go through, each a batch of one; without any, those of the capture, or around the scene. Raises DyngsError:
+    the file cannot be written.
     """
     inputs_of(opened).require_output(path)
     if title is None:

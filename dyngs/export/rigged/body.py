@@ -23,32 +23,21 @@ _MOST_ROWS = 4000
 
 @dataclass(frozen=True)
 class BodyMesh:
-    """A skinned mesh at rest; m, y up, facing +z.
+    """A skinned mesh at rest; m, y up, facing +z."""
 
-    Attributes:
-        vertices: (V, 3).
-        normals: (V, 3) outward unit normals.
-        uv: (V, 2) texture coordinates, row of the image = (1 - v) * H.
-        faces: (T, 3) int64, counter-clockwise from outside.
-        source: (V,) int64 vertex of the template that each is a copy of; more than one where the atlas has a seam.
-        weights: (V, J) skinning weights, rows sum to 1.
-        skeleton: of the person.
-    """
-
-    vertices: Tensor
-    normals: Tensor
-    uv: Tensor
-    faces: Tensor
-    source: Tensor
-    weights: Tensor
-    skeleton: Skeleton
+    vertices: Tensor  # (V, 3)
+    normals: Tensor  # (V, 3) outward unit normals
+    uv: Tensor  # (V, 2) texture coordinates, row of the image = (1 - v) * H
+    faces: Tensor  # (T, 3) int64, counter-clockwise from outside
+    source: Tensor  # (V,) int64 vertex of the template that each is a copy of; more than one where the atlas has a seam
+    weights: Tensor  # (V, J) skinning weights, rows sum to 1
+    skeleton: Skeleton  # of the person
 
 
 def body_mesh(scene: HumanScene, body: BodyTemplate, vertices: Tensor) -> BodyMesh:
     """Return the mesh of a person: the template's triangles over ``vertices`` (M, 3) at rest, the person's joints.
 
-    Raises:
-        DyngsError: the template has no texture coordinates.
+    Raises DyngsError: the template has no texture coordinates.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(
@@ -71,11 +60,9 @@ def body_mesh(scene: HumanScene, body: BodyTemplate, vertices: Tensor) -> BodyMe
 def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
     """Return the template's vertices (M, 3) at rest in the shape of a trained person.
 
-    Runs and avatar files hold no shape parameters, but joints and points of the surface, which are linear in these:
-    the parameters follow by least squares, exactly.
-
-    Raises:
-        DyngsError: the template is not the one that the person was trained on.
+    Runs and avatar files hold no shape parameters, but joints and points of the surface, which are linear in these: the
+    parameters follow by least squares, exactly. Raises DyngsError: the template is not the one that the person was
+    trained on.
     """
     anchors, joints = scene.anchors, scene.skeleton.joints
     if joints.shape != body.joints.shape or int(anchors.face.max()) >= len(body.faces):

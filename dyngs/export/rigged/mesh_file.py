@@ -53,31 +53,19 @@ class Played:
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh that was written.
+    """A mesh that was written."""
 
-    Attributes:
-        path: of the file.
-        notes: a line about each thing that was chosen, or that glTF cannot hold.
-    """
-
-    path: Path
-    notes: tuple[str, ...]
+    path: Path  # of the file
+    notes: tuple[str, ...]  # a line about each thing that was chosen, or that glTF cannot hold
 
 
 def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> MeshFile:
     """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up, facing +z.
 
     The size is that of the capture; the soles stand at y = 0. Colours are display-referred with the light of the
-    capture in them, hence a material without light (KHR_materials_unlit).
-
-    Args:
-        run: of a person.
-        path: output file.
-        played: the motion that the run plays, which becomes an animation; None: no animation.
-
-    Raises:
-        DyngsError: the run is not that of a person, the template is missing or without texture coordinates, or the file
-            cannot be written.
+    capture in them, hence a material without light (KHR_materials_unlit). ``played``: the motion that the run plays,
+    which becomes an animation; None: no animation. Raises DyngsError: the run is not that of a person, the template is
+    missing or without texture coordinates, or the file cannot be written.
     """
     scene, body = person_and_template(run, "--format mesh")
     if path.suffix.lower() != SUFFIX:
@@ -121,8 +109,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
 def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTemplate]:
     """Return the person of a run and its template.
 
-    Raises:
-        DyngsError: the run is not that of a person, or the template cannot be read.
+    Raises DyngsError: the run is not that of a person, or the template cannot be read.
     """
     scene, model = avatar_of(run.scene), run.config.model
     if scene is None or not isinstance(model, HumanModel):

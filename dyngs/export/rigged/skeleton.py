@@ -29,17 +29,11 @@ _STILL = 1e-6
 
 @dataclass(frozen=True)
 class Rig:
-    """A skeleton at rest in the axes of the file: y up, facing +z, soles at y = 0.
+    """A skeleton at rest in the axes of the file: y up, facing +z, soles at y = 0."""
 
-    Attributes:
-        skeleton: in m, as the person was trained.
-        scale: world units of the capture per metre of the template.
-        rise: what is added to y after scaling.
-    """
-
-    skeleton: Skeleton
-    scale: float
-    rise: float
+    skeleton: Skeleton  # in m, as the person was trained
+    scale: float  # world units of the capture per metre of the template
+    rise: float  # what is added to y after scaling
 
     @property
     def joints(self) -> Tensor:
@@ -62,21 +56,13 @@ class Rig:
 
 @dataclass(frozen=True)
 class JointAnimation:
-    """Motion of a rig's joints.
+    """Motion of a rig's joints."""
 
-    Attributes:
-        name: of the animation.
-        seconds: (F,) float64.
-        quats: (F, J, 4) xyzw, relative to the parent joints.
-        root: (F, 3) place of the root joint.
-        root_scale: (F,) its scale; 1 for a person who keeps the size.
-    """
-
-    name: str
-    seconds: np.ndarray
-    quats: np.ndarray
-    root: np.ndarray
-    root_scale: np.ndarray
+    name: str  # of the animation
+    seconds: np.ndarray  # (F,) float64
+    quats: np.ndarray  # (F, J, 4) xyzw, relative to the parent joints
+    root: np.ndarray  # (F, 3) place of the root joint
+    root_scale: np.ndarray  # (F,) its scale; 1 for a person who keeps the size
 
 
 def rig_of(scene: HumanScene, vertices: Tensor) -> Rig:
@@ -90,13 +76,7 @@ def animation_of(
 ) -> JointAnimation:
     """Return the motion that a person plays: y up, on the floor y = 0, around the origin.
 
-    Args:
-        scene: plays it.
-        rig: of the person.
-        vertices: (V, 3) at rest, m, of which the lowest one stands on the floor.
-        weights: (V, J).
-        fps: frames per second.
-        name: of the animation.
+    ``vertices``: (V, 3) at rest, m, of which the lowest one stands on the floor. ``weights``: (V, J).
     """
     joints, parents = rig.skeleton.joints, rig.skeleton.parents
     clip = upright(scene.moves_as, scene.clip, joints)

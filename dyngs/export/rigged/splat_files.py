@@ -45,15 +45,9 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
 
     ``.ply``: the columns ``joint_0`` to ``joint_7`` (indices as float32, heaviest first) and ``weight_0`` to
     ``weight_7`` after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
-    Gaussians of KHR_gaussian_splatting with JOINTS_n, WEIGHTS_n and a skin.
-
-    Args:
-        run: of a person.
-        path: output file.
-        played: the motion that the run plays, as an animation in a ``.glb``; None: no animation.
-
-    Raises:
-        DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
+    Gaussians of KHR_gaussian_splatting with JOINTS_n, WEIGHTS_n and a skin. ``played``: the motion that the run plays,
+    as an animation in a ``.glb``; None: no animation. Raises DyngsError: the run is not that of a person, its template
+    is missing, or the file cannot be written.
     """
     scene, body = person_and_template(run, "--joints")
     suffix = path.suffix.lower()

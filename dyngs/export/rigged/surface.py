@@ -40,19 +40,12 @@ _ANGLES = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 
 @dataclass(frozen=True)
 class FittedSurface:
-    """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians.
+    """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians."""
 
-    Attributes:
-        vertices: (M, 3).
-        margin: the distance of ``MARGINS`` that was taken; None: the template as it is agrees better.
-        agreement: intersection over union of the silhouettes.
-        plain: the same for the template as it is.
-    """
-
-    vertices: Tensor
-    margin: float | None
-    agreement: float
-    plain: float
+    vertices: Tensor  # (M, 3)
+    margin: float | None  # the distance of ``MARGINS`` that was taken; None: the template as it is agrees better
+    agreement: float  # intersection over union of the silhouettes
+    plain: float  # the same for the template as it is
 
 
 def fitted_surface(
@@ -62,13 +55,7 @@ def fitted_surface(
 
     A vertex is displaced by the mean displacement of the samples around it in space, along their normals, up to what is
     seen there. So fingers, whose sides cancel, swell less, and lids and lips move with the skin around them.
-
-    Args:
-        gaussians: N at rest.
-        body: the template.
-        vertices: (M, 3) at rest in the person's shape.
-        samples: P texels of that surface.
-        baked: what is seen there.
+    ``vertices``: (M, 3) at rest in the person's shape.
     """
     cameras = _cameras(vertices)
     shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5

@@ -45,26 +45,17 @@ _AROUND = 16
 
 @dataclass(frozen=True)
 class BakedTexels:
-    """What is seen straight above P texels.
+    """What is seen straight above P texels."""
 
-    Attributes:
-        rgb: (P, 3) in [0, 1], display-referred as the images were.
-        alpha: (P,) opacity.
-        top: (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is reached.
-    """
-
-    rgb: Tensor
-    alpha: Tensor
-    top: Tensor
+    rgb: Tensor  # (P, 3) in [0, 1], display-referred as the images were
+    alpha: Tensor  # (P,) opacity
+    top: Tensor  # (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is reached
 
 
 def bake_texels(scene: HumanScene, texels: Texels, normals: Tensor) -> BakedTexels:
     """Return what the Gaussians at rest show along the normal of each texel, blended from the outside in.
 
-    Args:
-        scene: a person.
-        texels: P of the template in the person's shape.
-        normals: (N, 3) of the surface below each Gaussian at rest.
+    ``texels``: P of the template in the person's shape. ``normals``: (N, 3) of the surface below each Gaussian at rest.
     """
     colours = frontal_colours(scene, normals)
     gaussians = scene.gaussians

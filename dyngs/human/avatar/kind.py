@@ -30,8 +30,7 @@ FIRST_VIEWS = 50
 def start(setting: Setting) -> GaussianModel:
     """Return the model of a person before the first step.
 
-    Raises:
-        DyngsError: a capture without body parameters, or a template that cannot be read.
+    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     config, model = setting.config, setting.config.model
     if not isinstance(model, HumanModel):
@@ -59,8 +58,7 @@ KIND = Kind(HumanModel, start, restore)
 def human_start(config: Config, model: HumanModel, capture: Capture, images: ImageLoader) -> tuple[Gaussians, Subject]:
     """Return the first Gaussians of a person, and the person.
 
-    Raises:
-        DyngsError: a capture without body parameters, or a template that cannot be read.
+    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     sh_degree = config.stored_sh_degree
     if capture.body is None:
