@@ -70,7 +70,6 @@ def _stored(folder: Path) -> float | None:
 
 
 def _psnrs(drawings: Sequence[Drawing], images: Sequence[Image]) -> list[float]:
-    """Return the mean PSNR of each drawing, dB."""
     truths = [(image, image.composite(drawings[0].background)) for image in images]
     return [
         fmean(psnr(drawing.image(image.cameras, image.time), truth, image.mask) for image, truth in truths)
@@ -81,7 +80,6 @@ def _psnrs(drawings: Sequence[Drawing], images: Sequence[Image]) -> list[float]:
 def _views(
     runs: Sequence[LoadedRun], capture: Capture, split: str, device: torch.device
 ) -> tuple[list[Drawing], list[Image]]:
-    """Return one drawing per run as a split shows it, and some images of that split."""
     config = runs[0].config
     loader = ImageLoader(split_views(capture, split), config.data)
     loader.device = device

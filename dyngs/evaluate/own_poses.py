@@ -53,7 +53,6 @@ def scores_from_own_poses(drawing: Drawing, images: ImageLoader, size: float, lp
 def _person_scores(
     avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
 ) -> PoseScores:
-    """Return the scores of a person in the poses that are most like the images."""
     fitted = fitted_to_images(avatar, images, drawing.background, avatar.options, comparison)
     each = (images[i] for i in range(len(images)))
     views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)

@@ -165,7 +165,6 @@ def _require_possible(run_dir: Path, split: str, refine_poses: bool) -> None:
 
 
 def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
-    """Return the fields of a report that no image is needed for."""
     facts = {
         "seconds_train": run.seconds_train,
         "step": run.step,
@@ -217,7 +216,6 @@ def report_path(run_dir: Path, split: str) -> Path:
 
 
 def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> dict[str, MetricValue]:
-    """Return the flicker of a split, and the error of its changes in time."""
     return {
         "flicker": flicker_of_split(drawing, loader, views),
         "flicker_error": flicker_error(drawing, loader, views),
@@ -225,7 +223,6 @@ def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> d
 
 
 def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:
-    """Return the errors of the scene's motion where the capture has true tracks."""
     tracks = read_true_tracks(capture.root, capture.world_offset)
     cameras = training_cameras(views, run.config.data)
     if not isinstance(scene, Scene):
@@ -243,7 +240,6 @@ def parameter_megabytes(scene: Scene) -> float:
 
 
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
-    """Return notes on how to read the numbers."""
     notes = []
     if run.step < run.config.total_steps:
         notes.append(
@@ -261,7 +257,6 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
 
 @contextmanager
 def _num_threads(threads: int) -> Iterator[None]:
-    """Run the block with ``threads`` threads (0 = as they are)."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads or before)
     try:

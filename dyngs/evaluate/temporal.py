@@ -112,7 +112,6 @@ def flicker_of_split(drawing: Drawing, loader: ImageLoader, views: Sequence[View
 
 
 def _middles(num_times: int) -> list[int]:
-    """Return the indices of the moments that are compared with their neighbours."""
     if num_times <= MAX_MOMENTS:
         return list(range(1, num_times - 1))
     return np.linspace(1, num_times - 2, _SAMPLED_TRIPLES).round().astype(int).tolist()

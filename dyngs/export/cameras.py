@@ -90,7 +90,6 @@ def _way(file: Path, folder: Path) -> str:
 
 
 def _write_points(path: Path, points: PointCloud, offset: np.ndarray) -> None:
-    """Write points with their colours as a binary .ply."""
     colours = ("red", "green", "blue")
     rows = np.empty(len(points.xyz), dtype=[*((name, "<f8") for name in "xyz"), *((name, "u1") for name in colours)])
     for i, name in enumerate("xyz"):

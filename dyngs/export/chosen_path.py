@@ -118,7 +118,6 @@ def front_of(opened: Opened, ring: Cameras) -> int:
 
 
 def _require_fitting(opened: Opened, options: PathOptions) -> None:
-    """Raise DyngsError for options that a file, which has no capture, does not support."""
     file = opened.config.data.root
     if options.path == "along":
         raise DyngsError(f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit")
@@ -131,7 +130,6 @@ def _require_fitting(opened: Opened, options: PathOptions) -> None:
 
 
 def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
-    """Return the path of one fixed camera at the times that are requested, or at the time of its view."""
     if opened.captured is None:
         ring = orbit_around(opened, _RING, options.size or DEFAULT_SIZE)
         camera, times = ring.select(front_of(opened, ring)), opened.renderable.times
@@ -143,7 +141,6 @@ def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
 
 
 def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
-    """Return the path called ``name``, with the times that are requested if there are any."""
     file = path_file(name)
     if file is None:
         found = _placed(opened, name, options)

@@ -86,7 +86,6 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
-    """Return a labelled row of panels."""
     height, width = panels[0].shape[:2]
     band = np.full((LABEL_HEIGHT + height, GAP + len(panels) * (width + GAP), 3), BACKGROUND, np.uint8)
     for i, panel in enumerate(panels):

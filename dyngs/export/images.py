@@ -239,7 +239,6 @@ def _sample(path: CameraPath) -> CameraPath:
 
 
 def _shared_depth_limits(frames: Iterator[Frame]) -> tuple[float, float]:
-    """Return near and far over all of the frames."""
     seen = [(frame.depth.ravel(), frame.alpha.ravel()) for frame in frames if frame.depth is not None]
     return depth_limits(np.concatenate([d for d, _ in seen]), np.concatenate([a for _, a in seen]))
 

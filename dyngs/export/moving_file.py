@@ -101,7 +101,6 @@ def _sample(splat: SplatFile, start: float, duration: float, model: Any, delta: 
 
 
 def _packages(path: Path) -> tuple[Any, Any]:
-    """Return the modules of fourdgs with its model and its deltas."""
     try:
         return import_module("fourdgs.model"), import_module("fourdgs.keyframe_delta_writer")
     except ImportError:

@@ -123,7 +123,6 @@ class VideoWriter:
             container.close()
 
     def _discard(self) -> None:
-        """Remove an unfinished video."""
         with suppress(OSError):
             self._close()
         if self._temporary is not None:

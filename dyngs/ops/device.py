@@ -118,7 +118,6 @@ def why_no_gpu() -> str | None:
 
 
 def _why_torch_has_none() -> str:
-    """Return why torch, built with CUDA, finds no GPU."""
     try:
         torch.cuda.init()
     except Exception as error:  # of torch: RuntimeError, or an AssertionError where it was built otherwise
@@ -132,7 +131,6 @@ def _why_torch_has_none() -> str:
 
 
 def _why_kernels_fail() -> str | None:
-    """Return why the kernels cannot run on the GPU that torch has found; None where they can."""
     try:
         kernels = cuda_core()
     except DyngsError as error:

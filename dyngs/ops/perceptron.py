@@ -120,12 +120,10 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
 
 
 def _is_large(widths: list[int]) -> bool:
-    """Return whether the kernel of a GPU does not take the network."""
     return len(widths) - 1 > GPU_LAYERS or max(widths) > GPU_WIDTH
 
 
 def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:
-    """Return the widths of the input and of every layer's output, once all shapes, types and devices are checked."""
     if x.ndim != 2 or x.shape[1] == 0:
         raise DyngsError(f"perceptron: the inputs must be (M, K) with K at least 1, got {tuple(x.shape)}")
     if not layers:

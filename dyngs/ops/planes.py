@@ -30,7 +30,6 @@ class PlaneLevel:
 
 
 def _pairs(planes: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Return the space and time planes of each level, as the kernels take them."""
     return list(zip(planes[::2], planes[1::2], strict=True))
 
 

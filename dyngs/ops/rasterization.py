@@ -92,13 +92,11 @@ def _settings(size: list[int], thresholds: list[float]) -> Struct:
 
 
 def _arrays(*splats: Tensor) -> Struct:
-    """Return means2d, factors, opacities and radii as the kernels take them."""
     return Struct("SplatArraysF32" if splats[0].dtype == torch.float32 else "SplatArraysF64", splats)
 
 
 @contextmanager
 def _refusals(kernel: str) -> Generator[None]:
-    """Turn what the kernels say of lengths and indices into a ``DyngsError``."""
     try:
         yield
     except ValueError as error:
@@ -137,7 +135,6 @@ bin_tiles_op = register("bin_tiles", _bin_tiles)
 
 
 def _image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return uninitialised colours, transmittances and stops of V images."""
     check_size(*size)
     views, channels = colors.shape[0], colors.shape[2]
     needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)

@@ -121,7 +121,6 @@ def empty_like(x: Tensor) -> Tensor:
 
 
 def _passed(core: ModuleType, value: Any) -> Any:
-    """Return ``value`` as the functions of the core take it."""
     match value:
         case Tensor():
             return array(value)
@@ -136,8 +135,6 @@ def _passed(core: ModuleType, value: Any) -> Any:
 
 
 def _shapes_of(kernel: Callable[P, R]) -> Callable[P, R]:
-    """Return ``kernel`` without the calls of the core."""
-
     def shapes(*arguments: P.args, **named: P.kwargs) -> R:
         _mode.shapes_only = True
         try:
@@ -171,7 +168,6 @@ def _refusal(name: str) -> Callable[..., Any]:
 
 
 def _tensors(values: Iterable[object]) -> list[Tensor]:
-    """Return the tensors among ``values`` and in its lists and tuples."""
     found: list[Tensor] = []
     for value in values:
         if isinstance(value, Tensor):

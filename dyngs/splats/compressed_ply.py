@@ -125,7 +125,6 @@ def _header(splat: SplatFile, chunks: int, count: int, rest: int) -> bytes:
 
 
 def _read_rest(header: PlyHeader, file: BinaryIO, path: Path, count: int) -> np.ndarray:
-    """Return the harmonics above degree 0, (N, K - 1, 3)."""
     if "sh" not in header.names:
         return np.zeros((count, 0, 3), np.float32)
     table = header.read_element(file, path, "sh")

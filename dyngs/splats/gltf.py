@@ -84,13 +84,11 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Return linear values of sRGB ones, clamped to [0, 1]."""
     inside = srgb.clip(0, 1)
     return np.where(inside <= 0.04045, inside / 12.92, ((inside + 0.055) / 1.055) ** 2.4)
 
 
 def _placed_primitives(file: GltfFile) -> Iterator[tuple[Primitive, Placement]]:
-    """Yield the primitives of Gaussians, and where nodes put them."""
     document, visited = file.document, 0
     if document.scenes and document.scene >= len(document.scenes):
         raise file.error(f"scene {document.scene} is missing; export it again")
@@ -130,7 +128,6 @@ def _matrix(node: Node) -> np.ndarray:
 
 
 def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
-    """Return the Gaussians of a primitive, in the axes of its node."""
     own, names = primitive.extensions[EXTENSION], primitive.attributes
     if not isinstance(own, dict) or "extensions" in own:
         raise file.error("its Gaussians are compressed by another extension; export them without")

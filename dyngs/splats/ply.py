@@ -138,7 +138,6 @@ def _header(comments: Iterable[str], count: int, num_terms: int, more: tuple[str
 
 
 def _check_properties(header: PlyHeader, path: Path) -> int:
-    """Return the SH degree of the file. Raises DyngsError if a required property is missing."""
     present = set(header.vertex_names)
     missing = [name for name in _REQUIRED if name not in present]
     if missing:
@@ -154,8 +153,6 @@ def _check_properties(header: PlyHeader, path: Path) -> int:
 
 
 def _gaussians(rows: np.ndarray, degree: int) -> Gaussians:
-    """Return the Gaussians of a structured array, with unit quaternions."""
-
     def columns(names: Sequence[str]) -> torch.Tensor:
         out = np.empty((len(rows), len(names)), dtype=np.float32)
         with np.errstate(over="ignore"):  # doubles beyond float32 become Inf and are reported as such

@@ -174,7 +174,6 @@ def _is_list(words: list[str]) -> bool:
 
 
 def _add_property(properties: dict[str, str], words: list[str], path: Path) -> None:
-    """Add the property of a header line to the types by name."""
     if len(words) != 3 or words[1] not in _SCALARS:
         raise DyngsError(f"{path}: bad .ply header line {_shown(' '.join(words))}")
     if words[2] in properties:

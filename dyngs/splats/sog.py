@@ -186,7 +186,6 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
 
 
 def _rest(path: Path, archive: zipfile.ZipFile, rest: _Rest, labels: np.ndarray) -> np.ndarray:
-    """Return the harmonics above degree 0, (N, K - 1, 3)."""
     name, terms = rest.files[0], num_sh_terms(rest.bands) - 1
     image = _image(path, archive, name)
     row = labels[:, 0].astype(np.int64) | (labels[:, 1].astype(np.int64) << 8)
@@ -219,7 +218,6 @@ def _meta(path: Path, archive: zipfile.ZipFile) -> _Meta:
 
 
 def _image(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """Return an image (H, W, 4) uint8 of the archive."""
     from PIL import Image
 
     try:

@@ -82,7 +82,6 @@ def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
 
 
 def _clamped(gaussians: Gaussians) -> tuple[Gaussians, list[str]]:
-    """Return the Gaussians with finite logits and scales above 0, and notes about them."""
     notes: list[str] = []
     logits, scales = gaussians.logit_opacities, gaussians.log_scales
     opaque, clear = int((logits == torch.inf).sum()), int((logits == -torch.inf).sum())

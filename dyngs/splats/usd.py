@@ -90,7 +90,6 @@ def write_usd(path: Path, splat: SplatFile) -> None:
 
 
 def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
-    """Return the modules Sdf, Usd, UsdGeom and UsdVol."""
     try:
         sdf, usd, geom, vol = (import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol"))
         _ = vol.ParticleField3DGaussianSplat

@@ -89,7 +89,6 @@ def decompressed(data: bytes, size: int, *, exact: bool = True) -> bytes:
 
 
 def _laid_out(whole: np.ndarray, axis: int, by_rows: bool) -> tuple[Packing, bytes]:
-    """Return the numbers as bytes, before compression."""
     if axis >= 0:
         whole = np.diff(whole, axis=axis, prepend=np.int64(0))
     signed = bool((whole < 0).any())

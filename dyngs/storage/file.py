@@ -203,7 +203,6 @@ def _steps(header: _Header, tensors: Mapping[str, Tensor]) -> dict[str, float]:
 
 
 def _stored(name: str, x: Tensor, coding: Coding, coarseness: np.ndarray | None) -> tuple[_Entry, bytes]:
-    """Return the header entry of a tensor, and its data."""
     whole = to_whole(x, coding, coarseness)
     packing, block = packed(whole.numbers)
     entry = _Entry(

@@ -153,14 +153,12 @@ def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_
 
 
 def _chosen(capture: Capture, count: int) -> list[View]:
-    """Return at most ``count`` training views, evenly chosen."""
     views = capture.splits["train"]
     count = min(count, len(views))
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
 def _visibility(scene: Scene, shots: Sequence[_Shot]) -> Tensor:
-    """Return (N,) sums of blending weights over the images."""
     scene = scene.unmasked()
     total = torch.zeros(len(scene), device=scene.gaussians.means.device)
     for shot in shots:

@@ -194,7 +194,6 @@ def _usual_size(values: Tensor) -> tuple[float, float]:
 
 
 def _groups(tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Return the tensors by name of each group."""
     groups: dict[str, dict[str, Tensor]] = {}
     for name, x in tensors.items():
         group = group_of(name, x)

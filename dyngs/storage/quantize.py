@@ -135,5 +135,4 @@ def _unit(quats: np.ndarray) -> np.ndarray:
 
 
 def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the (N, 4) Hamilton products wxyz."""
     return quat_product(torch.from_numpy(left), torch.from_numpy(right)).numpy()

@@ -158,7 +158,6 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
 
 
 def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
-    """Add the skeleton and the clip of a person, and what a pose changes at rest."""
     from scipy.spatial.transform import Rotation
 
     clip, skeleton = scene.moves_as, scene.learned_skeleton

@@ -126,7 +126,6 @@ def _middle(opened: Opened) -> list[float]:
 
 
 def _some(capture: Capture) -> list[View]:
-    """Return training views at different positions, evenly chosen."""
     views, seen = [], set()
     for view in capture.splits["train"]:
         pose = view.cam_from_world.tobytes()

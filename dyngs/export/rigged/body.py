@@ -82,7 +82,6 @@ def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
 
 
 def _on_the_skin(anchors: Anchors) -> Tensor:
-    """Return the rows of some anchors without height, spread over all of them."""
     rows = torch.nonzero(anchors.height == 0)[:, 0]
     return rows[:: max(len(rows) // _MOST_ROWS, 1)]
 

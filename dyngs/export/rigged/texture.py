@@ -118,7 +118,6 @@ def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Te
 
 
 def _turned(linear: Tensor, directions: Tensor) -> Tensor:
-    """Return unit directions (N, 3) under linear maps (N, 3, 3)."""
     return torch.nn.functional.normalize((linear @ directions[..., None])[..., 0], dim=1)
 
 

@@ -227,7 +227,6 @@ class _Fit:
 
 
 def _shrinks(images: Sequence[Image]) -> tuple[int, int, int]:
-    """Return the factors by which images are shrunk in the three rounds."""
     heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in images]
     coarse = max(1, round(max(heights) / COARSE_PX))
     return coarse, round(math.sqrt(coarse)), 1

@@ -151,7 +151,6 @@ def rest_offsets(anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | N
 
 
 def _pose_features(rotations: Tensor) -> Tensor:
-    """Return rotations (J, 3, 3) minus the identity."""
     return rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
 
 

@@ -249,7 +249,6 @@ def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], po
 def _from_given(
     fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[TriedFit, ...]:
-    """Return the poses as given, with a fitted shape, and with fitted poses."""
     start = new_fit(fitting.clip, fitting.surface)
     tick, full = ticker("shape", report, 4 * effort.steps), seen.used.__getitem__
     # Clothes and hair are no sign of wrong poses.
@@ -270,7 +269,6 @@ def _from_given(
 def _from_silhouettes(
     fitting: Fitting, seen: Seen, shape: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[TriedFit, ...]:
-    """Return the poses as they were found first, and shape and poses fitted together."""
     start, steps = new_fit(fitting.clip, fitting.surface), effort.steps_for(fitting.clip)
     tick, found = ticker("shape", report, 2 * steps), start
     first = measured("poses found frame by frame", start, fitting, seen)

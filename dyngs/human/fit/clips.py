@@ -87,7 +87,6 @@ def fitted_clips(
 
 
 def _of_training(capture: Capture, body: BodyTemplate, found: CaptureFit) -> CapturedMotion:
-    """Return the clip of all frames in train, val and test."""
     fitted = replace(found.motion, clip=found.fit.fitted(found.motion.clip))
     known, rows = _expanded(fitted), fitted.rows
     views = [view for split in ("train", "val", "test") for view in capture.splits.get(split, ())]

@@ -223,7 +223,6 @@ def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mappi
 
 
 def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:
-    """Return images of the training views with the body's outline as given (red) and as fitted (green)."""
     views = capture.splits["train"]
     images = ImageLoader(views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1}))
     given, fitted, rows = found.motion.clip, found.fit.fitted(found.motion.clip), found.motion.rows

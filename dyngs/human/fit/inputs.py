@@ -85,7 +85,6 @@ def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
 
 
 def _with_masks(capture: Capture, masks: Path) -> Capture:
-    """Return the capture with the masks of a folder as silhouettes."""
     splits = {}
     for split, views in capture.splits.items():
         found = silhouettes_of(masks, [f"{view.name}{view.image_path.suffix}" for view in views])
@@ -94,7 +93,6 @@ def _with_masks(capture: Capture, masks: Path) -> Capture:
 
 
 def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[str], None]) -> Capture:
-    """Return the clip without the frames in which nobody is seen."""
     views = capture.splits["train"]
     small = ImageLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
     areas = []

@@ -153,7 +153,6 @@ def _of_npz(path: Path, body: BodyTemplate) -> _Found:
 
 
 def _of_sam_3d_body(folder: Path) -> _Found:
-    """Read a folder of the dictionaries that SAM 3D Body returns, one file per image."""
     files = sorted(folder.glob("*.npz"))
     if not files:
         raise DyngsError(f"{folder}: no .npz files of SAM 3D Body there")
@@ -198,7 +197,6 @@ def _joints_of(where: str, value: object) -> np.ndarray:
 
 
 def _checked(path: Path, joints: Mapping[int | str, np.ndarray], order: object, space: object) -> _Found:
-    """Return what was found."""
     count = len(next(iter(joints.values())))
     by_count = {len(names): name for name, names in ORDERS.items()}
     wanted = by_count.get(count, "") if order is None else str(order)

@@ -145,7 +145,6 @@ def _all_headings(
 
 
 def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
-    """Return the clip with another pose (J, 3) and translation (3,) in a frame."""
     poses, positions = clip.poses.clone(), clip.trans.clone()
     poses[row], positions[row] = pose, trans
     return replace(clip, poses=poses, trans=positions)

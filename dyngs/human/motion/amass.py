@@ -171,7 +171,6 @@ def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
-    """Return the finite float64 numbers at ``key``."""
     if key not in arrays:
         raise DyngsError(f"{path}: the key '{key}' is missing; give an AMASS file of a motion")
     value = arrays[key]
@@ -222,7 +221,6 @@ def _turn_to_y(up: np.ndarray) -> np.ndarray:
 
 
 def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: UpAxis) -> bool:
-    """Return whether the file is z up: by ``up``, its key ``up_axis``, or as AMASS files are."""
     if up != "auto":
         return up == "z"
     if "up_axis" not in arrays:

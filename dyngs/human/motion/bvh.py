@@ -91,7 +91,6 @@ def _halves(path: Path) -> tuple[str, str]:
 
 
 def _joints(path: Path, hierarchy: str) -> list[_Joint]:
-    """Return the joints, parents first."""
     joints: list[_Joint] = []
     without_offset: set[int] = set()
     blocks: list[int] = []  # joints with open braces, _END_SITE among them
@@ -149,7 +148,6 @@ def _channels(path: Path, name: str, words: list[str]) -> list[str]:
 
 
 def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray, float]:
-    """Return the channels (F, C) of the frames, and frames per second."""
     header = re.match(r"\s*Frames\s*:\s*(\d{1,9})\s+Frame\s+Time\s*:\s*(\S+)", rows, re.IGNORECASE)
     if header is None:
         raise DyngsError(f"{path}: MOTION must begin with 'Frames: ' and 'Frame Time: '; export it again")
@@ -176,14 +174,12 @@ def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray
 
 
 def _cut_off(path: Path, frames: int, channels: int, count: int) -> DyngsError:
-    """Return the error to raise for a file with another count of numbers than it says."""
     return DyngsError(
         f"{path}: says {frames} frames of {channels} numbers but holds {count} numbers; it may be cut off"
     )
 
 
 def _numbers(path: Path, words: list[str]) -> np.ndarray:
-    """Return the words as finite float64 numbers."""
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:

@@ -90,7 +90,6 @@ def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -
 
 
 def _skin(file: GltfFile) -> _Rig | None:
-    """Return the joints of the largest skin; None without skins."""
     if not file.document.skins:
         return None
     largest = max(file.document.skins, key=lambda skin: len(skin.joints))
@@ -118,7 +117,6 @@ def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
 
 
 def _motion(file: GltfFile, rig: _Rig, fps: float, animation: Animation) -> SkeletonMotion:
-    """Return the motion of the joints, in world rotations relative to the rest pose."""
     joints = rig.joints
     chain = _with_ancestors(file, joints)
     curves = _curves(file, animation, chain)
@@ -274,7 +272,6 @@ def _sampled(file: GltfFile, curve: _Curve, times: np.ndarray) -> np.ndarray:
 
 
 def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
-    """Return the rotations of quaternions (F, 4) xyzw of any length."""
     largest = np.abs(quats).max(axis=1, keepdims=True)
     if (largest == 0).any():
         raise file.error("a rotation is a quaternion of zeros; export it again")

@@ -89,7 +89,6 @@ def _axis_angle(rotations: Tensor) -> Tensor:
 
 
 def _joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
-    """Return the joints (F, J, 3) in the world."""
     moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints)
     return clip.scale[:, None, None] * moved + clip.trans[:, None]
 

@@ -273,7 +273,6 @@ def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarr
 
 
 def _nearest_axis(direction: np.ndarray) -> np.ndarray:
-    """Return the signed unit axis (3,) nearest to a direction."""
     axis = np.zeros(3)
     i = int(np.abs(direction).argmax())
     axis[i] = 1.0 if direction[i] >= 0 else -1.0
@@ -308,7 +307,6 @@ def least_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def _leg_length(at: dict[str, np.ndarray]) -> float:
-    """Return the length of both thighs and shins together."""
     bones = (("hip", "knee"), ("knee", "ankle"))
     return sum(
         float(np.linalg.norm(at[f"{side}_{a}"] - at[f"{side}_{b}"])) for side in ("left", "right") for a, b in bones

@@ -143,7 +143,6 @@ def random_light(seed: int | None) -> Lamp:
 
 
 def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> Motion:
-    """Return the clip of the split train (``which`` 0) or of ``pose`` (1)."""
     if seed is not None:
         return random_clip(body, num_frames, 2 * seed + which)
     return squat(body, num_frames) if which else walk(body, num_frames)
@@ -179,7 +178,6 @@ def render_mesh(
 def _write_split(
     out: Path, split: str, meshes: list[PosedMesh], cameras: dict[int, np.ndarray], options: HumanOptions
 ) -> None:
-    """Write the images of one split and its JSON; nothing without cameras."""
     if not cameras:
         return
     frames, light = [], random_light(options.light_seed)
@@ -195,7 +193,6 @@ def _write_split(
 
 
 def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
-    """Yield the mesh of each frame, posed in float64."""
     uv, uv_faces = texture_coordinates(body)
     exact, faces = body.to(dtype=torch.float64), body.faces.cpu().numpy()
     for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):

@@ -269,7 +269,6 @@ def _normalized_weights(path: Path, key: str, weights: np.ndarray) -> np.ndarray
 
 
 def _parents(arrays: _Arrays) -> tuple[int, ...]:
-    """Return the parents (J,) of a tree whose root is joint 0 and where parents come before their children."""
     path, where = arrays.path, "'kintree_table'"
     table = arrays.floats("kintree_table", (2, None))
     count = table.shape[1]
