@@ -12,8 +12,8 @@ from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import quat_product, rotation_matrices
-from dyngs.ops.reference import harmonics_basis
 
 AXES: dict[str, tuple[float, float, float]] = {
     f"{sign}{name}": (value * (i == 0), value * (i == 1), value * (i == 2))

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference import shortest_axes
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -13,7 +14,6 @@ from dyngs.deform.nodes import turned
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.quaternions import quat_product, rotate, rotation_matrices, unit_quats
-from dyngs.ops.shading import shortest_axes
 
 SCALES = [1e-45, 1e-38, 1e-30, 1e-20, 1e-13, 1e-6, 1.0, 1e6, 1e13, 1e20, 1e37]
 ROUNDING = 8 * torch.finfo(torch.float32).eps

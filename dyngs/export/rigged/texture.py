@@ -19,8 +19,8 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.placement import rest_clip
 from dyngs.human.pose.skinning import blend_transforms, joint_transforms
 from dyngs.human.template.atlas import Texels
+from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.reference import harmonics_basis
 
 _NEAR = 20
 """Gaussians that are looked for at each height above a texel."""
