@@ -16,10 +16,10 @@ from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.human.motion.clip import MotionClip
-from dyngs.human.pose.nearest_rotation import quats_of
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.ops.quaternions import quats_of
 from dyngs.state import fields_moved_to
 
 MAX_JOINTS = 8

@@ -15,11 +15,10 @@ from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.motion.clip import MotionClip
-from dyngs.human.pose.nearest_rotation import nearest_rotations
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 from dyngs.ops.posing import pose_by_joints
-from dyngs.ops.quaternions import rotation_matrices
+from dyngs.ops.quaternions import quats_of, rotation_matrices
 from dyngs.state import fields_moved_to
 
 LEFT_OUT = "the learned light is left out: colours are those in even light"
@@ -127,15 +126,16 @@ def pose_gaussians(
     """Return the N Gaussians in a pose, in the world; differentiable in all arguments.
 
     x' = s T x + t with T = sum_j w_j A_j (Loper et al. 2015); covariances under the same linear map, exactly. Harmonics
-    of degree 1 are rotated by the nearest rotation of T, so that colours turn with the body. Gaussians are at rest, m,
-    of SH degree 0 or 1; ``weights`` (N, J) skin them; ``offsets`` (N, 3), m, are added to the means at rest.
+    of degree 1 are rotated as their joints are (``blended_rotations``), so that colours turn with the body. Gaussians
+    are at rest, m, of SH degree 0 or 1; ``weights`` (N, J) skin them; ``offsets`` (N, 3), m, are added to the means at
+    rest.
     """
     moves = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
     world = torch.cat([posing.scale * moves[..., :3], posing.scale * moves[..., 3:] + posing.trans[:, None]], dim=-1)
     means = gaussians.means if offsets is None else gaussians.means + offsets
     moved = pose_by_joints(means, gaussians.quats, gaussians.log_scales, weights, world)
     linear = moved.transforms[..., :3]
-    sh = gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, nearest_rotations(linear))
+    sh = gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, blended_rotations(weights, moves))
     return Gaussians(
         means=moved.means,
         quats=moved.quats,
@@ -143,6 +143,16 @@ def pose_gaussians(
         logit_opacities=gaussians.logit_opacities,
         sh=sh if light is None else light.on(sh, linear),
     )
+
+
+def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
+    """Return the rotations (N, 3, 3) of joints (J, 3, 4) blended by ``weights`` (N, J), as quaternions; differentiable.
+
+    Each has the sign in which it is nearer to that of the heaviest joint: their sum never vanishes.
+    """
+    quats = quats_of(transforms[..., :3])
+    signs = torch.where(quats @ quats.T < 0, -1.0, 1.0).to(weights)
+    return rotation_matrices((weights * signs[weights.argmax(1)]) @ quats)
 
 
 def rest_offsets(anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None) -> Tensor | None:
