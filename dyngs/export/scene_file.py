@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import Tensor
@@ -13,12 +13,11 @@ from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
 from dyngs.kinds import restored_scene
-from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.inputs import inputs_of
-from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
+from dyngs.storage.file import decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
 from dyngs.storage.tensors import FIELD, drawable
@@ -61,9 +60,9 @@ def write_scene_file(
         plan = storage_plan(config, checkpoint, scene, max_change)
         precision = plan.precision
         steps = {name: step * (field_step if name.startswith(FIELD) else 1) for name, step in precision.steps.items()}
-        data = encoded(SceneInfo(**asdict(checkpoint.info)), scene, steps, plan.coarseness)
+        data = encoded(checkpoint.info, scene, steps, plan.coarseness)
         if plan.images is not None and precision.allowed is not None and field_step == 1:
-            stored = restored_scene(Checkpoint(checkpoint.info, decoded(data).tensors), config.model)
+            stored = restored_scene(decoded(data), config.model)
             precision = _checked(run_dir, precision, plan.images(scene), plan.images(stored))
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():

@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -27,6 +27,7 @@ from torch import Tensor
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians.scene import Scene
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
 from dyngs.storage.tensors import (
     COARSENESS,
@@ -38,7 +39,6 @@ from dyngs.storage.tensors import (
     completed,
     drawable,
     from_whole,
-    group_of,
     restored,
     stored_edit,
     to_whole,
@@ -62,8 +62,8 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class SceneInfo(_Part):
-    """Metadata of a checkpoint; see ``dyngs.training.state.CheckpointInfo``."""
+class _Info(_Part):
+    """``CheckpointInfo``."""
 
     step: int
     extent: float
@@ -95,19 +95,8 @@ class _Entry(_Part):
 
 
 class _Header(_Part):
-    info: SceneInfo
+    info: _Info
     tensors: tuple[_Entry, ...]
-
-
-@dataclass(frozen=True)
-class StoredScene:
-    """Contents of a .dyngs file."""
-
-    info: SceneInfo  # about the run
-    tensors: dict[str, Tensor]  # of a checkpoint, those that drawing needs
-    steps: dict[str, float]  # of each group of tensors that is quantised
-    sizes: dict[str, int]  # bytes of each tensor as stored
-    num_bytes: int  # of the file
 
 
 def write_scene(path: Path, data: bytes) -> None:
@@ -116,8 +105,8 @@ def write_scene(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def read_scene(path: Path) -> StoredScene:
-    """Return the scene in a file.
+def read_scene(path: Path) -> Checkpoint:
+    """Return the checkpoint in a file: the tensors that drawing needs.
 
     Raises DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
     """
@@ -130,7 +119,7 @@ def read_scene(path: Path) -> StoredScene:
         raise DyngsError(f"{path}: {error}") from None
 
 
-def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
+def encoded(info: CheckpointInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
     """Return the bytes of a file; the same for what was read from it.
 
     ``scene``: N Gaussians; what only training needs is left out. ``steps``: of groups of tensors, see
@@ -151,15 +140,17 @@ def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarsenes
         entry, block = _stored(name, kept[name], coding, scale)
         entries.append(entry)
         blocks.append(block)
-    header = compressed(_Header(info=info, tensors=tuple(entries)).model_dump_json().encode(), room=MAX_HEADER)
+    header = compressed(
+        _Header(info=_Info(**asdict(info)), tensors=tuple(entries)).model_dump_json().encode(), room=MAX_HEADER
+    )
     body = b"".join([MAGIC, len(header).to_bytes(4, "little"), header, *blocks])
     num_values = sum(math.prod(entry.shape) for entry in entries)
     body += bytes(max(0, (num_values - FREE_VALUES) // VALUES_PER_BYTE + 1 - len(body)))
     return body + hashlib.sha256(body).digest()
 
 
-def decoded(data: bytes) -> StoredScene:
-    """Return the scene in the bytes of a file. Raises DyngsError: anything but what ``encoded`` makes."""
+def decoded(data: bytes) -> Checkpoint:
+    """Return the checkpoint in the bytes of a file. Raises DyngsError: anything but what ``encoded`` makes."""
     if data[: len(MAGIC)] != MAGIC:
         is_other = data.startswith(MAGIC[:6]) and len(data) > len(MAGIC)
         raise DyngsError("written by another version of dyngs" if is_other else "not a stored scene of dyngs")
@@ -187,19 +178,7 @@ def decoded(data: bytes) -> StoredScene:
         raise DyngsError(f"its header is wrong at {where or 'its start'}: {first['msg']}") from None
     except (ValueError, OverflowError, RuntimeError, IndexError) as error:
         raise DyngsError(f"its tensors are wrong: {str(error).splitlines()[0]}") from None
-    sizes = {entry.name: entry.size + _FAR_BYTES * entry.far for entry in header.tensors}
-    return StoredScene(header.info, full, _steps(header, tensors), sizes, len(data))
-
-
-def _steps(header: _Header, tensors: Mapping[str, Tensor]) -> dict[str, float]:
-    """Return the steps that would store the tensors again unchanged; 0 for tensors stored exactly without need."""
-    steps: dict[str, float] = {}
-    for entry in header.tensors:
-        x = tensors[entry.name]
-        group = group_of(entry.name, x) or entry.name
-        if entry.step or (entry.kind is Kind.EXACT and coding_of(entry.name, x, {}).kind is not Kind.EXACT):
-            steps[group] = max(entry.step, steps.get(group, 0.0))
-    return steps
+    return Checkpoint(CheckpointInfo(**header.info.model_dump()), full)
 
 
 def _stored(name: str, x: Tensor, coding: Coding, coarseness: np.ndarray | None) -> tuple[_Entry, bytes]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import torch
@@ -21,7 +21,7 @@ from dyngs.gaussians.scene import Scene, render_options
 from dyngs.kinds import restored_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.views import evaluation_background, training_cameras
-from dyngs.storage.file import SceneInfo, decoded, encoded
+from dyngs.storage.file import decoded, encoded
 from dyngs.storage.precision import (
     GREY_LEVELS,
     Precision,
@@ -134,7 +134,7 @@ def coarsest_file(
         else:
             refused, high = found, middle
     for index in range(low - 1, -1, -1):
-        data = encoded(SceneInfo(**asdict(checkpoint.info)), scene, steps(FACTORS[index]), plan.coarseness)
+        data = encoded(checkpoint.info, scene, steps(FACTORS[index]), plan.coarseness)
         found = quality(drawn(decoded(data).tensors))
         if found >= least:
             return CoarseFile(data, FACTORS[index], found, refused)
