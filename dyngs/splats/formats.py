@@ -14,7 +14,7 @@ from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.splats.rotation import axis_of, product, turn_between, turned
-from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, unit_rotations, with_degree
+from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, require_writable, unit_rotations, with_degree
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Format:
 
 
 FORMATS = (
-    Format("compressed-ply", (".compressed.ply",), "-y", 3, True, ("ply", "read_raw", "write_compressed")),
-    Format("ply", (".ply",), "-y", 4, True, ("ply", "read_raw", "write_raw")),
+    Format("compressed-ply", (".compressed.ply",), "-y", 3, True, ("ply", "read_ply", "write_compressed")),
+    Format("ply", (".ply",), "-y", 4, True, ("ply", "read_ply", "write_ply")),
     Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz")),
     Format("splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")),
     Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
@@ -122,11 +122,7 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
     path = Path(path)
     own = format_of(path)
     gaussians, notes = splat.gaussians.detach().to(device="cpu", dtype=torch.float32), []
-    if len(gaussians) == 0:
-        raise DyngsError(f"{path}: not written, there are no Gaussians")
-    bad = torch.stack([~x[:, None].flatten(1).isfinite().all(1) for x in gaussians.tensors().values()]).any(0)
-    if bool(bad.any()):
-        raise DyngsError(f"{path}: not written, {int(bad.sum())} of {len(gaussians)} Gaussians have non-finite values")
+    require_writable(path, gaussians)
     if sh_degree is not None and sh_degree > own.max_degree:
         raise DyngsError(f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}")
     degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree

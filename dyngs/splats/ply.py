@@ -12,101 +12,55 @@ render the file), ``SH degree``, ``eps2d`` (the 2D low-pass variance), ``up`` (t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from dyngs.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
-from dyngs.errors import DyngsError, reading
-from dyngs.files.write import atomic_file
+from dyngs.conventions import MAX_SH_DEGREE, num_sh_terms
+from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.splats.compressed_ply import is_compressed, read_compressed, write_compressed
 from dyngs.splats.ply_header import PlyHeader, header_bytes, read_header
-from dyngs.splats.splat_file import Nonfinite, SplatFile, described, drawable, header_comments, unit_rotations
+from dyngs.splats.splat_file import SplatFile, described, header_comments, unit_rotations
 
-__all__ = ["read_ply", "read_raw", "write_compressed", "write_ply", "write_raw"]
+__all__ = ["read_ply", "write_compressed", "write_ply"]
 
 _DEGREE_OF_REST = {3 * (num_sh_terms(degree) - 1): degree for degree in range(MAX_SH_DEGREE + 1)}
 
 
-def write_ply(
-    path: Path | str,
-    gaussians: Gaussians,
-    mode: RasterizeMode = RasterizeMode.CLASSIC,
-    comments: Iterable[str] = (),
-    *,
-    eps2d: float | None = None,
-    world_offset: Sequence[float] | np.ndarray | None = None,
-    columns: Mapping[str, np.ndarray] | None = None,
-) -> Path:
-    """Write Gaussians as .ply, atomically: an old file stays until the new one is complete. Return the path.
+def read_ply(path: Path) -> SplatFile:
+    """Read a .ply, plain or compressed, binary or ascii, whatever its values are; properties may have any order.
 
-    ``path``: file to write; its folder is created. ``gaussians``: N >= 1 Gaussians, SH degree 0 to 4; any 3D filter
-    must be fused into them already. ``mode``: noted in the header, as viewers must render an antialiased model with
-    opacity compensation. ``comments``: further header comments, one line of ASCII each. ``eps2d``: 2D low-pass variance
-    (px^2) to note in the header. ``world_offset``: (3,) offset to note in the header; zeros are not noted. ``columns``:
-    further properties (N,) by name, written as float32 after all others; ``read_ply`` skips them. Raises DyngsError: no
-    Gaussians, non-finite values, or the file cannot be written.
+    Scalar types other than float32 are converted; other properties, and elements other than ``vertex``, are skipped.
     """
-    path = Path(path)
-    more = columns or {}
-    table = np.column_stack([_table(gaussians), *(x.astype("<f4") for x in more.values())])
-    if len(table) == 0:
-        raise DyngsError(f"{path}: not written, there are no Gaussians")
-    bad = int((~np.isfinite(table).all(axis=1)).sum())
-    if bad:
-        raise DyngsError(f"{path}: not written, {bad} of {len(table)} Gaussians have non-finite values")
-    x, y, z = (0.0, 0.0, 0.0) if world_offset is None else map(float, world_offset)
-    notes = header_comments(SplatFile(gaussians, mode, eps2d, (x, y, z)))
-    header = _header([*notes, *comments], len(table), gaussians.sh.shape[1], tuple(more))
-    with atomic_file(path) as temporary, open(temporary, "wb") as file:
-        file.write(header)
-        file.write(table.data)
-    return path
-
-
-def read_ply(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFile:
-    """Read a 3DGS .ply, plain or compressed by SuperSplat, binary or ascii, with properties in any order.
-
-    ``path``: the file, with or without normals and extra properties. Scalar types other than float32 are converted;
-    elements other than ``vertex`` are skipped. ``nonfinite``: as in ``dyngs.splats.formats.read_splats``. Raises
-    DyngsError: not a splat file, truncated, empty or non-finite; nothing large is allocated before the vertex count has
-    been compared with the size of the file.
-    """
-    path = Path(path)
-    with reading(path):
-        return drawable(read_raw(path), path, nonfinite)
-
-
-def read_raw(path: Path) -> SplatFile:
-    """Read a .ply as ``read_ply`` does, whatever its values are."""
-    if path.exists() and not path.is_file():
-        raise DyngsError(f"{path}: cannot read: it is no file; name a 3DGS .ply")
-    try:
-        with open(path, "rb") as file:
-            header = read_header(file, path)
-            if is_compressed(header):
-                gaussians = read_compressed(header, file, path)
-            else:
-                degree = _check_properties(header, path)
-                gaussians = _gaussians(header.read_element(file, path), degree)
-    except OSError as error:
-        raise DyngsError(f"{path}: cannot read: {error.strerror or error}") from error
+    with open(path, "rb") as file:
+        header = read_header(file, path)
+        if is_compressed(header):
+            gaussians = read_compressed(header, file, path)
+        else:
+            degree = _check_properties(header, path)
+            gaussians = _gaussians(header.read_element(file, path), degree)
     return described(SplatFile(gaussians, comments=header.comments), path)
 
 
-def write_raw(path: Path, splat: SplatFile) -> None:
-    """Write a plain .ply, not atomically."""
-    table = _table(splat.gaussians)
+def write_ply(path: Path, splat: SplatFile, columns: Mapping[str, np.ndarray] | None = None) -> None:
+    """Write a plain .ply, not atomically.
+
+    ``columns`` are further properties (N,) by name, written as float32 after all others, which ``read_ply`` skips.
+    """
+    more = columns or {}
+    table = np.column_stack([_table(splat.gaussians), *(x.astype("<f4") for x in more.values())])
+    rest = [f"f_rest_{i}" for i in range(3 * (splat.gaussians.sh.shape[1] - 1))]
+    names = ("x", "y", "z", "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALE, *_ROT, *more)
     with open(path, "wb") as file:
-        file.write(_header(header_comments(splat), len(table), splat.gaussians.sh.shape[1]))
+        file.write(header_bytes([("vertex", len(table), [("float", name) for name in names])], header_comments(splat)))
         file.write(table.data)
 
 
 def _table(gaussians: Gaussians) -> np.ndarray:
-    """Return (N, P) little-endian float32, columns in the order of ``_property_names``."""
+    """Return (N, P) little-endian float32, columns in the order of the module's layout."""
     parts = {name: x.detach().cpu().float() for name, x in gaussians.tensors().items()}
     n = len(gaussians)
     columns = [
@@ -121,20 +75,10 @@ def _table(gaussians: Gaussians) -> np.ndarray:
     return np.ascontiguousarray(torch.cat(columns, dim=1).numpy(), dtype="<f4")
 
 
-def _property_names(num_terms: int) -> list[str]:
-    rest = [f"f_rest_{i}" for i in range(3 * (num_terms - 1))]
-    return ["x", "y", "z", "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALE, *_ROT]
-
-
 _DC = tuple(f"f_dc_{i}" for i in range(3))
 _SCALE = tuple(f"scale_{i}" for i in range(3))
 _ROT = tuple(f"rot_{i}" for i in range(4))
 _REQUIRED = ("x", "y", "z", *_DC, "opacity", *_SCALE, *_ROT)
-
-
-def _header(comments: Iterable[str], count: int, num_terms: int, more: tuple[str, ...] = ()) -> bytes:
-    names = (*_property_names(num_terms), *more)
-    return header_bytes([("vertex", count, [("float", name) for name in names])], comments)
 
 
 def _check_properties(header: PlyHeader, path: Path) -> int:

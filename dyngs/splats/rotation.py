@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -50,6 +51,30 @@ def turned(
         logit_opacities=gaussians.logit_opacities,
         sh=turned_harmonics(gaussians.sh, matrix),
     )
+
+
+def placed(gaussians: Gaussians, world: np.ndarray) -> Gaussians | None:
+    """Return the Gaussians where an affine matrix (4, 4) puts them, None where that distorts or mirrors them."""
+    from scipy.spatial.transform import Rotation
+
+    linear = world[:3, :3]
+    if not np.isfinite(world).all():
+        return None
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not 1e-9 < scale < 1e9 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > 1e-3:
+        return None
+    if abs(scale - 1) < 1e-7:
+        scale = 1.0
+    x, y, z, w = Rotation.from_matrix(linear / scale).as_quat(canonical=True).tolist()
+    shift = torch.from_numpy(world[:3, 3].copy()) if world[:3, 3].any() else None
+    return turned(gaussians, (w, x, y, z), scale, shift)
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """Return the Gaussians of all parts, with harmonics of the least degree among them."""
+    terms = num_sh_terms(min(part.sh_degree for part in parts))
+    tensors = [part.tensors() | {"sh": part.sh[:, :terms]} for part in parts]
+    return Gaussians(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
 
 
 def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
+from dyngs.ops.checks import finite_rows
 from dyngs.splats.packing import logit
 from dyngs.splats.rotation import AXES
 
@@ -68,8 +69,7 @@ def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
     """
     total = len(splat.gaussians)
     gaussians, notes = _clamped(splat.gaussians)
-    bad_of = [~x[:, None].flatten(1).isfinite().all(1) for x in gaussians.tensors().values()]
-    bad = torch.stack([*bad_of, (gaussians.log_scales > MOST_LOG_SCALE).any(1)]).any(0)
+    bad = ~finite_rows(list(gaussians.tensors().values())) | (gaussians.log_scales > MOST_LOG_SCALE).any(1)
     count = int(bad.sum())
     if count and nonfinite == "error":
         raise DyngsError(f"{path}: {count:,} of {total:,} Gaussians have non-finite values (NaN or Inf)")
@@ -110,6 +110,15 @@ def require_count(path: Path, count: int, available: int, each: float) -> None:
             "export it again"
         )
     require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
+
+
+def require_writable(path: Path, gaussians: Gaussians) -> None:
+    """Raise DyngsError unless there are Gaussians, all of them finite."""
+    if len(gaussians) == 0:
+        raise DyngsError(f"{path}: not written, there are no Gaussians")
+    bad = int((~finite_rows(list(gaussians.tensors().values()))).sum())
+    if bad:
+        raise DyngsError(f"{path}: not written, {bad} of {len(gaussians)} Gaussians have non-finite values")
 
 
 def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -16,15 +16,13 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import torch
 
 from dyngs.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats import usd_child
-from dyngs.splats.rotation import turned
-from dyngs.splats.similarity import placement_of
+from dyngs.splats.rotation import joined, placed
 from dyngs.splats.splat_file import SplatFile, from_linear
 
 _SECONDS = 600.0
@@ -57,10 +55,7 @@ def read_usd(path: Path) -> SplatFile:
     if not count:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
     found = [_gaussians(path, {name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
-    degree = min(g.sh_degree for g in found)
-    parts = [g.tensors() | {"sh": g.sh[:, : num_sh_terms(degree)]} for g in found]
-    whole = Gaussians(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
-    return SplatFile(whole, up=_UP.get(str(read["up"]), "y"))
+    return SplatFile(joined(found), up=_UP.get(str(read["up"]), "y"))
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
@@ -114,10 +109,10 @@ def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     if any(len(arrays[name]) != n for name in ("scales", "opacities", "quats")) or len(sh) != n * terms:
         raise DyngsError(f"{path}: the attributes of its Gaussians have different lengths; export it again")
     found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3))
-    placement = placement_of(arrays["world"])
-    if placement is None:
+    moved = placed(found, arrays["world"])
+    if moved is None:
         raise DyngsError(f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting")
-    return turned(found, placement.rotation, placement.scale, placement.shift_tensor)
+    return moved
 
 
 def _environment() -> dict[str, str]:

@@ -22,7 +22,7 @@ from dyngs.export.splat_files import (
     writing_of,
 )
 from dyngs.runs.opened import Captured, Opened, open_run
-from dyngs.splats.ply import read_ply
+from dyngs.splats.formats import read_splats
 from dyngs.splats.rotation import AXES, turn_between
 
 ALL = (0, 1, 2, 3, 4)
@@ -44,12 +44,12 @@ def written(run: Opened, path: Path, time: float = 0.0, part: Part = "all") -> P
 
 
 def x_of(path: Path) -> torch.Tensor:
-    return read_ply(path).gaussians.means[:, 0]
+    return read_splats(path).gaussians.means[:, 0]
 
 
 @pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
 def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
-    splat = read_ply(written(moving, tmp_path / "a.ply", time))
+    splat = read_splats(written(moving, tmp_path / "a.ply", time))
     torch.testing.assert_close(splat.gaussians.means[:, 0], moved_x(ALL, time))
     assert torch.equal(splat.gaussians.means[:, 1:], row_of_balls().means[:, 1:])
     assert f"dyngs time {time!r}" in splat.comments
@@ -60,7 +60,7 @@ def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
 def test_a_still_run_has_no_time(still: Opened, tmp_path: Path) -> None:
     early, late = (written(still, tmp_path / f"{time}.ply", time) for time in (0.0, 1.0))
     assert early.read_bytes() == late.read_bytes()
-    assert not any("time" in comment for comment in read_ply(early).comments)
+    assert not any("time" in comment for comment in read_splats(early).comments)
     everything = written(still, tmp_path / "still.ply", part="still")
     assert everything.read_bytes() == early.read_bytes()
 
@@ -76,7 +76,7 @@ def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
         stays = x_of(written(moving, tmp_path / "still.ply", time, "still"))
         torch.testing.assert_close(moves, moved_x(MOVING_ROWS, time))
         torch.testing.assert_close(stays, moved_x(STILL_ROWS, time))
-    assert not any("time" in comment for comment in read_ply(tmp_path / "still.ply").comments)
+    assert not any("time" in comment for comment in read_splats(tmp_path / "still.ply").comments)
 
 
 def test_empty_parts_are_refused() -> None:
@@ -96,7 +96,7 @@ def test_a_sequence(moving: Opened, part, rows: tuple[int, ...], tmp_path: Path)
     assert all(re.fullmatch(r"(.*?)(\d+)\.ply", p.name) for p in paths)  # what players look for
     for path, time in zip(paths, times, strict=True):
         torch.testing.assert_close(x_of(path), moved_x(rows, time))
-        assert f"dyngs time {time!r}" in read_ply(path).comments
+        assert f"dyngs time {time!r}" in read_splats(path).comments
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
 from dyngs.splats.gltf import EXTENSION, add_gaussians
 from dyngs.splats.ply import write_ply
+from dyngs.splats.splat_file import SplatFile, require_writable
 
 SUFFIXES = (".ply", ".glb")
 
@@ -70,6 +71,7 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
     gaussians = gaussians.replace(
         means=rig.placed(gaussians.means), log_scales=gaussians.log_scales + float(np.log(rig.scale))
     )
+    require_writable(path, gaussians)
     if suffix == ".ply":
         _write_columns(path, run, scene, rig, gaussians)
         return RiggedSplats(path, notes)
@@ -93,7 +95,9 @@ def _write_columns(path: Path, run: LoadedRun, scene: HumanScene, rig: Rig, gaus
         for i, (name, parent, place) in enumerate(zip(rig.names, rig.skeleton.parents, places, strict=True))
     ]
     model = run.config.model
-    write_ply(path, gaussians, model.rasterize_mode, ["up: y", *lines], eps2d=model.eps2d, columns=columns)
+    splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, comments=tuple(lines), up="y")
+    with atomic_file(path) as temporary:
+        write_ply(temporary, splat, columns)
 
 
 def _document(scene: HumanScene, rig: Rig, gaussians: Gaussians) -> GlbDocument:
