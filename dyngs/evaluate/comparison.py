@@ -22,8 +22,7 @@ from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 
-COMPARED_VIEWS = 20
-"""Number of views compared per split; enough for before and after, not for a benchmark."""
+COMPARED_VIEWS = 20  # number of views compared per split; enough for before and after, not for a benchmark
 ROUNDS = 3
 
 

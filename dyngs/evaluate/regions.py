@@ -19,12 +19,10 @@ from dyngs.metrics import psnr
 RegionMetric = Literal["psnr_foreground", "psnr_moving", "psnr_static"]
 REGION_METRICS: tuple[RegionMetric, ...] = ("psnr_foreground", "psnr_moving", "psnr_static")
 
-FEWEST_PIXELS = 25
-"""A region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing."""
+FEWEST_PIXELS = 25  # a region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing
 CHANGE = 0.05
 """Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as moving."""
-MEDIAN_IMAGES = 31
-"""Number of images, spread over the clip, from which a camera's median is taken."""
+MEDIAN_IMAGES = 31  # number of images, spread over the clip, from which a camera's median is taken
 FEWEST_IMAGES = 3
 
 NO_ALPHA = "the images have no alpha and no silhouettes"

@@ -24,8 +24,7 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.drawing import Drawing
 from dyngs.metrics import MetricValue
 
-MAX_MOMENTS = 60
-"""Number of training times up to which flicker is measured at all of them."""
+MAX_MOMENTS = 60  # number of training times up to which flicker is measured at all of them
 
 _SAMPLED_TRIPLES = MAX_MOMENTS // 3
 _NO_TIMES = "the images have no times"

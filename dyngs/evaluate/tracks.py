@@ -18,10 +18,8 @@ from dyngs.data.times import SAME_TIME
 from dyngs.data.tracks import TRACKS_FILE, TrueTracks
 from dyngs.gaussians.scene import Scene
 
-CARRIERS = 4
-"""K, nearest Gaussians that carry a point, weighted by opacity."""
-MIN_OPACITY = 0.3
-"""Fainter Gaussians carry nothing."""
+CARRIERS = 4  # K, nearest Gaussians that carry a point, weighted by opacity
+MIN_OPACITY = 0.3  # fainter Gaussians carry nothing
 CLOSE_PX = 5.0
 
 NO_TRACKS = f"the capture has no {TRACKS_FILE}"

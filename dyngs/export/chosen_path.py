@@ -24,8 +24,7 @@ from dyngs.splats.rotation import AXES, with_scene
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
-_SAMPLED_TIMES = 8
-"""Times of a motion whose Gaussians the images of an orbit must hold."""
+_SAMPLED_TIMES = 8  # times of a motion whose Gaussians the images of an orbit must hold
 _RING = 24
 
 

@@ -27,8 +27,7 @@ SUFFIX = ".4dgs"
 UP = "-y"
 FPS = 30.0
 _KEYFRAME_EVERY = 8
-_FOREVER = 1e4
-"""Standard deviation in time, in lengths of the clip: a Gaussian never fades."""
+_FOREVER = 1e4  # standard deviation in time, in lengths of the clip: a Gaussian never fades
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,8 @@ from dyngs.splats.splat_file import SplatFile, splat_options
 
 VIEWS = 4
 _LONGEST_SIDE = 240
-_LEAST_FRACTION = 0.002
-"""Cameras that see the scene in fewer pixels than this are replaced by an orbit."""
-FAINT = 30.0
-"""dB, below which a line about the difference is a warning."""
+_LEAST_FRACTION = 0.002  # cameras that see the scene in fewer pixels than this are replaced by an orbit
+FAINT = 30.0  # dB, below which a line about the difference is a warning
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from dyngs.export.splat_files import scene_part
 from dyngs.files.write import atomic_file
 from dyngs.gaussians.scene import Scene
 
-MAX_BYTES = 4_000_000_000
-"""Largest size of the positions, which are held in memory."""
+MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in memory
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from dyngs.ops.native import num_threads
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
 from dyngs.ops.transfer import sent
 
-Count: TypeAlias = int | Tensor
-"""A number, or a tensor () of one that may still be on a GPU, where ``int`` waits for it."""
+Count: TypeAlias = int | Tensor  # a number, or a tensor () of one that may still be on a GPU, where int waits for it
 
 
 def _adam_step(

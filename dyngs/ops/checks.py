@@ -12,15 +12,12 @@ from dyngs.errors import DyngsError
 from dyngs.ops.native import core, num_threads
 from dyngs.ops.registration import has_kernel, launch, register, shapes_only
 
-LARGEST = 3.4e38
-"""Options are computed with in float32."""
+LARGEST = 3.4e38  # options are computed with in float32
 
 LARGEST_COUNT = 2**31 - 1
-MAX_SIDE: int = core.MAX_SIDE
-"""px; float32 has no pixel centres beyond 2^23"""
+MAX_SIDE: int = core.MAX_SIDE  # px; float32 has no pixel centres beyond 2^23
 
-UNASKED = 1 << 26
-"""Bytes up to which the free memory is not asked for, because asking takes 0.1 ms."""
+UNASKED = 1 << 26  # bytes up to which the free memory is not asked for, because asking takes 0.1 ms
 
 REMEDY = "lower the resolution, the scales or the number of views"
 

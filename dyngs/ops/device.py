@@ -18,8 +18,7 @@ from dyngs.ops.native import core, cuda_core, has_cuda_core
 
 CPU = torch.device("cpu")
 CHOICES = ("auto", "cpu", "cuda")
-OLDEST = (7, 5)
-"""Compute capability of the oldest GPUs that the kernels are compiled for."""
+OLDEST = (7, 5)  # compute capability of the oldest GPUs that the kernels are compiled for
 
 _TORCH = "install a torch for CUDA, see pytorch.org"
 _BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc (docs/gpu.md)"

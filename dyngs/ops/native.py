@@ -27,8 +27,7 @@ from torch.utils.dlpack import to_dlpack  # pyright: ignore[reportPrivateImportU
 from dyngs.errors import DyngsError
 
 _BASELINE = "SSE4.2" if platform.machine() in ("x86_64", "AMD64") else "NEON"
-ISA_NAMES = {"v2": _BASELINE, "v3": "AVX2", "v4": "AVX-512"}
-"""Instruction sets, x86-64 levels, oldest first."""
+ISA_NAMES = {"v2": _BASELINE, "v3": "AVX2", "v4": "AVX-512"}  # instruction sets, x86-64 levels, oldest first
 
 
 def built_isas() -> tuple[str, ...]:

@@ -17,8 +17,7 @@ from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, launch, register
 
-_KEPT = 12
-"""Numbers per Gaussian that the forward pass keeps for the backward pass."""
+_KEPT = 12  # numbers per Gaussian that the forward pass keeps for the backward pass
 
 
 _Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]

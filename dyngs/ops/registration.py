@@ -32,8 +32,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _LIBRARY = torch.library.Library(NAMESPACE, "FRAGMENT")
-_kernels: dict[str, set[str]] = {}
-"""Devices of each op's implementations."""
+_kernels: dict[str, set[str]] = {}  # devices of each op's implementations
 
 
 @dataclass(frozen=True)

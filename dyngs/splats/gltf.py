@@ -22,8 +22,7 @@ from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, from_linear
 
 EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
-_MOST_NODES, _MOST_DEPTH = 4096, 32
-"""Limits on the nodes that are visited, and on those above one another."""
+_MOST_NODES, _MOST_DEPTH = 4096, 32  # limits on the nodes that are visited, and on those above one another
 
 
 def read_gltf(path: Path) -> SplatFile:

@@ -23,8 +23,7 @@ AXES: dict[str, tuple[float, float, float]] = {
 }
 """Unit vectors by the names that ``--up`` takes: x, y, z, -x, -y, -z."""
 
-_ALONG_AXIS = 0.866
-"""A direction within 30 degrees of an axis is taken for the axis."""
+_ALONG_AXIS = 0.866  # a direction within 30 degrees of an axis is taken for the axis
 _DIRECTIONS = 200
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 

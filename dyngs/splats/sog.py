@@ -27,8 +27,7 @@ from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile
 _PER_ROW = 64
 _MOST_META_BYTES = 1 << 20
 _MOST_PIXELS = 1 << 27
-_MODE = 252
-"""Alpha of a rotation: this plus the index of its largest entry."""
+_MODE = 252  # alpha of a rotation: this plus the index of its largest entry
 _HALF_ROOT = float(np.sqrt(0.5))
 
 _Table = Annotated[tuple[FiniteFloat, ...], Field(min_length=256, max_length=256)]

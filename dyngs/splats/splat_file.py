@@ -24,10 +24,8 @@ Nonfinite = Literal["error", "skip"]
 
 MOST_LOGIT = 16.0
 """Infinite logits become this: an opacity of 1 - 1e-7. Files with opacities in 8 bits hold exactly 0 and 1."""
-LEAST_LOG_SCALE = -30.0
-"""Scales of 0, flat Gaussians, become exp(-30) = 1e-13."""
-MOST_LOG_SCALE = 80.0
-"""Beyond 88 the scale itself is infinite in float32."""
+LEAST_LOG_SCALE = -30.0  # scales of 0, flat Gaussians, become exp(-30) = 1e-13
+MOST_LOG_SCALE = 80.0  # beyond 88 the scale itself is infinite in float32
 MOST_GAUSSIANS = 1 << 26
 """Limit on the Gaussians of a file whose size does not bound them: 16 GB in memory with harmonics of degree 3."""
 

@@ -25,8 +25,7 @@ from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, un
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
 _ANTIALIASED = 1
-_MOST_RATIO = 1032
-"""Largest compression of deflate."""
+_MOST_RATIO = 1032  # largest compression of deflate
 _MOST_BYTES = 1 << 31
 _COLOUR_SCALE = 0.15
 _FRACTION_BITS = 12

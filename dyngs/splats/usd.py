@@ -25,8 +25,7 @@ from dyngs.splats import usd_child
 from dyngs.splats.rotation import joined, placed
 from dyngs.splats.splat_file import SplatFile, from_linear
 
-_SECONDS = 600.0
-"""Of wall time; the child has less of processor time."""
+_SECONDS = 600.0  # of wall time; the child has less of processor time
 _NAMES = ("means", "scales", "opacities", "quats", "sh", "degree", "world")
 _MOST_BYTES = 1 << 31
 _UP = {"Y": "y", "Z": "z"}

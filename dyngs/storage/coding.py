@@ -14,10 +14,8 @@ import numpy as np
 
 from dyngs.errors import DyngsError
 
-_SAMPLE = 2**15
-"""Number of values by which the layout of an array is chosen."""
-_FEW = 512
-"""Number of values below which the layout is not changed."""
+_SAMPLE = 2**15  # number of values by which the layout of an array is chosen
+_FEW = 512  # number of values below which the layout is not changed
 _MAX_PLANES = 8
 _SMALLEST_DICTIONARY, _LARGEST_DICTIONARY = 2**12, 2**24
 

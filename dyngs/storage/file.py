@@ -46,11 +46,9 @@ from dyngs.storage.tensors import (
 
 MAGIC = b"dyngs\x00\x01\n"
 MAX_HEADER = 2**20
-FREE_VALUES, VALUES_PER_BYTE = 2**22, 64
-"""Largest number of values in any file, and of further values per byte of it."""
+FREE_VALUES, VALUES_PER_BYTE = 2**22, 64  # largest number of values in any file, and of further values per byte of it
 _CHECKSUM = 32
-_FAR_BYTES = 16
-"""Bytes of an index and a value."""
+_FAR_BYTES = 16  # bytes of an index and a value
 _DTYPES = {
     str(dtype).removeprefix("torch."): dtype
     for dtype in (torch.float16, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8, torch.bool)

@@ -35,15 +35,11 @@ from dyngs.storage.tensors import COARSENESS, completed, drawable
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""
-COMPARED = 6
-"""Number of training views in which the change is measured."""
-SMALLEST_CHANGE = 0.01
-"""Smallest change to allow, in grey levels of 255."""
-LOOKED_AT = 50
-"""Number of training views in which the visibility of each Gaussian is measured."""
+COMPARED = 6  # number of training views in which the change is measured
+SMALLEST_CHANGE = 0.01  # smallest change to allow, in grey levels of 255
+LOOKED_AT = 50  # number of training views in which the visibility of each Gaussian is measured
 
-FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))
-"""Factors on the usual steps that are tried, by bisection."""
+FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))  # factors on the usual steps that are tried, by bisection
 
 Images = Callable[[Scene], list[Tensor]]
 """Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""

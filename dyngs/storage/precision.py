@@ -27,18 +27,14 @@ from dyngs.storage.tensors import (
 )
 
 GREY_LEVELS = 255.0
-TRIALS = 4
-"""Number of steps tried per group."""
-CLOSE = 0.8
-"""Fraction of the allowed error from which the search ends."""
-FIRST_STEP = 2.0**-6
-"""First step as a fraction of the mean magnitude of the values."""
+TRIALS = 4  # number of steps tried per group
+CLOSE = 0.8  # fraction of the allowed error from which the search ends
+FIRST_STEP = 2.0**-6  # first step as a fraction of the mean magnitude of the values
 WIDEST_JUMP = 32.0
 OUTLYING, USUAL_FRACTION = 64.0, 0.95
 """Values so many times as large as this fraction of those that are not 0 are outliers: steps are chosen without
 them."""
-MOST_VISIBLE = 0.9
-"""Quantile of visibility above which Gaussians are stored most finely."""
+MOST_VISIBLE = 0.9  # quantile of visibility above which Gaussians are stored most finely
 ASSUMED_STEPS = {"quats": 2**-8, "log_scales": 2**-6, "logit_opacities": 2**-10, "sh_base": 2**-7, "sh_rest": 2**-7}
 
 Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]

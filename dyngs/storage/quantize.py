@@ -13,17 +13,13 @@ import torch
 
 from dyngs.ops.quaternions import quat_product
 
-LIMIT = 2**20
-"""Bound on the magnitude of the integers; larger values are stored as they are."""
+LIMIT = 2**20  # bound on the magnitude of the integers; larger values are stored as they are
 SMALLEST_STEP, LARGEST_STEP = 2.0**-100, 2.0**60
 NEAREST, SPARSE = 0.5, 0.35
 """Added before rounding down: to the nearest integer, or biased to zero, which costs least to store."""
-ROTATION_STEP = 1 / 32
-"""Coarsest step for rotations, at which the component left out stays the largest."""
-FINEST_ROTATION = 2.0**-19
-"""Finest step for rotations, at which the components of a unit quaternion are within ``LIMIT``."""
-OPACITY_STEPS = 2.0**-12, 1 / 8
-"""Finest and coarsest step for opacities."""
+ROTATION_STEP = 1 / 32  # coarsest step for rotations, at which the component left out stays the largest
+FINEST_ROTATION = 2.0**-19  # finest step for rotations, at which the components of a unit quaternion are within LIMIT
+OPACITY_STEPS = 2.0**-12, 1 / 8  # finest and coarsest step for opacities
 
 
 def step_below(step: float) -> float:
@@ -37,8 +33,7 @@ def is_step(step: float) -> bool:
     return SMALLEST_STEP <= step <= LARGEST_STEP and step_below(step) == step
 
 
-Steps = float | np.ndarray
-"""One step for all, or one per row, of a shape that broadcasts."""
+Steps = float | np.ndarray  # one step for all, or one per row, of a shape that broadcasts
 
 
 def to_grid(values: np.ndarray, step: Steps, rounding: float = NEAREST) -> tuple[np.ndarray, np.ndarray]:

@@ -52,11 +52,9 @@ class Kind(str, Enum):
     ROTATION = "rotation"
 
 
-FIELD = "model.field.learned."
-"""Prefix of the learned tensors of a deformation field."""
+FIELD = "model.field.learned."  # prefix of the learned tensors of a deformation field
 GAUSSIANS = tuple(field.name for field in fields(Gaussians))
-MAX_COARSENESS = 6
-"""Most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others."""
+MAX_COARSENESS = 6  # most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
 COARSENESS = "gaussians.coarseness"
 _BY_COARSENESS = ("gaussians.sh_base", "gaussians.sh_rest")
 _KINDS = {
@@ -65,13 +63,10 @@ _KINDS = {
     "gaussians.sh_rest": Kind.SPARSE,
 }
 _LIMITS = {Kind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), Kind.OPACITY: OPACITY_STEPS}
-FEW = 64
-"""Number of values up to which tensors are stored as they are."""
+FEW = 64  # number of values up to which tensors are stored as they are
 LARGEST_HALF = 65504.0
-MOST_FAR = 1 / 8
-"""Largest fraction of values out of the integer range; with more, all are stored as they are."""
-RELATIVE = "model.filter_std"
-"""Stored in half precision: it spans orders of magnitude."""
+MOST_FAR = 1 / 8  # largest fraction of values out of the integer range; with more, all are stored as they are
+RELATIVE = "model.filter_std"  # stored in half precision: it spans orders of magnitude
 POSITIVE = "model.field.buffers.radii"
 """Stored as they are: a radius of influence that is rounded to 0 has no meaning, and there are few."""
 FIXED_STEPS = {

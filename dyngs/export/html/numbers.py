@@ -24,14 +24,10 @@ from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 
-BONES = 8
-"""Bones that a Gaussian follows on the page."""
-FINE = ("means", "quats")
-"""Splines of nodes that are stored in 16 bits."""
-MOST_LOGIT = 15.0
-"""Opacities beyond that of this logit are 1 to seven digits."""
-CHUNK = 256
-"""Rows of a list that share a range for each column: neighbours in space are alike."""
+BONES = 8  # bones that a Gaussian follows on the page
+FINE = ("means", "quats")  # splines of nodes that are stored in 16 bits
+MOST_LOGIT = 15.0  # opacities beyond that of this logit are 1 to seven digits
+CHUNK = 256  # rows of a list that share a range for each column: neighbours in space are alike
 
 
 class Lists:

@@ -30,12 +30,10 @@ from dyngs.splats.rotation import AXES
 HERE = Path(__file__).parent
 SCRIPTS = ("data.js", "motion.js", "sort.js", "renderer.js", "camera.js", "player.js", "main.js")
 SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
-TOLERANCE = 0.25
-"""Pixels of the first view that a place at its target may be off where motion is fitted."""
+TOLERANCE = 0.25  # pixels of the first view that a place at its target may be off where motion is fitted
 
 
-MOST_VIEWS = 24
-"""Cameras of the capture that a page offers, evenly chosen."""
+MOST_VIEWS = 24  # cameras of the capture that a page offers, evenly chosen
 _RING, _FRONT_RING = 8, 24
 """Cameras around a scene without a capture; among how many the front of a person is looked for."""
 

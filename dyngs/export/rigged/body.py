@@ -17,8 +17,7 @@ from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.template.body import BodyTemplate, apply_shape
 
-_MOST_ROWS = 4000
-"""Anchors whose places determine the shape; each gives three equations."""
+_MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
 
 
 @dataclass(frozen=True)

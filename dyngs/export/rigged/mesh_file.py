@@ -35,12 +35,9 @@ from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
 
 SUFFIX = ".glb"
-_FINER = 4
-"""Texels of the texture per texel of the model's atlas, along a side."""
-_LARGEST = 2048
-"""Texels along a side of the largest texture."""
-_MOST_SAMPLES = 512
-"""Texels along a side of the atlas from which the surface is moved."""
+_FINER = 4  # texels of the texture per texel of the model's atlas, along a side
+_LARGEST = 2048  # texels along a side of the largest texture
+_MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
 
 
 @dataclass(frozen=True)

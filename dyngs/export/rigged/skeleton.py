@@ -22,8 +22,7 @@ from dyngs.human.motion.placement import upright
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
-_FLOOR_FRAMES = 64
-"""Frames, evenly spread, in which the lowest vertex is looked for."""
+_FLOOR_FRAMES = 64  # frames, evenly spread, in which the lowest vertex is looked for
 _STILL = 1e-6
 
 

@@ -25,12 +25,9 @@ from dyngs.human.template.mesh import rasterize
 
 MARGINS = (0.0, 0.004, 0.008, 0.012, 0.016)
 """Distances, m, from the uppermost Gaussians to the surface that are tried: Gaussians reach beyond their centres."""
-_BOUNDS = (-0.02, 0.06)
-"""Least and greatest displacement, m."""
-_SMOOTH = 0.01
-"""Standard deviation, m, of the weights by which displacements are averaged."""
-_NEAR = 64
-"""Samples that displace a vertex."""
+_BOUNDS = (-0.02, 0.06)  # least and greatest displacement, m
+_SMOOTH = 0.01  # standard deviation, m, of the weights by which displacements are averaged
+_NEAR = 64  # samples that displace a vertex
 _FOLDS = (0.01, 0.02, 0.03)
 """Distances, m, above a sample at which the body must not be for the sample to count: mouth, eye sockets."""
 _SIZE = 256

@@ -22,25 +22,18 @@ from dyngs.human.template.atlas import Texels
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import rotation_matrices
 
-_NEAR = 20
-"""Gaussians that are looked for at each height above a texel."""
+_NEAR = 20  # Gaussians that are looked for at each height above a texel
 _HEIGHTS = (-0.015, 0.005, 0.025, 0.05)
 """Heights, m, where they are looked for: below the skin, on it, in clothes and hair."""
-_REACH = (-0.04, 0.07)
-"""Heights, m, between which Gaussians belong to a texel."""
+_REACH = (-0.04, 0.07)  # heights, m, between which Gaussians belong to a texel
 _FACING = 0.3
 """Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not colour the trunk."""
-_TOP = 0.1
-"""Fraction of what is seen from which a texel counts as covered."""
+_TOP = 0.1  # fraction of what is seen from which a texel counts as covered
 _CHUNK = 8192
-SEEN = 0.1
-"""Opacity from which a texel has a colour of its own."""
-_MIRROR = 0.02
-"""Distance, m, within which the mirror image of a texel is looked for."""
-_GAP = 0.015
-"""Distance, m, to what is seen, up to which a texel lies in a small gap."""
-_AROUND = 16
-"""Texels that colour one in a gap, or one that is not seen on either side."""
+SEEN = 0.1  # opacity from which a texel has a colour of its own
+_MIRROR = 0.02  # distance, m, within which the mirror image of a texel is looked for
+_GAP = 0.015  # distance, m, to what is seen, up to which a texel lies in a small gap
+_AROUND = 16  # texels that colour one in a gap, or one that is not seen on either side
 
 
 @dataclass(frozen=True)

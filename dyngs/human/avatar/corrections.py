@@ -32,14 +32,11 @@ LR = {
     "normals": 1e-3,
 }
 """Learning rates."""
-OF_FRAMES = ("poses", "trans")
-"""What is learned of single frames."""
-LR_DECAY = 0.1
-"""Last over first learning rate."""
+OF_FRAMES = ("poses", "trans")  # what is learned of single frames
+LR_DECAY = 0.1  # last over first learning rate
 POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
 """Of the squared corrections of poses and joints, of skinning weights, and of the light, in the loss."""
-POSE_CM = 0.05
-"""Rotation of a joint, rad, that is penalized as much as a centimetre."""
+POSE_CM = 0.05  # rotation of a joint, rad, that is penalized as much as a centimetre
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Kind, Setting
 from dyngs.models.views import training_cameras
 
-FIRST_VIEWS = 50
-"""Number of images from which a person's first colours are taken."""
+FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
 
 
 def start(setting: Setting) -> GaussianModel:

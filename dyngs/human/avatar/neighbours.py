@@ -14,10 +14,8 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions
 from dyngs.human.avatar.anchors import Anchors
 
-_SAME_JOINTS = 0.5
-"""Least cosine between the skinning weights of points that belong to the same part of the body."""
-_LOOKED_AT = 4
-"""Points that are looked at, over the number of requested neighbours."""
+_SAME_JOINTS = 0.5  # least cosine between the skinning weights of points that belong to the same part of the body
+_LOOKED_AT = 4  # points that are looked at, over the number of requested neighbours
 
 
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
@@ -59,19 +57,14 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
     return torch.where(others, own, near).gather(1, order)
 
 
-ENOUGH = 1.0
-"""Sightings (see ``sightings``) at which a Gaussian's own values count as much as what is around it."""
-MIRRORED = 0.9
-"""Trust in the other side of the body, where that was seen."""
-HARDLY = 0.5
-"""Trust in a Gaussian's own values below which it is counted as unseen in the line for people."""
+ENOUGH = 1.0  # sightings (see sightings) at which a Gaussian's own values count as much as what is around it
+MIRRORED = 0.9  # trust in the other side of the body, where that was seen
+HARDLY = 0.5  # trust in a Gaussian's own values below which it is counted as unseen in the line for people
 _NEIGHBOURS = 8
 _SAME_PLACE = 1.5
 """Distance from the mirrored anchor, in sides of its texel, within which a Gaussian is its mirror image."""
-_OWN = 1e-6
-"""Least weight of own values, which decides where nothing around is seen either."""
-_SURE = 1e-3
-"""Least doubt in own values, so that the numbers stay in range."""
+_OWN = 1e-6  # least weight of own values, which decides where nothing around is seen either
+_SURE = 1e-3  # least doubt in own values, so that the numbers stay in range
 _RESIDUAL, _MAX_ROUNDS = 1e-5, 1000
 """Largest residual of the linear system at which its solution is good enough, and bound on the rounds it takes."""
 

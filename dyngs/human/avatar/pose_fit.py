@@ -79,12 +79,10 @@ def shrunk(image: Tensor, factor: int) -> Tensor:
     return area_downscale(image, width, height)
 
 
-COARSE_PX = 40
-"""Height of the person, px, in the coarsest of the three rounds."""
+COARSE_PX = 40  # height of the person, px, in the coarsest of the three rounds
 FIRST_RATES, LAST_RATES = (5e-3, 5e-3, 3e-3), (2.5e-3, 1.2e-3, 5e-4)
 """Learning rates of rotations, rad, in the three rounds."""
-SHIFT_RATE = 0.5
-"""Learning rate of the translation, m, over that of rotations, rad."""
+SHIFT_RATE = 0.5  # learning rate of the translation, m, over that of rotations, rad
 BETAS = (0.9, 0.99)
 WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
 """After so many updates (at least one for each image) the rate is halved unless the mean loss fell by that share; a

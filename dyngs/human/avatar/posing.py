@@ -21,10 +21,8 @@ from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_of, rotation_matrices
 from dyngs.state import fields_moved_to
 
-LEFT_OUT = "the learned light is left out: colours are those in even light"
-"""Message of files that cannot hold it."""
-TERMS = 8
-"""Number of harmonics of degree 1 and 2; degree 0 is the colour itself."""
+LEFT_OUT = "the learned light is left out: colours are those in even light"  # message of files that cannot hold it
+TERMS = 8  # number of harmonics of degree 1 and 2; degree 0 is the colour itself
 
 
 @dataclass(frozen=True)

@@ -25,20 +25,16 @@ from dyngs.human.fit.start import first_poses, num_ticks
 from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 
-IMAGE_SIDE = 512
-"""Longest side of the images that are read, px."""
-RESOLUTION = 48
-"""Texels per side of the atlas whose discs are drawn."""
-MOST_VIEWS = 8
-"""Views of one frame that are looked at."""
+IMAGE_SIDE = 512  # longest side of the images that are read, px
+RESOLUTION = 48  # texels per side of the atlas whose discs are drawn
+MOST_VIEWS = 8  # views of one frame that are looked at
 GAIN, GAIN_OF_SHAPE = 0.01, 0.03
 """Gain of IoU for which more is learned, and for which given poses are touched at all.
 
 Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another shape explains thick
 clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
-SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
-"""What is the same in all frames."""
+SHAPE = ("log_scale", "betas", "padding", "offset", "shift")  # what is the same in all frames
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from dyngs.human.fit.solve import Fitting, near_given, new_fit
 from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 
-_CLEARLY = 0.001
-"""Gain of IoU for which the clip is moved."""
+_CLEARLY = 0.001  # gain of IoU for which the clip is moved
 _EFFORT = FitEffort()
 
 

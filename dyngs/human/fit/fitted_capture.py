@@ -41,8 +41,7 @@ from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
 
-FRAME_RATE = 30.0
-"""Frames per second of a clip whose capture does not say."""
+FRAME_RATE = 30.0  # frames per second of a clip whose capture does not say
 
 
 def write_body(
@@ -96,8 +95,7 @@ def _straight(image: Image) -> np.ndarray:
     return straight_uint8(torch.cat(parts, dim=-1)).numpy()
 
 
-GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)
-"""Colours of the outlines: red and green."""
+GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)  # colours of the outlines: red and green
 
 
 @torch.no_grad()
@@ -259,8 +257,7 @@ def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[Av
     }
 
 
-KEYPOINTS = "keypoints"
-"""Folder of a capture with key points of its images, as OpenPose writes them."""
+KEYPOINTS = "keypoints"  # folder of a capture with key points of its images, as OpenPose writes them
 _LARGEST = 100_000_000
 """Files of a capture larger than this many bytes, such as videos, are not what it says about bodies and cameras."""
 

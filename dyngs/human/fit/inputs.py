@@ -42,8 +42,7 @@ class FitInputs:
     avatar: KnownAvatar | None = None
 
 
-NOTHING_ELSE = FitInputs()
-"""Nothing beside the capture."""
+NOTHING_ELSE = FitInputs()  # nothing beside the capture
 
 
 def has_guessed_lens(capture: Capture) -> bool:

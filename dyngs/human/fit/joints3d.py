@@ -24,10 +24,8 @@ from dyngs.human.fit.keypoints import JOINTS, ORDERS, by_stem
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
 
-NUM_JOINTS = 22
-"""Joints of the body without hands and face, the same in SMPL, SMPL-H and SMPL-X."""
-NEAR = 0.5
-"""A vertex tells where a joint is if it follows that joint and its parent by this fraction at least."""
+NUM_JOINTS = 22  # joints of the body without hands and face, the same in SMPL, SMPL-H and SMPL-X
+NEAR = 0.5  # a vertex tells where a joint is if it follows that joint and its parent by this fraction at least
 
 
 def joints_of_vertices(where: Path, body: BodyTemplate, vertices: np.ndarray) -> np.ndarray:
@@ -69,8 +67,7 @@ INNER = 0.3
 """Confidence of joints inside the trunk, which differ from model to model by centimetres, over that of limbs."""
 _MHR, _MHR_JOINTS = "mhr70", 70
 _MOST_FRAMES, _FARTHEST = 100_000, 1e6
-_TURNED = (1.0, -1.0, -1.0)
-"""From the axes of a camera of OpenGL, y up and looking along -z, to those of OpenCV."""
+_TURNED = (1.0, -1.0, -1.0)  # from the axes of a camera of OpenGL, y up and looking along -z, to those of OpenCV
 Joints3D = dict[int, Tensor]
 """Frame number to (55, 4): place in the world of the cameras and confidence, 0 where a joint is not known."""
 

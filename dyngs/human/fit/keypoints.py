@@ -65,8 +65,7 @@ JOINTS = {
     name: row for row, name in enumerate(JOINT_NAMES) if name.removeprefix("left_").removeprefix("right_") in _SEEN
 }
 """Names of these joints, and their rows in ``JOINT_NAMES``."""
-_FARTHEST = 1e6
-"""Key points further away, px, are taken for mistakes."""
+_FARTHEST = 1e6  # key points further away, px, are taken for mistakes
 _ORDERS = {17: COCO, 133: COCO, 25: BODY_25, 18: COCO_18}
 """Number of key points of a format to the names of the first ones, as published."""
 Keypoints = dict[str, Tensor]

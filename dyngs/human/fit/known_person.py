@@ -63,10 +63,8 @@ def shape_of(body: BodyTemplate, known: BodyFrames) -> torch.Tensor:
 LONGEST_SIDE = 320
 """Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
 size, since its edges are those of its images."""
-CHECKED = 3
-"""Moments, at most, at which a view is left out to see what the fit is worth."""
-_FEWEST_VIEWS = 3
-"""Of a moment, so that one of them can be left out."""
+CHECKED = 3  # moments, at most, at which a view is left out to see what the fit is worth
+_FEWEST_VIEWS = 3  # of a moment, so that one of them can be left out
 
 
 @dataclass(frozen=True)

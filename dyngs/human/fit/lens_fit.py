@@ -10,10 +10,8 @@ import torch
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit.solve import Fitting, Observations, frame_error, with_lens
 
-EVERY = 4
-"""Each so many-th frame is left out: of those only poses are fitted."""
-GAIN = 0.01
-"""Share by which the error on frames left out must fall for a refined focal length to be taken."""
+EVERY = 4  # each so many-th frame is left out: of those only poses are fitted
+GAIN = 0.01  # fraction by which the error on frames left out must fall for a refined focal length to be taken
 
 
 @dataclass(frozen=True)

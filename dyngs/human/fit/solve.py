@@ -25,12 +25,9 @@ from dyngs.human.template.joints import JOINT_NAMES
 
 NUM_TURNED = 22
 """Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
-_GIVEN = 0.05
-"""Expected error of given poses, rad."""
-_LIMIT = 3.0
-"""Standard deviations of usual poses beyond which joints would be dislocated."""
-_LEAST = 8.0
-"""Least spread, degrees: a few clips do not show how far a joint can go."""
+_GIVEN = 0.05  # expected error of given poses, rad
+_LIMIT = 3.0  # standard deviations of usual poses beyond which joints would be dislocated
+_LEAST = 8.0  # least spread, degrees: a few clips do not show how far a joint can go
 _DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "hip": ((-11, 1, -6), (23, 14, 7)),
     "knee": ((26, 0, 1), (22, 1, 0)),
@@ -96,15 +93,13 @@ LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e
 }
 """Learning rates at the first step; those of positions per metre of the person's unit."""
 LR_DECAY = 0.1
-BETAS_WEIGHT = BONES_WEIGHT = 1e-3
-"""Of the mean squared shape parameter, whose unit is the spread among adults."""
+BETAS_WEIGHT = BONES_WEIGHT = 1e-3  # of the mean squared shape parameter, whose unit is the spread among adults
 TURN, STEP = 0.25, 0.1
 """Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the next."""
 TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
 """Of their mean squares. What silhouettes do not show, such as a limb turned about itself, follows the noise of Adam's
 steps where these are much smaller: renders of new poses then lose 1 to 3 dB, while the silhouettes look as good."""
-LIMIT_WEIGHT = 2e-2
-"""Of the mean square of what lies beyond the limit of a joint, in standard deviations."""
+LIMIT_WEIGHT = 2e-2  # of the mean square of what lies beyond the limit of a joint, in standard deviations
 KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
 """Expected error of a key point, as a fraction of the square's side, and the weight of their robust mean."""
 PLACE, PLACE_WEIGHT = 0.03, 0.1
@@ -113,10 +108,8 @@ FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
 """Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
-FRAMES = 3
-"""Frames drawn in each step."""
-Observations = Callable[[int], ObservedFrame | None]
-"""Returns what is seen in a row of the clip."""
+FRAMES = 3  # frames drawn in each step
+Observations = Callable[[int], ObservedFrame | None]  # returns what is seen in a row of the clip
 
 
 def new_fit(clip: MotionClip, surface: Surface) -> Parameters:

@@ -28,10 +28,8 @@ from dyngs.human.fit.solve import (
 from dyngs.human.motion.clip import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 
-NUM_HEADINGS = 8
-"""Directions that a person may face, all of which are tried in every anchor."""
-MOST_ANCHORS = 20
-"""Frames in which headings are tried."""
+NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor
+MOST_ANCHORS = 20  # frames in which headings are tried
 CHANGE_WEIGHT = 0.01
 """Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the square."""
 
@@ -84,14 +82,11 @@ OFF_COURSE = math.radians(30)
 """Rotation of the root away from the path of headings from which a frame is begun on that path instead."""
 ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
 """Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent forward."""
-_WITHOUT_PATH = 2
-"""Headings of the first frame from which clips without key points are followed without the path, too."""
+_WITHOUT_PATH = 2  # headings of the first frame from which clips without key points are followed without the path, too
 MOMENTUM = 0.8
 """Fraction of the last rotation that is expected again, so that legs which pass each other are not exchanged."""
-STATURE = 1.70
-"""Height of a person in a usual pose, m, where a single camera leaves it open."""
-PELVIS_FRACTION = 0.53
-"""Height of the pelvis, of that of the person."""
+STATURE = 1.70  # height of a person in a usual pose, m, where a single camera leaves it open
+PELVIS_FRACTION = 0.53  # height of the pelvis, of that of the person
 
 
 def first_poses(

@@ -27,8 +27,7 @@ _NAMED = ("global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose", "l
 """Keys of the same 165 numbers as the package smplx names its arguments."""
 _NAMED_WIDTHS = (3, 63, 3, 3, 3, 45, 45)
 _RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate")
-_ANY_AXES = "any axes"
-"""Marks arrays of a file with the names of smplx: nobody says which way is up."""
+_ANY_AXES = "any axes"  # marks arrays of a file with the names of smplx: nobody says which way is up
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 

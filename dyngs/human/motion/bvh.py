@@ -21,8 +21,7 @@ from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_fram
 _END_SITE = -1
 _MOST_JOINTS = 4096
 _LONGEST_NAME = 200
-_CHARACTERS = 1 << 16
-"""Characters of MOTION that are parsed at once."""
+_CHARACTERS = 1 << 16  # characters of MOTION that are parsed at once
 _GAP = re.compile(r"\s")
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
 

@@ -22,10 +22,8 @@ from dyngs.state import fields_moved_to
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
 """Limit on joints (at least 55) times frames of a motion: 90,909 frames, or 50 minutes at 30 frames per second."""
-_RATES = (1e-3, 1e5)
-"""Frames per second that a file may have."""
-_CHUNK = 1024
-"""Frames per block, so that temporary memory does not grow with the length of a motion."""
+_RATES = (1e-3, 1e5)  # frames per second that a file may have
+_CHUNK = 1024  # frames per block, so that temporary memory does not grow with the length of a motion
 
 
 @dataclass(frozen=True)

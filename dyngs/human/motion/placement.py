@@ -14,8 +14,7 @@ from dyngs.human.motion.motion import Motion, frame_chunks
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 
-_ALONG_AXIS = 0.87
-"""Cosine of 30 degrees: how near to the up direction a world axis must be to replace it."""
+_ALONG_AXIS = 0.87  # cosine of 30 degrees: how near to the up direction a world axis must be to replace it
 
 
 def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> MotionClip:

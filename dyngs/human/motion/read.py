@@ -15,8 +15,7 @@ from dyngs.human.template.body_reader import default_template
 
 _KINDS = {".npz": "an AMASS or SMPL-X .npz", ".bvh": "a .bvh", ".glb": "a .glb", ".gltf": "a .gltf", ".vrma": "a .vrma"}
 """Names of the formats by suffix."""
-_GLTF_FPS = 30.0
-"""Frames per second at which glTF's curves are sampled unless another rate is requested."""
+_GLTF_FPS = 30.0  # frames per second at which glTF's curves are sampled unless another rate is requested
 
 
 def read_motion(

@@ -181,8 +181,7 @@ _FOLLOWS = {f"{finger}{i}": f"{finger}{i - 1}" if i > 1 else "wrist" for finger 
     "wrist": "elbow",
 }
 """The joint whose alignment a joint of a limb takes if the end of its own bone is unknown."""
-_SNAP_COS = np.cos(np.radians(15.0))
-"""How near to an axis the left direction of a rest pose must be to be that axis."""
+_SNAP_COS = np.cos(np.radians(15.0))  # how near to an axis the left direction of a rest pose must be to be that axis
 
 
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:

@@ -34,10 +34,8 @@ from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 
-_RADIUS = 3.5
-"""Radius of the ring of cameras, m."""
-_TARGET = np.array([0.0, 0.95, 0.0])
-"""The point that all cameras look at, m."""
+_RADIUS = 3.5  # radius of the ring of cameras, m
+_TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
 
 
 @dataclass(frozen=True)

@@ -146,14 +146,11 @@ def _blend_shape_offsets(directions: Tensor, parameters: Tensor) -> Tensor:
 
 BONE_UNIT = 0.015
 """Change of a bone vector by one unit of a direction, m: about the spread among adults of the same height."""
-SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
-"""Joints that exist on both sides."""
-MIDDLE = ("spine1", "spine2", "spine3", "neck", "head")
-"""Joints in the plane of symmetry."""
+SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")  # joints that exist on both sides
+MIDDLE = ("spine1", "spine2", "spine3", "neck", "head")  # joints in the plane of symmetry
 NUM_BONE_SHAPES = 3 * len(SIDED) + 2 * len(MIDDLE)
 """B: a bone vector has three coordinates, in the plane of symmetry two."""
-_NEAREST = 0.02
-"""Distance added to all distances when a vertex lies between several joints, m."""
+_NEAREST = 0.02  # distance added to all distances when a vertex lies between several joints, m
 
 
 def bone_shapes(

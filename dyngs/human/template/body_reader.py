@@ -115,12 +115,10 @@ _TEMPLATE = ("v_template", "f", "weights_idx", "weights_val", "kintree_table", "
 _UV = ("vt", "ft")
 _TEMPLATE_SHAPES = ("shapedirs", "J_shapedirs")
 _NAMES = {24: "smpl", 52: "smplh", 55: "smplx"}
-_NO_PARENT = 2**32 - 1
-"""-1 as an unsigned 32-bit number: the parent of the root in SMPL files."""
+_NO_PARENT = 2**32 - 1  # -1 as an unsigned 32-bit number: the parent of the root in SMPL files
 _MOST_VERTICES = 250_000
 """SMPL-X has 10,475. Four times as many triangles are allowed."""
-_LARGEST = 1e10
-"""A larger number in a body file, in whatever unit, means that the file is damaged."""
+_LARGEST = 1e10  # a larger number in a body file, in whatever unit, means that the file is damaged
 
 
 def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
