@@ -22,8 +22,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.storage.file import decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
-from dyngs.storage.quantize import step_below
-from dyngs.storage.tensors import drawable
+from dyngs.storage.tensors import drawable, step_below
 
 KEPT = 0.7
 """Fraction of the Gaussians that each trial keeps of those of the trial before."""

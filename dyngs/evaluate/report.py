@@ -18,20 +18,79 @@ from dyngs.data.read import read_capture
 from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.drawing import Drawing
-from dyngs.evaluate.own_poses import PoseRefinement, images_of_split, scores_from_own_poses
 from dyngs.evaluate.regions import REGION_METRICS, Regions
 from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene
-from dyngs.metrics import LpipsNet, MetricValue, load_lpips
+from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
+from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.metrics import Lpips, LpipsNet, MetricValue, load_lpips, psnr
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
+from dyngs.runs.cameras import found_corrections
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
+from dyngs.training.corrections.camera_fit import fitted_to_image
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """Scores from poses that were fitted to the tested images; None where that was not done."""
+
+    psnr: float | None = None  # from cameras, or of a person from body poses, fitted to the whole images
+    to_images: PoseScores | None = None  # of a person, all scores of these
+    # of a person, from poses fitted to the silhouettes alone; None without silhouettes
+    to_silhouettes: PoseScores | None = None
+
+
+def scores_from_own_poses(drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips) -> PoseRefinement:
+    """Return the scores of images from poses that were fitted to them; the scene stays as it is."""
+    avatar = avatar_of(drawing.scene)
+    if avatar is None:
+        return PoseRefinement(psnr_from_own_poses(drawing, images, size))
+    outlined = all(images[i].alpha is not None for i in range(len(images)))
+    whole = _person_scores(avatar, drawing, images, lpips, IMAGES)
+    outlines = _person_scores(avatar, drawing, images, lpips, SILHOUETTES) if outlined else None
+    return PoseRefinement(whole.psnr, whole, outlines)
+
+
+def _person_scores(
+    avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
+) -> PoseScores:
+    fitted = fitted_to_images(avatar, images, drawing.background, avatar.options, comparison)
+    each = (images[i] for i in range(len(images)))
+    views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
+    return PoseScores(**means_of(views), updates=fmean(fitted.updates), per_view=tuple(views))
+
+
+def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
+    """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in world units."""
+    scene, background = require_gaussians(drawing.scene, "what cameras are fitted to"), drawing.background
+    options = scene.options
+    scores: list[float] = []
+    for image in (images[i] for i in range(len(images))):
+        fitted = fitted_to_image(scene, image, background, size, options=options)
+        with torch.no_grad():
+            rendering = scene.render(fitted.cameras, image.time, options=options, background=background)
+        scores.append(psnr(rendering.rgb[0], image.composite(background), image.mask))
+    return fmean(scores)
+
+
+def images_of_split(capture: Capture, views: Sequence[View], run_dir: Path, run: LoadedRun) -> ImageLoader:
+    """Return the images of ``views``, a split of ``capture``, with the cameras that training found, if any.
+
+    Images that were not trained on have the lens that they share with others, and the pose of a camera that stands
+    still; all other poses are those of the capture.
+    """
+    images = ImageLoader(views, run.config.data)
+    found = found_corrections(run_dir, run, capture.splits["train"])
+    if found is not None:
+        images.corrected = lambda index, cameras: found.applied_to(images.views[index], cameras)
+    return images
 
 
 @dataclass(frozen=True)

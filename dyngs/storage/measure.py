@@ -30,8 +30,7 @@ from dyngs.storage.precision import (
     measured_precision,
     rounded,
 )
-from dyngs.storage.quantize import step_below
-from dyngs.storage.tensors import COARSENESS, completed, drawable
+from dyngs.storage.tensors import COARSENESS, completed, drawable, step_below
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""

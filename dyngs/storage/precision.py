@@ -15,15 +15,16 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
-from dyngs.storage.quantize import LIMIT, step_below
 from dyngs.storage.tensors import (
     COARSENESS,
+    LIMIT,
     MAX_COARSENESS,
     checked_coarseness,
     coding_of,
     completed,
     group_of,
     restored,
+    step_below,
 )
 
 GREY_LEVELS = 255.0

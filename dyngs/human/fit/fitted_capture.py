@@ -29,8 +29,7 @@ from dyngs.files.outputs import require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
-from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
-from dyngs.human.fit.clips import NewClip, fitted_clips, placed_clip
+from dyngs.human.fit.capture_fit import CaptureFit, Known, NewClip, fit_capture, fitted_clips, placed_clip
 from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, read_person, with_lens
 from dyngs.human.fit.joints3d import read_joints
 from dyngs.human.fit.keypoints import read_keypoints

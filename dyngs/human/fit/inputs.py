@@ -14,7 +14,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.lens_fit import LensFit
+from dyngs.human.fit.solve import LensFit
 
 _LOOKED_AT, _PRESENT = 128, 0.2
 """Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""

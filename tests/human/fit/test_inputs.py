@@ -10,7 +10,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 from dyngs.human.fit.inputs import FitInputs, has_guessed_lens, read_person, with_lens
-from dyngs.human.fit.lens_fit import LensFit
+from dyngs.human.fit.solve import LensFit
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 
