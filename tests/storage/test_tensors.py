@@ -64,7 +64,8 @@ from dyngs.storage.tensors import (
 
 def test_names_decide() -> None:
     x = torch.ones(100, 3)
-    steps: dict[str, float] = dict.fromkeys(("gaussians.means", "gaussians.sh_rest", "model.field.learned.weight"), 0.01)
+    groups = ("gaussians.means", "gaussians.sh_rest", "model.field.learned.weight")
+    steps: dict[str, float] = dict.fromkeys(groups, 0.01)
     assert coding_of("gaussians.means", x, steps).kind is Kind.GRID
     assert coding_of("gaussians.sh_rest", x, steps).kind is Kind.SPARSE
     assert coding_of("model.field.learned.weight12", x, steps).kind is Kind.GRID

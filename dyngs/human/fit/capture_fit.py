@@ -30,7 +30,6 @@ from dyngs.human.fit.solve import (
     new_fit,
     usual,
 )
-from dyngs.human.fit.solve import num_ticks as num_lens_ticks
 from dyngs.human.fit.start import first_poses, num_ticks
 from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
@@ -74,9 +73,6 @@ class Known:
         """Names of what is learned for all frames; one camera does not tell a small person from a distant one."""
         fixed = ("log_scale",) * self.guessed_lens + ("betas",) * self.shape
         return tuple(name for name in SHAPE if name not in fixed)
-
-
-NOTHING_KNOWN = Known()
 
 
 @dataclass(frozen=True)
@@ -130,7 +126,7 @@ def fit_capture(
     report: ReportProgress,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
-    known: Known = NOTHING_KNOWN,
+    known: Known = Known(),
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
@@ -150,9 +146,8 @@ def fit_capture(
     )
     seen, surface = look_at(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
     joints = known.joints
-    seen = (
-        seen if joints is None else seen.with_positions({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
-    )
+    if joints is not None:
+        seen = seen.with_positions({row: joints[frame] for frame, row in motion.rows.items() if frame in joints})
     if given:
         fitting = Fitting(motion.clip, surface, near_given(motion.clip))
         tried = _from_given(fitting, seen, known.learned, report, effort)
@@ -165,7 +160,7 @@ def fit_capture(
     lens = None
     if known.guessed_lens:
         fitting, steps = replace(fitting, expected=usual(motion.clip)), effort.steps_for(motion.clip)
-        tick = ticker("focal length", report, num_lens_ticks(steps))
+        tick = ticker("focal length", report, 5 * steps)
         refined, lens = fit_lens(fitting, tried[-1].learned, known.learned, seen.used.__getitem__, steps, tick)
         if lens.taken:
             tried = (*tried, measured("the focal length refined", refined, fitting, seen))
@@ -300,24 +295,17 @@ def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> Tr
     """Return the candidate with its IoU in the frames that judge."""
     found = []
     for row, frame in seen.judged.items():
+        found.append(torch.zeros(0, device="cpu"))
         if frame is not None:
             drawn = drawn_frame(learned, fitting.clip, fitting.surface, row, frame.cameras)
-            found.append(_iou(drawn, frame))
-        else:
-            found.append(torch.zeros(0, device="cpu"))
+            ours, theirs, known = drawn > 0.5, frame.alpha > 0.5, frame.known > 0
+            both, either = (ours & theirs & known), ((ours | theirs) & known)
+            found[-1] = both.sum((1, 2)) / either.sum((1, 2)).clamp_min(1)
     per_frame = tuple(float(x.mean()) if len(x) else float("nan") for x in found)
     return TriedFit(name, learned, float(torch.cat(found).mean()), per_frame)
 
 
-def _iou(drawn: Tensor, seen: ObservedFrame) -> Tensor:
-    """Return the IoU (V,) of coverages above a half, where images are known."""
-    known = seen.known > 0
-    ours, theirs = (drawn > 0.5) & known, (seen.alpha > 0.5) & known
-    return (ours & theirs).sum((1, 2)) / (ours | theirs).sum((1, 2)).clamp_min(1)
-
-
 _CLEARLY = 0.001  # gain of IoU for which the clip is moved
-_EFFORT = FitEffort()
 
 
 @dataclass(frozen=True)
@@ -342,7 +330,7 @@ def placed_clip(
     body: BodyTemplate,
     found: CaptureFit,
     report: ReportProgress,
-    effort: FitEffort = _EFFORT,
+    effort: FitEffort = FitEffort(),
 ) -> NewClip | None:
     """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without such a clip.
 
@@ -352,16 +340,15 @@ def placed_clip(
     if not views or capture.body is None:
         return None
     motion = captured_motion(capture.root, capture.body["pose"], views, body.joints)
-    surface, seen = (
-        surface_of(body, RESOLUTION),
-        look_at(capture.replace(splits={"train": views}), motion, options, effort, {}),
-    )
+    surface = surface_of(body, RESOLUTION)
+    seen = look_at(capture.replace(splits={"train": views}), motion, options, effort, {})
     start = new_fit(motion.clip, surface)
     with torch.no_grad():
         for name, value in found.chosen.learned.values().items():
             if name not in ("poses", "trans"):
                 start[name].copy_(value)
-    name, tick = "place of new poses", ticker("place of new poses", report, effort.steps)
+    name = "place of new poses"
+    tick = ticker(name, report, effort.steps)
     fitting = Fitting(motion.clip, surface, near_given(motion.clip))
     moved = fitting.run(start, ("shift",), effort.steps, seen.used.__getitem__, tick)
     before, after = (measured(name, x, fitting, seen) for x in (start, moved))

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.capture.background import with_background_masks
+from dyngs.capture.fixed_camera import FORMAT, is_plain_clip, read_fixed_camera, silhouettes_of, zoomed
 from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
@@ -22,7 +24,7 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import read_capture
+from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted, reading
 from dyngs.files.outputs import require_new_folder
@@ -30,15 +32,90 @@ from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, NewClip, fit_capture, fitted_clips, placed_clip
-from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, read_person, with_lens
 from dyngs.human.fit.joints3d import read_joints
 from dyngs.human.fit.keypoints import read_keypoints
-from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.fit.known_person import AvatarPoses, KnownAvatar, known_shape, posed_by_avatar, shape_of, with_shape
 from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
+from dyngs.human.fit.solve import LensFit
 from dyngs.human.motion.clip import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
+
+_LOOKED_AT, _PRESENT = 128, 0.2
+"""Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""
+
+
+@dataclass(frozen=True)
+class FitInputs:
+    """What is given beside the capture; everything may be None."""
+
+    keypoints: Path | None = None  # folder or file of 2D key points
+    masks: Path | None = None  # folder of masks, white = the person
+    background: Path | None = None  # image of the place without the person, or a folder of one for each camera
+    joints: Path | None = None  # file or folder of 3D joints or posed vertices, see ``read_joints``
+    body: Path | None = None  # body file whose vertices these are; None: the free template
+    person: Path | None = None  # capture or run of the same person, whose shape is kept
+    # of the same person, if that run has one: its silhouette decides the poses in the end
+    avatar: KnownAvatar | None = None
+
+
+def has_guessed_lens(capture: Capture) -> bool:
+    """Whether the camera of a capture was guessed."""
+    return capture.format == FORMAT
+
+
+def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = print) -> Capture:
+    """Return a capture of a person with silhouettes.
+
+    ``root`` of the options is a capture, or a video or a folder of images of one fixed camera. Masks of ``given`` take
+    the place of those of the capture; without any the person is told from the background. Masks that are made are
+    written to the folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and none that can be made.
+    """
+    source = options.root
+    if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
+        capture = read_fixed_camera(options, given.masks)
+        for line in capture.warnings:
+            say(line)
+    else:
+        capture = read_capture(options)
+        if given.masks is not None:
+            splits: dict[Split, tuple[View, ...]] = {}
+            for split, views in capture.splits.items():
+                found = silhouettes_of(given.masks, [f"{view.name}{view.image_path.suffix}" for view in views])
+                splits[split] = tuple(replace(view, silhouette=own) for view, own in zip(views, found, strict=True))
+            capture = capture.replace(splits=splits, has_alpha=True)
+    if given.background is not None or not capture.has_alpha:
+        if capture.format == "neuman":
+            raise DyngsError(f"{source}: no silhouettes, and the camera moves; add masks of the person")
+        capture = with_background_masks(capture, work, given.background, say)
+    return _without_empty_frames(capture, options, say) if has_guessed_lens(capture) else capture
+
+
+def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
+    """Return the capture with the focal length that was found."""
+    if lens is None or not lens.taken:
+        return capture
+    splits = {
+        name: tuple(zoomed(view, lens.factor, lens.distance) for view in views)
+        for name, views in capture.splits.items()
+    }
+    return capture.replace(splits=splits)
+
+
+def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[str], None]) -> Capture:
+    views = capture.splits["train"]
+    small = ImageLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
+    areas = [0.0 if (alpha := small[i].alpha) is None else float(alpha.mean()) for i in range(len(views))]
+    usual = sorted(areas)[len(areas) * 3 // 4]
+    kept = tuple(view for view, area in zip(views, areas, strict=True) if area > _PRESENT * usual)
+    if not kept:
+        raise DyngsError(f"{capture.root}: nobody is seen in the masks; white is the person")
+    if len(kept) < len(views):
+        gone = [view.name for view in views if view not in kept]
+        say(f"{len(gone)} frames in which hardly anybody is seen are left out, first {gone[0]}")
+    return capture.replace(splits={"train": kept})
+
 
 FRAME_RATE = 30.0  # frames per second of a clip whose capture does not say
 
@@ -77,7 +154,8 @@ def write_split(
     for view, image in shown:
         row = rows[-1 if view.frame is None else view.frame]
         name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
-        write_image(out / name, _straight(image))
+        parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
+        write_image(out / name, straight_uint8(torch.cat(parts, dim=-1)).numpy())
         camera = image.cameras
         intrinsics = camera.intrinsics[0].double().numpy()
         pose = opengl_from_cam(view.cam_from_world).copy()
@@ -87,11 +165,6 @@ def write_split(
         entry |= {"w": camera.width, "h": camera.height, "fl_x": intrinsics[0, 0], "fl_y": intrinsics[1, 1]}
         frames.append(entry | {"cx": intrinsics[0, 2], "cy": intrinsics[1, 2], "transform_matrix": pose.tolist()})
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
-
-
-def _straight(image: Image) -> np.ndarray:
-    parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
-    return straight_uint8(torch.cat(parts, dim=-1)).numpy()
 
 
 GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)  # colours of the outlines: red and green
@@ -108,7 +181,9 @@ def overlay(
     sheet = image.composite(torch.ones_like(image.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
     for betas, pose, colour in bodies:
         discs = surface.in_pose(betas, torch.zeros_like(surface.weights[:, 0]), pose)
-        sheet[_outline(drawn_silhouettes(discs, image.cameras)[0] > 0.5)] = sheet.new_tensor(colour)
+        inside = drawn_silhouettes(discs, image.cameras)[0] > 0.5
+        grown = torch.nn.functional.max_pool2d((~inside).float()[None, None], 3, 1, 1)[0, 0] > 0
+        sheet[inside & grown] = sheet.new_tensor(colour)
     return sheet.cpu().numpy()
 
 
@@ -121,12 +196,6 @@ def side_by_side(sheets: Sequence[np.ndarray], columns: int) -> np.ndarray:
         top, left = i // columns * height, i % columns * width
         whole[top : top + sheet.shape[0], left : left + sheet.shape[1]] = sheet
     return whole
-
-
-def _outline(inside: Tensor) -> Tensor:
-    """Return the pixels (H, W) inside whose neighbour is outside."""
-    grown = torch.nn.functional.max_pool2d((~inside).float()[None, None], 3, 1, 1)[0, 0] > 0
-    return inside & grown
 
 
 REPORT_NAME, OVERLAYS_NAME = "fit_report.json", "fit_overlays.png"
@@ -161,7 +230,7 @@ class FittedCapture:
 
 
 def write_fitted_capture(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE, *, with_images: bool = True
+    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = FitInputs(), *, with_images: bool = True
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
@@ -194,9 +263,12 @@ def write_fitted_capture(
             by_avatar = {x: posed_by_avatar(given.avatar, capture.splits[x], options, clips[x]) for x in clips}
         clips |= {split: found_by.clip for split, found_by in by_avatar.items()}
         if with_images:
-            _write_images(folder, capture, options, clips)
-            for split, clip in clips.items():
-                clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
+            full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
+            for split, views in ((split, views) for split, views in capture.splits.items() if views):
+                images, rows = ImageLoader(views, full), clips.get(split, clips["train"]).rows
+                shown = ((view, images[i]) for i, view in enumerate(views))
+                write_split(folder, split, shown, rows, capture.world_offset)
+            clips = {split: replace(clip, frames=tuple(range(len(clip.frames)))) for split, clip in clips.items()}
         for split, clip in clips.items():
             write_body(folder / f"body_{split}.npz", clip, found.fit.betas.numpy(), capture.world_offset, capture.fps)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
@@ -208,15 +280,6 @@ def write_fitted_capture(
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return FittedCapture(out, found, new_poses, tuple(by_avatar.values()))
-
-
-def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, CapturedMotion]) -> None:
-    full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
-    for split, views in capture.splits.items():
-        if views:
-            images, found = ImageLoader(views, full), clips["pose" if split == "pose" else "train"]
-            shown = ((view, images[i]) for i, view in enumerate(views))
-            write_split(out, split, shown, found.rows, capture.world_offset)
 
 
 def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:

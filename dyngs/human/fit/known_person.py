@@ -19,7 +19,6 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted, reading
 from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.inputs import KnownAvatar
 from dyngs.human.motion.clip import CapturedMotion, MotionClip
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import rest_shape
@@ -65,6 +64,14 @@ LONGEST_SIDE = 320
 size, since its edges are those of its images."""
 CHECKED = 3  # moments, at most, at which a view is left out to see what the fit is worth
 _FEWEST_VIEWS = 3  # of a moment, so that one of them can be left out
+
+
+@dataclass(frozen=True)
+class KnownAvatar:
+    """The avatar of a person, and the longest side of the images it was trained on, px; None: as they are."""
+
+    scene: HumanScene
+    longest_side: int | None
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
     """
     joints = surface.body.joints
     zeros = {
-        "log_scale": joints.new_zeros(()).reshape(1),
+        "log_scale": joints.new_zeros(1),
         "betas": joints.new_zeros(surface.shape_dirs.shape[-1]),
         "turns": joints.new_zeros(NUM_TURNED, 3),
         "poses": joints.new_zeros(len(clip), NUM_TURNED, 3),
@@ -349,11 +349,6 @@ class LensFit:
             f"focal length: {self.factor:.2f} times the guess, error on frames left out {guessed:.4f} -> {refined:.4f}"
             + (", taken" if self.taken else ": the guess stays, as the images do not tell")
         )
-
-
-def num_ticks(steps: int) -> int:
-    """Return how often ``fit_lens`` calls ``tick`` where a stage has so many steps."""
-    return 5 * steps
 
 
 def fit_lens(
