@@ -264,7 +264,9 @@ def write_fitted_capture(
         clips |= {split: found_by.clip for split, found_by in by_avatar.items()}
         if with_images:
             full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
-            for split, views in ((split, views) for split, views in capture.splits.items() if views):
+            for split, views in capture.splits.items():
+                if not views:
+                    continue
                 images, rows = ImageLoader(views, full), clips.get(split, clips["train"]).rows
                 shown = ((view, images[i]) for i, view in enumerate(views))
                 write_split(folder, split, shown, rows, capture.world_offset)
