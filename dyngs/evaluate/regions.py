@@ -32,13 +32,11 @@ TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
 
 
 class Regions:
-    """The regions of the images of one split.
+    """The regions of the images of one split; ``loader`` holds those of ``views``, ``background`` (3,) is behind them.
 
     The foreground is where the true image is not fully transparent. What moves is known, in this order, from motion
-    masks that the views come with, and from the truth's change over time before cameras that stand still: where it
-    differs by ``CHANGE`` from the camera's median over time, less single pixels. What is left does not move. Where
-    there is a foreground, both are parts of it, so that an empty background counts nowhere. ``loader``: images of
-    ``views``, in their order. ``background``: (3,) colour behind the truth.
+    masks, and before cameras that stand still from pixels that differ by ``CHANGE`` from their median over time. What
+    is left does not move. Where there is a foreground, both are parts of it.
     """
 
     def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:

@@ -169,11 +169,9 @@ def evaluate_run(
 ) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
-    ``run_dir``: folder of a run with at least one checkpoint. ``threads``: for rendering and metrics; 0 leaves the
-    number as it is. ``refine_poses``: also score from poses, of a person's body, otherwise of the cameras, that were
-    refined on the images themselves; always done for a run that refined its cameras. ``device``: "auto", "cpu" or
-    "cuda": draws the views, and compares images, but for FLIP. ``data_root``: where the capture lies by now, if it was
-    moved. ``capture``: of the run, if it was read already.
+    ``threads``: 0 leaves their number as it is. ``refine_poses``: also score from poses of a person, else of the
+    cameras, that were fitted to the images themselves; always done for a run that refined its cameras. ``data_root``:
+    where the capture lies by now. ``capture``: of the run, if it was read already.
     """
     draws_on = device_for(device)
     _require_possible(run_dir, split, refine_poses)

@@ -62,10 +62,9 @@ def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeSco
 def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
     """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one camera, without truth.
 
-    Smooth motion has little of it, flickering much. Where moments are not evenly spaced, R_k is compared with the
-    straight line between its neighbours: 2 |w R_{k-1} + (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} -
-    t_{k-1}), which is the same for even ones. Of more than 60 moments, 20 triples of neighbours are taken, evenly
-    spaced. A scene in which nothing moves has 0.
+    Where moments are not evenly spaced, R_k is compared with the straight line between its neighbours: 2 |w R_{k-1} +
+    (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 moments, 20 triples of
+    neighbours are taken, evenly spaced. A scene in which nothing moves has 0.
     """
     if drawing.scene.is_static:
         return MetricValue(0.0)

@@ -44,12 +44,11 @@ def track_scores(
     split: Sequence[tuple[View, Cameras]],
     views: Sequence[View],
 ) -> TrackScores:
-    """Return the errors of a scene's motion in the images of a split.
+    """Return the errors of a scene's motion in the images of a split, of which each view has its camera.
 
-    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any
-    view shows it; from there their mean displacement carries it. Distances are at most the diagonal of the image.
-    ``tracks``: of its capture, in the same world; None without any. ``split``: views that are measured, each with its
-    camera at the size of the evaluated image.
+    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any of
+    ``views``, of all splits, shows it; from there their mean displacement carries it. Distances are at most the
+    diagonal of the image.
     """
     if tracks is None:
         return TrackScores(reason=NO_TRACKS)

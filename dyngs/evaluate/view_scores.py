@@ -1,11 +1,7 @@
-"""Scores of single views, and their means.
+"""Scores of single views, and their means: the render against the truth, and how long it took to draw.
 
-Everything is measured on one view at a time: the render against the truth, and how long it took to draw.
-
-Most of an image of a person is background, which costs nothing to get right: on black, as published figures have it,
-the same render scores many dB more than inside the person's box. Where training images differ in exposure and white
-balance, so do test images: the published protocol (Martin-Brualla et al. 2021) fits what is particular to a test image
-on its left half, and scores the right half.
+Of people also inside their box, and on black, as published figures have it. Where training images differ in exposure,
+so do test images: the published protocol (Martin-Brualla et al. 2021) fits the left half, and scores the right half.
 """
 
 from __future__ import annotations
@@ -35,9 +31,8 @@ from dyngs.ops.device import finish
 class ViewScore:
     """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
 
-    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. Of people, ``psnr_person``
-    and ``ssim_person`` are those inside the person's box, and ``psnr_black``, ``ssim_black`` and ``lpips_black`` those
-    of the whole image on black.
+    ``render_seconds`` holds ``deform_seconds``. Of people, ``psnr_person`` and ``ssim_person`` are inside the person's
+    box, ``psnr_black``, ``ssim_black`` and ``lpips_black`` of the full image on black.
     """
 
     name: str
@@ -88,9 +83,8 @@ def score_views(
 ) -> tuple[list[ViewScore], dict[str, str]]:
     """Return scores of the Gaussians against images, and the reasons for metrics that are None.
 
-    ``scene``: what to draw, at the time of each image; on the device of all else. ``images``: truth and camera of each
-    view, drawn one at a time. ``background``: (3,) colour behind both the truth and the render. ``lpips``: from
-    ``load_lpips``. ``regions``: of the split of the images; None: they are not measured.
+    The scene is drawn at the time of each image on ``background`` (3,); ``regions`` are of the split, None: not
+    measured.
     """
     scores: list[ViewScore] = []
     reasons: dict[str, str] = {}

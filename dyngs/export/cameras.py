@@ -21,11 +21,10 @@ _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 def write_cameras(path: Path, capture: Capture, splits: Mapping[Split, Sequence[View]]) -> Path:
-    """Write cameras in nerfstudio's layout, and the capture's points beside them; return ``path``.
+    """Write cameras of train, val and test in nerfstudio's layout, and the capture's points; return ``path``.
 
-    Images stay where they are: ``file_path`` is the way to them from the folder of ``path``. Poses are in the world of
-    the capture's files. Coefficients of distortion are those of the capture. ``splits``: views of train, val and test,
-    with the cameras to write. Raises DyngsError: the folder cannot be written.
+    ``file_path`` is the way to the images from the folder of ``path``. Poses are in the world of the capture's files;
+    coefficients of distortion are those of the capture.
     """
     for out in (path, path.with_name(POINTS_NAME)):
         inputs_of(capture).require_output(out)

@@ -69,9 +69,8 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
 def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
     """Return the view called ``name``, by default the first one.
 
-    ``name``: name of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0; names
-    take precedence over numbers. ``split``: "test", "val" or "train"; None looks for a name in all, for a number in the
-    first that has views. Raises DyngsError: no such view, or no such split.
+    ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0. ``split``:
+    None looks for a name in all, for a number in the first that has views. Raises DyngsError: no such view or split.
     """
     order = [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
     candidates = [split_views(capture, s) for s in order]

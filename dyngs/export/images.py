@@ -87,10 +87,8 @@ def write_path_images(
 ) -> list[Path]:
     """Render a scene along a path to ``frame_0000.png`` and so on, and to a video if requested; return the paths.
 
-    ``opened``: scene to render. Images of its capture are not overwritten. ``path``: F >= 1 cameras and times, in the
-    order of the video. ``out_dir``: folder for the images; None writes only the video. ``output``: depth, alpha, video.
-    Depth colours share one range over the full path. Raises DyngsError: no cameras, nothing to write, or a file cannot
-    be written.
+    ``out_dir``: None writes only the video. Images of the capture are not overwritten; depth colours share one range
+    over the full path. Raises DyngsError: no cameras, nothing to write, or a file cannot be written.
     """
     if len(path) == 0:
         raise DyngsError("the camera path has no cameras")
@@ -118,9 +116,8 @@ def write_split_images(
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
 
     The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that of
-    training, black if that was random. ``out_dir``: folder for the images, which are named after the views
-    (``file_stems``). ``output``: depth, alpha, video (views of one size only). Raises DyngsError: no such split,
-    unreadable images, a file cannot be written.
+    training, black if that was random. Raises DyngsError: no such split, unreadable images, or a video of several
+    sizes.
     """
     inputs = inputs_of(opened)
     inputs.require_output(out_dir)

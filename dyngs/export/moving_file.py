@@ -42,11 +42,9 @@ class MovingFile:
 def write_moving(
     opened: Opened, path: Path, times: Sequence[float], part: Part = "all", how: Writing = AS_THEY_ARE
 ) -> MovingFile:
-    """Write a run at T times as one .4dgs, each shown for 1/30 s.
+    """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s.
 
-    ``path``: output file; an old one is replaced when the new one is complete. ``times``: T >= 1 times in [0, 1].
-    ``part``: all Gaussians, or only the moving or static ones. Raises DyngsError: the package is missing, the part is
-    empty, or the file cannot be written.
+    Raises DyngsError: the package is missing, the part is empty, or the file cannot be written.
     """
     inputs_of(opened).require_output(path)
     model, delta = _packages(path)

@@ -43,14 +43,12 @@ def write_scene_file(
     field_step: float = 1.0,
     data_root: Path | None = None,
 ) -> SceneFile:
-    """The file in the folder ``out``, with the run's ``config.yaml`` beside it: together a run that can be drawn.
+    """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that can be drawn.
 
-    ``out``: a folder, made where it is missing; it may be the run's own, or hold a former export of that run.
-    ``max_change``: root mean square over all values of some training images, grey levels of 255. None: what lowers
-    their PSNR by ``LOSS_DB``, if it is independent of the model's own errors. ``field_step``: how many times as
-    coarsely as that the field is rounded. ``data_root``: where the capture lies by now, if it was moved. Raises
-    DyngsError: no such run, ``out`` holds another one, the images would change by more than ``max_change``, or the file
-    cannot be written. Nothing is written then.
+    ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean square over all values
+    of some training images, grey levels of 255; None: what lowers their PSNR by ``LOSS_DB``. ``field_step``: how many
+    times as coarsely the field is rounded. Raises DyngsError: no such run, ``out`` holds another one, or the images
+    would change by more than ``max_change``; nothing is written then.
     """
     config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)

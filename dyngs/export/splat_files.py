@@ -43,9 +43,8 @@ def writing_of(
 ) -> tuple[Writing, str]:
     """Return how a scene is written, and a line about which way is up in the file.
 
-    ``target``: axis that viewers of the format take for up. ``up``: axis that is requested instead; "keep": nothing is
-    turned. ``from_up``: axis that is up in the scene; None: found as ``up_of`` does. ``sh_degree``: degree of the
-    harmonics in the file. Raises DyngsError: no such axis.
+    ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep": nothing is turned.
+    ``from_up``: axis that is up in the scene; None: found as ``up_of`` does. Raises DyngsError: no such axis.
     """
     if up == "keep":
         return Writing(sh_degree=sh_degree), "axes are those of the capture"
@@ -74,12 +73,10 @@ def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
 def write_run_splats(
     opened: Opened, path: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
 ) -> Written:
-    """Write a run as a file of Gaussians; its suffix names the format.
+    """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
     A 3D filter is fused, and colours of a network become harmonics; the header, where the format has one, states the
-    render mode, and the time if something moves. ``path``: output file; an old one is replaced when the new one is
-    complete. ``time``: scene time in [0, 1]. ``part``: all Gaussians, or only the moving or static ones. Raises
-    DyngsError: the part is empty, an unknown suffix, or the file cannot be written.
+    render mode, and the time if something moves. Raises DyngsError: the part is empty, or an unknown suffix.
     """
     inputs_of(opened).require_output(path)
     return _write(opened, scene_part(opened.scene, part), path, time, how)
@@ -93,12 +90,11 @@ def write_run_sequence(
     how: Writing = AS_THEY_ARE,
     suffix: str = ".ply",
 ) -> list[Written]:
-    """Write a sequence ``frame_0000.ply`` and so on, one file per time, for players.
+    """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
 
-    All files are written into a hidden folder first and appear together, so that a failed export leaves no incomplete
-    sequence behind. ``folder``: output folder, created if missing. Files of an earlier sequence of the same length are
-    replaced. ``times``: T >= 1 times in [0, 1]. ``part``: as in ``write_run_splats``. ``suffix``: of the files, names
-    the format. Raises DyngsError: the part is empty, the folder holds other such files, or the files cannot be written.
+    All files are written into a hidden folder first and appear together; those of an earlier sequence of the same
+    length are replaced. Raises DyngsError: the part is empty, the folder holds other such files, or they cannot be
+    written.
     """
     scene = scene_part(opened.scene, part)
     names = frame_names(len(times), suffix)

@@ -32,11 +32,9 @@ class Tracks:
 def tracks_of(
     scene: Scene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
 ) -> Tracks:
-    """Return the tracks of a scene.
+    """Return the tracks of a scene, or with ``part`` "moving" of what moves, in coordinates of the capture.
 
-    ``times``: T >= 1 in [0, 1]. ``world_offset``: (3,); coordinates of the model plus offset are those of the capture.
-    ``part``: "all", or "moving" for only the moving ones. Raises DyngsError: nothing moves, or the positions would take
-    more than 4 GB.
+    Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
     """
     device = scene.gaussians.means.device
     moves = torch.zeros(len(scene), dtype=torch.bool, device=device)

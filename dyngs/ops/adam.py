@@ -61,16 +61,11 @@ def adam_step_(
 ) -> Tensor:
     """Update ``param`` and its two moments in place; return the number () int64 of rows skipped for a bad gradient.
 
-    The update of Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step``
-    also for rows that were skipped before. Rows skipped keep their value and moments unchanged. A gradient cannot be
-    used if it is NaN, infinite, or so large that its square is not safely finite (2^63 = 9.2e18 in float32, 2^511 in
-    float64): an infinite second moment would hold the value for ever. ``param``: (N, ...) contiguous parameter, seen as
-    N rows of C numbers; a vector (N,) has rows of one number. ``grad``: same shape; copied if not contiguous.
-    ``exp_avg``: same shape, contiguous: running mean of the gradient. ``exp_avg_sq``: same shape, contiguous: running
-    mean of its square. ``lr``: learning rate, or (C,) rates, one per column of a row, better on the CPU: they are
-    checked. ``step``: count of this step, 1 for the first. ``eps``: added to the root of the second moment. ``rows``:
-    (N,) bool, the rows to update; None = all. Rows left out by it are not counted. Raises DyngsError: shapes or dtypes
-    that do not fit, a parameter or moment that is not contiguous, ``step`` < 1, or constants out of range.
+    Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step`` (from 1) also for
+    rows skipped before. A gradient is bad if it is NaN, infinite, or so large that its square is not safely finite
+    (2^63 in float32, 2^511 in float64). ``param`` (N, ...) contiguous: N rows of C numbers; ``grad`` and the moments
+    have its shape, the moments contiguous; ``lr``: a rate, or (C,) rates, better on the CPU; ``rows`` (N,) bool: the
+    rows to update, None: all. Raises DyngsError: shapes or dtypes that do not fit, or constants out of range.
     """
     _check(param, grad, exp_avg, exp_avg_sq, rows, step)
     _check_constants(param.dtype, eps, betas)

@@ -47,11 +47,10 @@ harmonics_op = register("harmonics", _harmonics, gradient=Gradient(_save, _backw
 
 
 def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
-    """Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from the camera centres, zero where culled.
+    """Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from ``centers`` (V, 3), zero where culled.
 
-    Differentiable in means, centers and sh. ``means``: (N, 3) world. ``centers``: (V, 3) camera centres, world. ``sh``:
-    (N, K, 3) coefficients. ``radii``: (V, N, 2) int32; Gaussians with radius 0 are skipped. ``degree``: 0 to 4, at most
-    the degree of ``sh``.
+    Differentiable in means, centers and sh (N, K, 3); ``radii`` (V, N, 2) int32; ``degree`` 0 to 4, at most that of
+    ``sh``.
     """
     return harmonics_op(means, centers, sh, radii, degree)
 

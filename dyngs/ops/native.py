@@ -1,9 +1,7 @@
 """The compiled cores for this processor and for CUDA GPUs, the number of threads, and tensors passed to a core.
 
-There is one module per x86-64 level: all of them in a wheel, that of the compiling machine in an installation from
-source. The newest that the processor runs is imported; ``DYNGS_ISA=v2|v3|v4`` picks an older one, for tests. The module
-for CUDA GPUs is there if dyngs was built with it (docs/gpu.md), has the same functions, and is imported when the first
-tensor on a GPU comes.
+There is one module per x86-64 level; the newest that the processor runs is imported, ``DYNGS_ISA=v2|v3|v4`` picks an
+older one, for tests. That for CUDA GPUs (docs/gpu.md) is imported when the first tensor on a GPU comes.
 """
 
 from __future__ import annotations
@@ -123,10 +121,8 @@ def num_threads() -> int:
 class Fork:
     """Handling of the threads of OpenMP in a process made by ``os.fork``.
 
-    The child has the parent's list of waiting threads, but not the threads: the next parallel loop, of the kernels as
-    of torch, would wait for them without end. Where the parent had started any, the child therefore runs kernels and
-    torch's operators on one thread, as torch's own DataLoader workers do, and says so once; results are the same bytes.
-    An error instead would end programs that fork for other reasons than speed.
+    The child has the parent's list of waiting threads, but not the threads: the next parallel loop would wait without
+    end. Where the parent had started any, the child runs kernels and torch's operators on one thread, and says so once.
     """
 
     def __init__(self) -> None:

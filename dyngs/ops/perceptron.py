@@ -1,9 +1,7 @@
 """A small multilayer perceptron over many rows, fused.
 
-Per-Gaussian decoders of deformation fields have tens of thousands of rows but layers of only 10 to 256 features. A
-matrix product, a bias and a ReLU per layer each go through memory once per step and direction; the fused kernel runs
-all layers of a hundred rows while they are in the cache, on a GPU in shared memory. Its results do not depend on the
-number of threads.
+Each layer of a few features would go through memory once per step and direction; the kernel runs all layers of a
+hundred rows while they are in the cache, on a GPU in shared memory. Results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -88,13 +86,11 @@ weight and bias of each layer, flat; ``skip`` 0 means none."""
 
 
 def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable in all of them.
+    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable once in all of them.
 
-    Only first derivatives exist. A row with NaN gives an output row of NaN and leaves the other rows alone; gradients
-    by the layers are sums over all rows, so a NaN in one reaches them. ``x``: (M, K) inputs, any strides; M may be 0.
-    Half precision is computed in float32. ``layers``: first to last, at least one; each takes the width that the one
-    before gives. ``skip``: layer, from 1 on, whose input is the hidden activations followed by ``x``: its weight is
-    (out, width + K). As in NeRF (Mildenhall et al. 2020, figure 7), there for the layer after the fifth. Raises
+    A row with NaN gives an output row of NaN; gradients by the layers are sums over all rows, so a NaN in one reaches
+    them. ``x`` (M, K), any strides; half precision is computed in float32. ``skip``: layer, from 1 on, whose input is
+    the hidden activations followed by ``x``: its weight is (out, width + K) (Mildenhall et al. 2020, figure 7). Raises
     DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
     """
     widths = _checked_widths(x, layers, skip)

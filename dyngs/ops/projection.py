@@ -135,10 +135,9 @@ def project(
 ) -> Projection:
     """Return the splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023).
 
-    Differentiable in means, quats, scales and cameras: poses, focal lengths and principal points. ``means``: (N, 3)
-    world. ``quats``: (N, 4) wxyz, any norm; zero means identity. ``scales``: (N, 3) standard deviations, world units.
-    ``opacities``: (N,) in [0, 1]; they only set the extents. ``options``: see ``ProjectionOptions``. Raises DyngsError:
-    an image with sides above 2^23 px, or more splats than memory holds.
+    Differentiable in means, quats, scales and cameras. ``quats`` (N, 4) wxyz, any norm; zero means identity; ``scales``
+    (N, 3) standard deviations; ``opacities`` (N,) in [0, 1] only set the extents. Raises DyngsError: an image with
+    sides above 2^23 px, or more splats than memory holds.
     """
     check_size(cameras.width, cameras.height)  # before torch, which takes no integers from 2^63 on
     limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]

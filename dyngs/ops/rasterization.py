@@ -274,13 +274,11 @@ def rasterize(
 ) -> Blended:
     """Return the splats blended front to back into V images of D channels.
 
-    Differentiable in means2d, factors, opacities, colors and background. ``projection``: splats, see ``project``.
-    ``opacities``: (V, N) in [0, 1], compensated already if wanted. ``colors``: (V, N, D), D up to 40. ``background``:
-    (V, D) or None for black. ``probe``: (V, N, 4) zeros; its gradient is the signed gradient of the 2D means in px,
-    then (with ``absgrad``) the sum over pixels of its absolute values. ``entries``: what ``bin_tiles`` returned for the
-    same splats, size and options, to save doing it again. Raises DyngsError: too many channels, sides above 2^23 px,
-    more (Gaussian, tile) pairs than ``options.max_entries`` or than memory holds, an image larger than memory, or
-    ``entries`` of another shape or with indices out of range.
+    Differentiable in means2d, factors, opacities, colors and background. ``opacities`` (V, N), compensated already if
+    wanted; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None: black; ``probe`` (V, N, 4) zeros, whose
+    gradient is that of the 2D means in px, then (with ``absgrad``) the sum over pixels of its absolute values;
+    ``entries``: what ``bin_tiles`` returned for the same. Raises DyngsError: too many channels, sides above 2^23 px,
+    more (Gaussian, tile) pairs than ``options.max_entries`` or than memory holds, or ``entries`` that do not fit.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
         raise DyngsError(f"colors have {colors.shape[-1]} channels; 1 to {MAX_CHANNELS} can be blended in one call")

@@ -1,12 +1,9 @@
 """Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
 
-One call of ``register`` holds all that an op is: its implementation, whose type hints are the schema, and the formula
-of its gradient. An implementation allocates its results and has them filled by ``launch``, which does nothing where
-only shapes are needed (``torch.compile``). Callers never ask where a tensor lies; the dispatcher picks the
-implementation. The compiled cores for CPU and CUDA have the same functions, so that one implementation serves both. A
-back end for another device adds its implementations with ``implement`` and changes nothing here.
-
-``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
+``register`` takes an implementation, whose type hints are the schema, and the formula of its gradient. An
+implementation allocates its results and has them filled by ``launch``, which does nothing where only shapes are needed
+(``torch.compile``). The compiled cores for CPU and CUDA have the same functions, so that one implementation serves
+both. ``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -54,12 +51,11 @@ def register(
     mutates: tuple[str, ...] = (),
     gradient: Gradient | None = None,
 ) -> Callable[P, R]:
-    """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments.
+    """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments; elsewhere it raises DyngsError.
 
-    On a device without an implementation it raises ``DyngsError``, which names the device. ``kernel``: the
-    implementation; its type hints give the schema. No result may share memory with an input. ``devices``: for whose
-    tensors ``kernel`` is; CUDA counts only where its core was built. ``mutates``: arguments that ``kernel`` writes to.
-    ``gradient``: None: not differentiable.
+    ``kernel``: the implementation, whose type hints give the schema; no result may share memory with an input.
+    ``devices``: for whose tensors it is; CUDA counts only where its core was built. ``mutates``: arguments that it
+    writes to.
     """
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
     qualified = f"{NAMESPACE}::{name}"

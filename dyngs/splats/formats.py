@@ -94,10 +94,10 @@ def all_suffixes() -> str:
 def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFile:
     """Read a file of Gaussians; its suffix names the format.
 
-    ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the file. Infinite logits
-    (opacities of exactly 0 or 1) and sizes of 0 are brought to finite values, with a note. Raises DyngsError: an
-    unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated before the numbers in
-    the header have been compared with the size of the file and the limits.
+    ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the file. Opacities of
+    exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError: an unknown suffix, or not such a file,
+    cut off, empty or non-finite; nothing large is allocated before the header has been compared with the size of the
+    file.
     """
     path = Path(path)
     own = format_of(path)
@@ -112,12 +112,11 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
 
 
 def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
-    """Write a file of Gaussians, atomically; its suffix names the format.
+    """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names the format.
 
-    ``path``: file to write; its folder is created. ``splat``: N >= 1 Gaussians and what the file is to say about them;
-    any 3D filter must be fused into them already. ``sh_degree``: degree of the harmonics in the file: higher ones are
-    left out, missing ones zero. None: as they are, up to what the format holds. Raises DyngsError: an unknown suffix,
-    no Gaussians, non-finite values, a degree that the format does not hold, or the file cannot be written.
+    ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None: up to what the
+    format holds. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree that the format
+    does not hold.
     """
     path = Path(path)
     own = format_of(path)

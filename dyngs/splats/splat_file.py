@@ -59,11 +59,9 @@ def splat_options(splat: SplatFile) -> RenderOptions:
 
 
 def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
-    """Return the contents with values that can be drawn, and a note about each kind of change.
+    """Return the contents with values that can be drawn, and a note about each kind of change; see ``read_splats``.
 
-    Infinite logits and scales of zero are brought to finite values: they mean exactly opaque, transparent or flat.
-    ``nonfinite``: "skip" leaves out Gaussians with NaN or other infinities, "error" refuses the file. Raises
-    DyngsError: no Gaussians, or none that can be drawn, or ``nonfinite`` is "error" and some cannot.
+    Raises DyngsError: no Gaussians, or none that can be drawn, or ``nonfinite`` is "error" and some cannot.
     """
     total = len(splat.gaussians)
     gaussians, notes = _clamped(splat.gaussians)

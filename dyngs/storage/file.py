@@ -118,11 +118,10 @@ def read_scene(path: Path) -> Checkpoint:
 
 
 def encoded(info: CheckpointInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
-    """Return the bytes of a file; the same for what was read from it.
+    """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is not finite.
 
-    ``scene``: N Gaussians; what only training needs is left out. ``steps``: of groups of tensors, see
-    ``dyngs.storage.precision``; others are stored in half precision. ``coarseness``: (N,) uint8 of the Gaussians, see
-    ``coarseness_of``; None: all are stored alike. Raises DyngsError: a value is not finite.
+    ``steps`` are of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.
+    ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are stored alike.
     """
     means = scene.gaussians.means.detach()
     if not bool(means.isfinite().all()):

@@ -77,11 +77,10 @@ def assumed_precision(gaussians: Gaussians) -> Precision:
 def measured_precision(
     exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
 ) -> Precision:
-    """Return the largest steps found that change the images by at most ``max_change``.
+    """Return the largest steps found that change the images by at most ``max_change``, grey levels of 255.
 
-    ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``draw``: draws them anew from
-    the tensors of a checkpoint. ``max_change``: root mean square over all of their values, grey levels of 255, more
-    than 0. Raises DyngsError: a value is not finite.
+    ``exact``: from ``drawable``, with the coarseness of the Gaussians if they have any; ``draw`` draws its like anew.
+    Raises DyngsError: a value is not finite.
     """
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:

@@ -76,9 +76,9 @@ def opacities_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
 def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
     """Return (N, 3) int32 multiples of ``step``: vector parts of unit quaternions with an about largest scalar part.
 
-    Half turns about its own axes do not change a Gaussian: of the four quaternions that they make, one with a large
-    scalar part is taken. A zero quaternion is the identity. Coded again, the result stays the same. ``quats``: (N, 4)
-    wxyz, of any length. ``step``: at most ``ROTATION_STEP``.
+    Half turns about its own axes do not change a Gaussian: of the four quaternions one with a large scalar part is
+    taken. A zero quaternion is the identity. Coded again, the result stays the same. ``step``: at most
+    ``ROTATION_STEP``.
     """
     turned = quats.astype(np.float64)
     while True:

@@ -53,10 +53,8 @@ def write_page(
 ) -> WrittenPage:
     """Write the page of a scene, atomically: where its viewer begins, and what moves.
 
-    ``opened``: a scene of any kind; one with a colour network is coloured by it in the page, too. ``title``: shown in a
-    corner and in the title bar, any text; None: the name of the run, or of the file. ``views``: cameras to begin with
-    and to go through, each a batch of one; without any, those of the capture, or around the scene. Raises DyngsError:
-    the file cannot be written.
+    ``title``: shown in a corner and in the title bar; None: the name of the run, or of the file. ``views``: cameras to
+    begin with and to go through, each a batch of one; without any, those of the capture, or around the scene.
     """
     inputs_of(opened).require_output(path)
     if title is None:

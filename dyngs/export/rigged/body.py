@@ -59,9 +59,8 @@ def body_mesh(scene: HumanScene, body: BodyTemplate, vertices: Tensor) -> BodyMe
 def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
     """Return the template's vertices (M, 3) at rest in the shape of a trained person.
 
-    Runs and avatar files hold no shape parameters, but joints and points of the surface, which are linear in these: the
-    parameters follow by least squares, exactly. Raises DyngsError: the template is not the one that the person was
-    trained on.
+    Runs hold no shape parameters, but joints and points of the surface, which are linear in these: they follow by least
+    squares, exactly. Raises DyngsError: the template is not the one that the person was trained on.
     """
     anchors, joints = scene.anchors, scene.skeleton.joints
     if joints.shape != body.joints.shape or int(anchors.face.max()) >= len(body.faces):

@@ -59,10 +59,9 @@ class MeshFile:
 def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> MeshFile:
     """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up, facing +z.
 
-    The size is that of the capture; the soles stand at y = 0. Colours are display-referred with the light of the
-    capture in them, hence a material without light (KHR_materials_unlit). ``played``: the motion that the run plays,
-    which becomes an animation; None: no animation. Raises DyngsError: the run is not that of a person, the template is
-    missing or without texture coordinates, or the file cannot be written.
+    The size is that of the capture; the soles stand at y = 0. Colours have the light of the capture in them, hence a
+    material without light. ``played`` becomes an animation. Raises DyngsError: not the run of a person, or its template
+    is missing or without texture coordinates.
     """
     scene, body = person_and_template(run, "--format mesh")
     if path.suffix.lower() != SUFFIX:

@@ -44,11 +44,9 @@ class RiggedSplats:
 def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None) -> RiggedSplats:
     """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing +z, soles at y = 0.
 
-    ``.ply``: the columns ``joint_0`` to ``joint_7`` (indices as float32, heaviest first) and ``weight_0`` to
-    ``weight_7`` after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
-    Gaussians of KHR_gaussian_splatting with JOINTS_n, WEIGHTS_n and a skin. ``played``: the motion that the run plays,
-    as an animation in a ``.glb``; None: no animation. Raises DyngsError: the run is not that of a person, its template
-    is missing, or the file cannot be written.
+    ``.ply``: columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7`` after those of 3DGS,
+    and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``: KHR_gaussian_splatting with a skin, and
+    ``played`` as an animation. Raises DyngsError: not the run of a person, or its template is missing.
     """
     scene, body = person_and_template(run, "--joints")
     suffix = path.suffix.lower()

@@ -51,8 +51,7 @@ def fitted_surface(
     """Return the surface whose silhouettes agree best with the Gaussians', of the template's and some moved ones.
 
     A vertex is displaced by the mean displacement of the samples around it in space, along their normals, up to what is
-    seen there. So fingers, whose sides cancel, swell less, and lids and lips move with the skin around them.
-    ``vertices``: (M, 3) at rest in the person's shape.
+    seen there. ``vertices`` (M, 3) are at rest in the person's shape.
     """
     cameras = _cameras(vertices)
     shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5

@@ -54,13 +54,10 @@ class SharedCorrection:
 def new_corrections(
     clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
 ) -> Parameters:
-    """Return the corrections to learn, all zero, of a clip of F frames, a skeleton and skinning weights.
+    """Return the corrections to learn, all zero; with ``normals`` (N, 3) also the light that falls on them (``Light``).
 
-    With ``normals`` (N, 3), also the light that falls on them.
-
-    Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
-    ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
-    optionally ``light`` (8, 3) and ``normals`` (N, 3), see ``dyngs.human.avatar.posing.Light``.
+    ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before those of the clip; ``trans`` (F, 3);
+    ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K).
     """
     unit = float(clip.scale.mean())
     zeros = {

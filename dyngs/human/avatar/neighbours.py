@@ -42,9 +42,8 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
 def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
     """Return the rows (Q, count) int64 of the nearest other points that follow the same joints, nearest first.
 
-    They do where the cosine between their skinning weights (Q, J) is above a half: arm and trunk do not, nor do two
-    fingers, however near they are at rest. Looks at four times ``count`` points around each; where fewer than ``count``
-    of these do, the point itself is in their place. At most Q - 1 columns.
+    They do where the cosine between their skinning weights (Q, J) is above a half, among four times ``count`` points
+    around each; where fewer do, the point itself is in their place. At most Q - 1 columns.
     """
     near = nearest_neighbours(points, _LOOKED_AT * count)
     unit = torch.nn.functional.normalize(weights, dim=1)
@@ -75,9 +74,7 @@ def sightings(
 ) -> Tensor:
     """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen there.
 
-    A view counts as 1 where the texel is in full view, and hardly at all where little of it shines through others: a
-    hundred views that see a hundredth of it tell less than one that sees all. Independent of the size of the images.
-    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the N Gaussians in the pose of
+    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the Gaussians in the pose of
     each view, and its camera; ``sizes`` (N,) sides of the texels, m; ``scale`` world units per metre.
     """
     total = torch.zeros_like(sizes)
@@ -99,10 +96,9 @@ def trust_in(seen: Tensor) -> Tensor:
 def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: float, trust: Tensor) -> dict[str, Tensor]:
     """Return new ``sh``, ``means`` and ``logit_opacities`` of N Gaussians at rest; the same where trust is 1.
 
-    Offsets from the scaffold, opacities and colours are mixed with those of the mirror image. Base colours are also
-    made like those of the neighbours that follow the same joints: harmonic where there is no trust. ``weights`` (N, J)
-    are those of the template; ``middle`` is x of the plane of symmetry at rest, m; ``trust`` (N,) in what was learned
-    is in [0, 1].
+    Offsets, opacities and colours are mixed with those of the mirror image; base colours are made like those of linked
+    neighbours. ``weights`` (N, J) are the template's; ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) in
+    [0, 1].
     """
     other, is_image = mirror_images(anchors, middle)
     borrowed = (1 - trust) * trust[other] * is_image * MIRRORED

@@ -1,8 +1,6 @@
-"""Body poses fitted to images: the poses in which an avatar, which stays as it is, looks most like them.
+"""Body poses in which an avatar, which stays as it is, looks most like images, or has their silhouettes.
 
-Either the full images count, or their silhouettes alone (``dyngs.human.avatar.pose_fit``). GART (Lei et al.
-2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test images like this before they score new poses.
-Local letters: F moments, V images of a moment.
+So do GART (Lei et al. 2024) and Anim-NeRF (Chen et al. 2021) before they score new poses. F moments, V images of one.
 """
 
 from __future__ import annotations
@@ -114,9 +112,9 @@ def fitted_to_images(
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
-    All images of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with that
-    corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are. No
-    random numbers are drawn. ``scene`` plays the clip to correct; ``background`` (3,) is behind both.
+    All images of a moment decide its pose. The fit begins with the pose that is played, or with that corrected as the
+    moment before was, whichever looks more alike. ``scene`` plays the clip to correct; ``background`` (3,) is behind
+    both.
     """
     groups: dict[float, list[int]] = {}
     for index, time in enumerate(images.times):

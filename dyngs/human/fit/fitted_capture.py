@@ -66,11 +66,10 @@ def has_guessed_lens(capture: Capture) -> bool:
 
 
 def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = print) -> Capture:
-    """Return a capture of a person with silhouettes.
+    """Return a capture with silhouettes: of a capture, or a video or a folder of images of one fixed camera.
 
-    ``root`` of the options is a capture, or a video or a folder of images of one fixed camera. Masks of ``given`` take
-    the place of those of the capture; without any the person is told from the background. Masks that are made are
-    written to the folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and none that can be made.
+    Masks of ``given`` take the place of those of the capture; without any they are made from the background, in the
+    folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and none that can be made.
     """
     source = options.root
     if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
@@ -235,9 +234,8 @@ def write_fitted_capture(
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
     Files: ``transforms_SPLIT.json`` and ``images/`` (without both it is for ``data.body``), ``body_train.npz``,
-    ``body_pose.npz`` for another clip whose poses were given by the same means, ``fit_report.json``, and
-    ``fit_overlays.png`` to look at. ``given`` is what is known beside the capture, see ``read_person``. Raises
-    DyngsError: see ``fit_capture``; ``out`` is not empty.
+    ``body_pose.npz`` for another clip, ``fit_report.json``, and ``fit_overlays.png`` to look at. Raises DyngsError: see
+    ``fit_capture``; ``out`` is not empty.
     """
     require_new_folder(out)
     person = None if given.person is None else known_shape(given.person)
@@ -335,9 +333,8 @@ def with_fitted_body(
 ) -> DataConfig:
     """Return the options with a fit of the free template to the capture; the same capture is fitted once.
 
-    Nothing is fitted where ``data.body`` names a fit, where the capture itself holds one, or without silhouettes.
-    ``only_if_needed``: nothing is fitted where the capture has body parameters. Raises DyngsError: neither body
-    parameters nor silhouettes.
+    Nothing is fitted where ``data.body`` names a fit, where the capture holds one, or without silhouettes; with
+    ``only_if_needed`` where it has body parameters. Raises DyngsError: neither body parameters nor silhouettes.
     """
     if data.body is not None:
         return data

@@ -83,14 +83,12 @@ class _Found:
 
 
 def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
-    """Return the 3D joints of the frames of training.
+    """Return the 3D joints of the frames of training; ``body`` is the template of vertices.
 
-    ``.npz``: ``joints`` (F, K, 3 or 4: with confidence), or ``vertices`` (F, N, 3) of ``body``; ``frames`` (F,)
-    numbers, else 0, 1, ...; ``order`` and ``space`` as text. ``.json``: an object of ``order``, ``space`` and
-    ``joints``, which maps images or frame numbers to K lists of 3 or 4 numbers. A folder: files of SAM 3D Body,
-    ``IMAGE.npz`` with ``pred_keypoints_3d`` (70, 3) and ``pred_cam_t`` (3,). ``.pkl``: ``frame_data.pkl`` of Alldieck
-    et al. (2018), whose vertices are those of SMPL. ``body`` is the template, for vertices. Raises DyngsError: another
-    layout, no frame of the capture, or no numbers; names the file.
+    ``.npz``: ``joints`` (F, K, 3 or 4: with confidence) or ``vertices`` (F, N, 3), ``frames`` (F,) numbers, ``order``
+    and ``space``. ``.json``: the same, ``joints`` mapping images or frame numbers to lists. A folder: files of SAM 3D
+    Body, ``IMAGE.npz``. ``.pkl``: ``frame_data.pkl`` of Alldieck et al. (2018). Raises DyngsError: another layout, no
+    frame of the capture, or no numbers; names the file.
     """
     views = capture.splits["train"]
     with reading(path):

@@ -76,10 +76,9 @@ where a joint is not marked."""
 def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     """Return the key points of the views: of a folder of OpenPose files, or of one COCO file.
 
-    OpenPose: ``NAME_keypoints.json`` or ``NAME.json``, NAME being the image's name without suffix; ``people`` with
-    ``pose_keypoints_2d`` of 25 or 18 points. COCO: ``images`` (id, file_name) and ``annotations`` (image_id, keypoints
-    of 17 or 133 points). Of several people the most confident one is taken. Raises DyngsError: a file that is neither,
-    or no key points for any view.
+    OpenPose: ``NAME_keypoints.json`` or ``NAME.json`` by the image's name, ``pose_keypoints_2d`` of 25 or 18 points.
+    COCO: 17 or 133 points. Of several people the most confident one is taken. Raises DyngsError: neither, or no known
+    view.
     """
     stems = by_stem(views)
     rows = _openpose(path, stems) if path.is_dir() else _coco(path, stems)

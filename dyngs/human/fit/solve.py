@@ -115,11 +115,10 @@ Observations = Callable[[int], ObservedFrame | None]  # returns what is seen in 
 def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
     """Return what is learned, all zero.
 
-    Tensors: ``betas`` (B,) shape parameters; ``log_scale`` (1,) natural logarithm of the factor on the given scale;
-    ``turns`` (22, 3) axis-angle, rad, rotations of the joints applied before those of the given poses, in all frames;
-    ``poses`` (F, 22, 3) the same per frame, added to ``turns``; ``shift`` (3,) added to the given translations, and
-    ``offset`` (3,) m in the frame of the pelvis; ``trans`` (F, 3) the same as ``shift`` per frame;
-    ``padding`` (P,) m between skin and silhouette: clothes and hair.
+    ``betas`` (B,) shape; ``log_scale`` (1,) of the factor on the scale; ``turns`` (22, 3) axis-angle, rad, applied
+    before the given rotations, in all frames; ``poses`` (F, 22, 3) the same per frame; ``shift`` (3,) added to the
+    translations, ``offset`` (3,) m in the frame of the pelvis; ``trans`` (F, 3) per frame; ``padding`` (P,) m between
+    skin and silhouette.
     """
     joints = surface.body.joints
     zeros = {
@@ -361,9 +360,9 @@ def fit_lens(
 ) -> tuple[Parameters, LensFit]:
     """Return the fit of shape, poses and focal length to the frames of one camera at the origin; ``start`` if it stays.
 
-    Both are fitted to three of four frames, with the focal length as guessed and refined. Then shape and focal length
-    are kept, and poses of the other frames are fitted: where these agree better, the refined one is taken. ``start``
-    was found with the guessed focal length; ``shape`` names what is the same in all frames.
+    Both lenses are fitted to three of four frames; then poses of the other frames: where these agree better, the
+    refined one is taken. ``start`` was found with the guessed focal length; ``shape`` names what is the same in all
+    frames.
     """
     rows = list(range(len(fitting.clip)))
     apart = rows[EVERY // 2 :: EVERY] or rows

@@ -94,11 +94,9 @@ def first_poses(
 ) -> MotionClip:
     """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row) alone.
 
-    In some frames, the anchors, every heading is tried; the likely path through them says which way the person faces
-    (``dyngs.human.fit.start``). Each frame starts from the pose of the one before, and where that has left the path
-    from the heading of the path: single frames would rather be explained by a twisted body. Without key points the path
-    may be that of somebody who faces the other way: clips that start with the best headings of the first frame and
-    never look at the path are compared with it. Raises ValueError: nobody is seen in the first frame.
+    In some frames, the anchors, every heading is tried; a likely path through them says which way the person faces.
+    Each frame starts from the pose of the one before, and where that has left the path from the path's heading. Without
+    key points clips that never look at the path are compared with it. Raises ValueError: nobody in the first frame.
     """
     seen = observed(0)
     if seen is None:

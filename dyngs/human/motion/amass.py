@@ -37,20 +37,14 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
     """Read a motion of 55 joints, y up, in float32; joints that the file lacks do not rotate.
 
     Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
-    ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,) if known; ``scale`` (one or F) and ``up_axis`` ("y" or
-    "z") in files that dyngs or a fit wrote. The last two of SMPL's 24 joints, the hands, are left out. Or the names of
-    the package smplx, which most fits to videos have: ``global_orient``, ``body_pose`` and the like, ``transl``,
-    ``fps``.
+    ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,); ``scale`` (one or F) and ``up_axis`` in files of dyngs
+    or a fit. Or the names of the package smplx: ``global_orient``, ``body_pose`` and the like, ``transl``, ``fps``.
 
-    AMASS files are z up: unless ``up`` or the key ``up_axis`` says otherwise, a file is z up if it has no ``scale``.
-    Fits with the names of smplx have any axes: there, the one nearest to the mean up direction of the pelvis is up.
-    The rotation T from z up to y up moves every vertex v to T v: the root rotates about the pelvis J_0 of the shaped
-    body, hence R_0' = T R_0 and trans' = T (trans + s J_0) - s J_0.
-
-    A file without ``scale`` and ``up_axis`` was made for SMPL, SMPL-H or SMPL-X (told by its width). Shape parameters
-    that ``body`` lacks are left out. If ``body`` is of another family, all are set to zero and the lowest vertex of the
-    motion to y = 0, as the pelvis of the file's body is not known. Raises DyngsError: names the file and what is
-    missing or wrong.
+    AMASS files are z up: unless ``up`` or ``up_axis`` says otherwise, a file is z up if it has no ``scale``; with the
+    names of smplx the axis nearest to the mean up direction of the pelvis is up. The rotation T to y up moves every
+    vertex v to T v: R_0' = T R_0 about the pelvis J_0 of the shaped body, trans' = T (trans + s J_0) - s J_0. If
+    ``body`` is of another family than a file without ``scale`` and ``up_axis``, shape parameters are set to zero and
+    the lowest vertex to y = 0. Raises DyngsError: names the file and what is missing or wrong.
     """
     with reading(path):
         return _motion(path, _arrays(path), body, up)

@@ -187,15 +187,11 @@ _SNAP_COS = np.cos(np.radians(15.0))  # how near to an axis the left direction o
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     """Return the motion of ``source`` on ``body``: 55 joints, y up, float32, the rest pose facing +z.
 
-    The world rotation of joint b that corresponds to joint s of the source: G_b = N G_s M^T align(d_b, M d_s). Here d
-    are bone directions at rest, ``align`` is the smallest rotation from one to the other (limbs only; the identity for
-    spine, neck, head and collars), M maps the axes of the source's rest pose to ours (found from its hips, shoulders
-    and ankles) and N those of its world: the identity if that is y up, else M. Joints without a counterpart follow
-    their parents.
-
-    The pelvis follows the source's path times the ratio of leg lengths, so units of length do not matter; the motion is
-    then moved vertically so that its lowest vertex has y = 0. Raises DyngsError: unknown joint names, or a rest pose
-    that does not stand upright.
+    World rotations of joint b and of joint s of the source: G_b = N G_s M^T align(d_b, M d_s). ``align`` is the
+    smallest rotation between bone directions d at rest (of limbs; else the identity), M maps the axes of the source's
+    rest pose to ours (by hips, shoulders and ankles) and N those of its world: the identity if that is y up, else M.
+    The pelvis follows the source's path times the ratio of leg lengths; the lowest vertex is put to y = 0. Raises
+    DyngsError: unknown joint names, or a rest pose that does not stand upright.
     """
     found = match_joints(source.path, source.names)
     target_from_rest = _target_from_rest(source, found)

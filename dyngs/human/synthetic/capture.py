@@ -1,8 +1,7 @@
 """A synthetic capture of a person: the dressed template in motion, from many cameras, with exact body parameters.
 
-Images are rasterized with a depth buffer in numpy, independently of the rasterizer of Gaussians, as ground truth.
-
-Local letters: T triangles, U vertices of the atlas, H fragments, S texels per side.
+Rasterized in numpy, independently of the rasterizer of Gaussians. T triangles, U vertices of the atlas, H fragments, S
+texels per side.
 """
 
 from __future__ import annotations
@@ -87,11 +86,9 @@ class PosedMesh:
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
     """Write images of a walking person in the layout that ``dyngs.data.readers.blender`` reads; returns ``out``.
 
-    Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m, y up,
-    floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``. Clothes
-    are offset from the template's surface; the person's size is the ``scale`` of the parameters. The split test shows
-    the frames of train from other cameras, ``pose`` another motion from these other cameras. Raises DyngsError: options
-    out of range, or ``out`` is not empty or cannot be written.
+    Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha), ``transforms_SPLIT.json`` (OpenGL poses, m, y up, floor
+    at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``. The split
+    test shows the frames of train from other cameras, ``pose`` another motion. Raises DyngsError: options out of range.
     """
     if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
@@ -151,10 +148,9 @@ def render_mesh(
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
-    Lambertian: the texture's value times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1; no shadows.
-    Alpha is the fraction of samples that hit the mesh, whose colours are averaged. ``world_from_cam`` (4, 4) is an
-    OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X`` across. Raises ValueError: the mesh reaches behind the
-    camera.
+    Lambertian: the texture times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1. ``world_from_cam``
+    (4, 4) is an OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X`` across. Raises ValueError: the mesh reaches
+    behind it.
     """
     rotation, center = world_from_cam[:3, :3], world_from_cam[:3, 3]
     x, up, back = ((mesh.vertices - center) @ rotation).T

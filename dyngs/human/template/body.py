@@ -116,10 +116,9 @@ def posed_vertices(
 ) -> Tensor:
     """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et al. 2015).
 
-    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. The root rotates about the pelvis joint.
-    ``poses`` (F, J, 3) are axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m, added last; ``betas`` (B,)
-    or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,) of the template. Raises DyngsError: poses for another
-    number of joints, or parameters that the template does not have.
+    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. ``poses`` (F, J, 3) are axis-angle relative to
+    the parent joint, rad; ``trans`` (F, 3) m; ``betas`` (B,) or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,).
+    Raises DyngsError: poses for another number of joints, or parameters that the template does not have.
     """
     if poses.ndim != 3 or tuple(poses.shape[1:]) != tuple(body.joints.shape):
         raise DyngsError(
@@ -158,9 +157,8 @@ def bone_shapes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return directions of the vertices (M, 3, B) and of the joints (J, 3, B), m per unit of a shape parameter.
 
-    Each moves one joint, or the same joint of both sides, in the frame of the rest pose, together with everything below
-    it. Vertices between two joints are stretched evenly; those beyond the last joint of a chain keep their shape.
-    ``vertices`` (M, 3) and the 55 ``joints`` (J, 3) of SMPL-X are at rest, +x to the left; ``weights`` are (M, J).
+    Each moves one joint, or the same joint of both sides, together with everything below it; vertices between two
+    joints are stretched evenly. ``joints`` (J, 3) are the 55 of SMPL-X at rest, +x to the left; ``weights`` are (M, J).
     """
     joint_dirs = _joint_directions(parents)
     follow = _following(vertices, joints, parents, weights)

@@ -122,12 +122,11 @@ _LARGEST = 1e10  # a larger number in a body file, in whatever unit, means that 
 
 
 def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
-    """Read the body template of a ``.npz`` or ``.pkl`` file, with the texture coordinates of ``uv``, if given.
+    """Read the body template of a ``.npz`` or ``.pkl`` file, with the texture coordinates of an ``.obj`` ``uv``.
 
     The number of joints (24, 52 or 55) tells SMPL, SMPL-H and SMPL-X apart. SMPL-X keeps shape and expression in one
-    array: 300 and the rest, or 10 and 10. Only the keys that are needed are read. A file cannot run code: arrays of
-    Python objects are refused, and only numbers, text and arrays are read from a pickle. ``uv`` is an ``.obj`` with the
-    triangles of the body. Raises DyngsError: names the file and what is missing or wrong.
+    array: 300 and the rest, or 10 and 10. A file cannot run code: only numbers, text and arrays are read from a pickle.
+    Raises DyngsError: names the file and what is missing or wrong.
     """
     path = Path(path)
     if path.is_dir():
