@@ -273,10 +273,7 @@ def report_path(run_dir: Path, split: str) -> Path:
 
 
 def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> dict[str, MetricValue]:
-    return {
-        "flicker": flicker_of_split(drawing, loader, views),
-        "flicker_error": flicker_error(drawing, loader, views),
-    }
+    return {"flicker": flicker_of_split(drawing, loader, views), "flicker_error": flicker_error(drawing, loader, views)}
 
 
 def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:

@@ -39,10 +39,7 @@ class TrackScores:
 
 
 def track_scores(
-    scene: Scene,
-    tracks: TrueTracks | None,
-    split: Sequence[tuple[View, Cameras]],
-    views: Sequence[View],
+    scene: Scene, tracks: TrueTracks | None, split: Sequence[tuple[View, Cameras]], views: Sequence[View]
 ) -> TrackScores:
     """Return the errors of a scene's motion in the images of a split, of which each view has its camera.
 

@@ -174,11 +174,7 @@ class _FrameWriter:
     """Context manager that writes frames to images and a video; ``written`` lists the files."""
 
     def __init__(
-        self,
-        out_dir: Path | None,
-        output: OutputOptions,
-        inputs: Inputs,
-        limits: tuple[float, float] | None = None,
+        self, out_dir: Path | None, output: OutputOptions, inputs: Inputs, limits: tuple[float, float] | None = None
     ) -> None:
         self.written: list[Path] = []
         self._inputs = inputs

@@ -37,11 +37,7 @@ class SceneFile:
 
 
 def write_scene_file(
-    run_dir: Path,
-    out: Path,
-    max_change: float | None = None,
-    field_step: float = 1.0,
-    data_root: Path | None = None,
+    run_dir: Path, out: Path, max_change: float | None = None, field_step: float = 1.0, data_root: Path | None = None
 ) -> SceneFile:
     """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that can be drawn.
 

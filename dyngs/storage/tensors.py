@@ -158,11 +158,7 @@ GAUSSIANS = tuple(field.name for field in fields(Gaussians))
 MAX_COARSENESS = 6  # most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
 COARSENESS = "gaussians.coarseness"
 _BY_COARSENESS = ("gaussians.sh_base", "gaussians.sh_rest")
-_KINDS = {
-    "gaussians.quats": Kind.ROTATION,
-    "gaussians.logit_opacities": Kind.OPACITY,
-    "gaussians.sh_rest": Kind.SPARSE,
-}
+_KINDS = {"gaussians.quats": Kind.ROTATION, "gaussians.logit_opacities": Kind.OPACITY, "gaussians.sh_rest": Kind.SPARSE}
 _LIMITS = {Kind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), Kind.OPACITY: OPACITY_STEPS}
 FEW = 64  # number of values up to which tensors are stored as they are
 LARGEST_HALF = 65504.0
