@@ -120,7 +120,9 @@ def fitted_to_images(
     for index, time in enumerate(images.times):
         groups.setdefault(0.0 if time is None else time, []).append(index)
     times = sorted(groups)
-    starts = _moments(scene.moves_as, times)
+    parts = [scene.moves_as.at(time) for time in times]
+    poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
+    starts = MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
     found: list[Correction] = []
     counts: list[int] = []
     for row, time in enumerate(times):
@@ -129,22 +131,11 @@ def fitted_to_images(
         correction, count = fit.fitted(found[-1] if found else None)
         found.append(correction)
         counts.append(count)
-    none = SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
+    fit, none = scene.fit, SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
     turns, shifts = torch.stack([x.turns for x in found]), torch.stack([x.shift for x in found])
     clip = corrected_clip(none, starts, turns, shifts * starts.scale[:, None])
-    return FittedPoses(_playing_exactly(scene, clip), tuple(counts))
-
-
-def _moments(clip: MotionClip, times: Sequence[float]) -> MotionClip:
-    parts = [clip.at(time) for time in times]
-    poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
-    return MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
-
-
-def _playing_exactly(scene: HumanScene, clip: MotionClip) -> HumanScene:
-    """Return the person in ``clip`` as it is: what ``playing`` applies to all poses is taken off first."""
-    fit = scene.fit
-    return scene.playing(corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip))
+    exactly = corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip)  # ``playing`` applies both again
+    return FittedPoses(scene.playing(exactly), tuple(counts))
 
 
 @dataclass(frozen=True)
@@ -166,7 +157,9 @@ class _Fit:
         """
         joints = self.scene.skeleton.joints
         none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))
-        shrinks = _shrinks(self.images)
+        heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in self.images]
+        coarse = max(1, round(max(heights) / COARSE_PX))
+        shrinks = coarse, round(math.sqrt(coarse)), 1
         found = none if guess is None else self._better(none, guess, shrinks[0])
         count = 0
         for shrink, first, last in zip(shrinks, FIRST_RATES, LAST_RATES, strict=True):
@@ -220,9 +213,3 @@ class _Fit:
             losses.append(how.difference(drawn, image, self.background, shrink))
         size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
         return torch.stack(losses).mean() + size
-
-
-def _shrinks(images: Sequence[Image]) -> tuple[int, int, int]:
-    heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in images]
-    coarse = max(1, round(max(heights) / COARSE_PX))
-    return coarse, round(math.sqrt(coarse)), 1

@@ -90,7 +90,8 @@ class PoseBlendShapes:
 
         ``rotations`` (J, 3, 3) are relative to the parent joints.
         """
-        at_vertices = (_pose_features(rotations)[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
+        features = rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+        at_vertices = (features[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
         around = self.faces.index_select(0, anchors.face)
         parts = at_vertices.index_select(0, around.flatten()).unflatten(0, (-1, 3))
         return (anchors.barycentric[..., None] * parts).sum(1)
@@ -156,10 +157,6 @@ def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
 def rest_offsets(anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None) -> Tensor | None:
     """Return the pose-dependent offsets (N, 3) at rest, m; None where the template has none."""
     return None if shapes is None else shapes.offsets(anchors, posing.rotations)
-
-
-def _pose_features(rotations: Tensor) -> Tensor:
-    return rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
 
 
 def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:

@@ -62,7 +62,10 @@ class HumanScene(Scene):
         anchors = Anchors(**{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)})
         clip = MotionClip(*(tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
-        own = part_of(tensors, "learned")
+        own, shapes = part_of(tensors, "learned"), None
+        if "shapes.directions" in tensors:
+            require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
+            shapes = PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
         learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
@@ -70,7 +73,7 @@ class HumanScene(Scene):
             skeleton=skeleton,
             clip=clip,
             learned=learned,
-            shapes=stored_shapes(tensors),
+            shapes=shapes,
         )
 
     @property
@@ -219,14 +222,6 @@ class HumanScene(Scene):
 def avatar_of(scene: Renderable) -> HumanScene | None:
     """Return ``scene`` if it is a person, who can be posed; None for any other scene."""
     return scene if isinstance(scene, HumanScene) else None
-
-
-def stored_shapes(tensors: Mapping[str, Tensor]) -> PoseBlendShapes | None:
-    """Return the pose blend shapes of a state, if there are any."""
-    if "shapes.directions" not in tensors:
-        return None
-    require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
-    return PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
 
 
 _MOST_FACES = 2**31

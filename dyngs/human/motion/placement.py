@@ -30,7 +30,7 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
     poses = torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1)
     pelvis = clip.scale[:, None] * joints[0]
     moved = MotionClip(clip.times, poses, unit * ((clip.trans + pelvis) @ rotation.T - pelvis), unit * clip.scale)
-    ours, theirs = (_joint_places(x, joints, parents) for x in (moved, like))
+    ours, theirs = (_joints_of(x, joints, parents) for x in (moved, like))
     shift = theirs[:, 0].mean(0) - ours[:, 0].mean(0)
     rise = (theirs @ up).amin() - (ours @ up).amin()
     return replace(moved, trans=moved.trans + shift + (rise - shift @ up) * up)
@@ -87,7 +87,7 @@ def _axis_angle(rotations: Tensor) -> Tensor:
     return torch.from_numpy(Rotation.from_matrix(rotations.double().cpu().numpy()).as_rotvec()).to(rotations)
 
 
-def _joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
+def _joints_of(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
     moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints)
     return clip.scale[:, None, None] * moved + clip.trans[:, None]
 

@@ -188,8 +188,9 @@ def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...
         rows = np.flatnonzero(weights[:, joint])
         ends = [joint, *(child for child, parent in enumerate(parents) if parent == joint)]
         bones = [child for child in ends[1:] if np.linalg.norm(joints[child] - joints[joint]) > 1e-6]
-        fraction = _along_bone(vertices[rows], joints[joint], joints[bones[0]]) if len(bones) == 1 else None
-        if fraction is not None:
+        if len(bones) == 1:  # the position along the bone: 0 at its start or before, 1 at its end or beyond
+            bone = joints[bones[0]] - joints[joint]
+            fraction = np.clip((vertices[rows] - joints[joint]) @ bone / (bone @ bone), 0.0, 1.0)
             follow[rows, joint] += weights[rows, joint] * (1 - fraction)
             follow[rows, bones[0]] += weights[rows, joint] * fraction
         elif len(bones) > 1 and len(bones) <= 3:  # pelvis, chest; the wrist has five fingers and moves as a whole
@@ -200,9 +201,3 @@ def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...
         else:
             follow[rows, joint] += weights[rows, joint]
     return follow
-
-
-def _along_bone(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the place (P,) of points (P, 3) along a bone: 0 at its start or before, 1 at its end or beyond."""
-    bone = end - start
-    return np.clip((points - start) @ bone / (bone @ bone), 0.0, 1.0)
