@@ -54,7 +54,8 @@ class Regions:
 
     def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[str, float | None]:
         """Return the PSNR of a view's regions, dB, by metric; None for too few such pixels, or unknown ones."""
-        foreground, moves = foreground_of(image), self.moving(image)
+        moves = self.moving(image)
+        foreground = None if image.alpha is None else image.alpha > 0
         self._has_alpha |= foreground is not None
         inside = torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
         parts = {
@@ -66,10 +67,9 @@ class Regions:
 
     def moving(self, image: Image) -> Tensor | None:
         """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
-        given = given_motion(image)
-        if given is not None:
+        if image.moves is not None:
             self._moving_from.add("motion masks")
-            return given
+            return image.moves >= 0.5
         indices = self._cameras.get(image.name)
         if indices is None:
             return None
@@ -98,16 +98,6 @@ class Regions:
             shown = [(255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte() for i in chosen]
             self._medians[key] = torch.stack(shown).median(dim=0).values
         return self._medians[key].float() / 255
-
-
-def foreground_of(image: Image) -> Tensor | None:
-    """Return (H, W) bool, the pixels that are not fully transparent; None where the image has no alpha."""
-    return None if image.alpha is None else image.alpha > 0
-
-
-def given_motion(image: Image) -> Tensor | None:
-    """Return (H, W) bool, the pixels of which the view's motion mask says that they move; None without one."""
-    return None if image.moves is None else image.moves >= 0.5
 
 
 def _psnr_inside(part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor) -> float | None:

@@ -26,7 +26,7 @@ from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.metrics import Lpips, LpipsNet, MetricValue, load_lpips, psnr
+from dyngs.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
@@ -187,7 +187,8 @@ def evaluate_run(
         regions = Regions(views, loader, drawing.background)
         images, lpips = (loader[i] for i in range(len(loader))), load_lpips(lpips_net, draws_on)
         scores, reasons = score_views(scene, images, drawing.options, drawing.background, lpips, regions)
-        temporal = _temporal(drawing, loader, views)
+        temporal = {"flicker": flicker_of_split(drawing, loader, views)}
+        temporal["flicker_error"] = flicker_error(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
         fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips) if asked else PoseRefinement()
@@ -270,10 +271,6 @@ def _reasons(report: EvalReport, regions: Regions, tracks: TrackScores) -> dict[
 def report_path(run_dir: Path, split: str) -> Path:
     """Return the path of the report of ``split`` in a run folder."""
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
-
-
-def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> dict[str, MetricValue]:
-    return {"flicker": flicker_of_split(drawing, loader, views), "flicker_error": flicker_error(drawing, loader, views)}
 
 
 def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:

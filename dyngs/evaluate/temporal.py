@@ -72,11 +72,13 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
         return MetricValue(None, f"needs at least three training times, there are {len(times)}")
     seen: dict[int, Tensor] = {}
     values = []
-    for k in _middles(len(times)):
+    last = len(times) - 1
+    sampled = np.linspace(1, last - 1, _SAMPLED_TRIPLES).round().astype(int).tolist()
+    for k in range(1, last) if last < MAX_MOMENTS else sampled:
         seen = {i: seen[i] if i in seen else drawing.image(cameras, times[i]).clamp(0, 1) for i in (k - 1, k, k + 1)}
         before, now, after = (times[i] for i in (k - 1, k, k + 1))
         line = torch.lerp(seen[k + 1], seen[k - 1], (after - now) / (after - before))
-        values.append(2 * 255 * _mean_change(line, seen[k]))
+        values.append(2 * 255 * float((line - seen[k]).abs().double().mean()))
     return MetricValue(fmean(values))
 
 
@@ -109,18 +111,8 @@ def flicker_of_split(drawing: Drawing, loader: ImageLoader, views: Sequence[View
     return flicker(drawing, loader[0].cameras, drawing.scene.times)
 
 
-def _middles(num_times: int) -> list[int]:
-    if num_times <= MAX_MOMENTS:
-        return list(range(1, num_times - 1))
-    return np.linspace(1, num_times - 2, _SAMPLED_TRIPLES).round().astype(int).tolist()
-
-
 def _signed_error(drawing: Drawing, image: Image) -> tuple[Tensor, Tensor]:
     """Return (H, W, 3) render minus truth and its mask (H, W): R' - R - (G' - G) is the difference of two of them."""
     truth = image.composite(drawing.background).clamp(0, 1)
     counts = torch.ones(truth.shape[:2], device=truth.device) if image.mask is None else image.mask
     return drawing.image(image.cameras, image.time).clamp(0, 1) - truth, counts
-
-
-def _mean_change(a: Tensor, b: Tensor) -> float:
-    return float((a - b).abs().double().mean())

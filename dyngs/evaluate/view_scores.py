@@ -124,7 +124,7 @@ def score_views(
 
 def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips: Lpips) -> dict[str, float | None]:
     """Return the scores by their names in ``ViewScore``; none where nobody is to be seen."""
-    box = person_box(image)
+    box = None if image.alpha is None else silhouette_box(image.alpha)
     if box is None:
         return {}
     truth, mask, rendered = image.composite(background), image.mask, rendering.rgb[0]
@@ -137,11 +137,6 @@ def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips:
         "ssim_black": ssim(black, image.rgb_premultiplied, mask),
         "lpips_black": lpips(black, image.rgb_premultiplied, mask).value,
     }
-
-
-def person_box(image: Image) -> tuple[slice, slice] | None:
-    """Return rows and columns of the smallest box around opaque pixels; None without alpha or where there are none."""
-    return None if image.alpha is None else silhouette_box(image.alpha)
 
 
 def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float | None]:

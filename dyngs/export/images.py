@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.path import CameraPath
@@ -96,7 +95,10 @@ def write_path_images(
         raise DyngsError("nothing to write: give a folder for the images or a video file")
     options, limits = _with_depth(opened.renderable, output), None
     if output.depth and out_dir is not None:
-        limits = _shared_depth_limits(path_frames(opened.renderable, _sample(path), options))
+        seen = [
+            (x.depth, x.alpha) for x in path_frames(opened.renderable, _sample(path), options) if x.depth is not None
+        ]
+        limits = depth_limits(*(np.concatenate([x.ravel() for x in part]) for part in zip(*seen, strict=True)))
     digits = max(4, len(str(len(path) - 1)))
     with _FrameWriter(out_dir, output, inputs_of(opened), limits) as writer:
         for i, frame in enumerate(path_frames(opened.renderable, path, options)):
@@ -134,17 +136,12 @@ def write_split_images(
             writer.write(stem, frame)
             report("views", i + 1, len(views))
             if i in shown:
-                truth = image.composite(background)
-                label = f"{psnr(torch.from_numpy(frame.rgb), truth, image.mask):.2f} dB  {image.name}"
-                rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), image.mask))
+                both = image.composite(background), torch.from_numpy(frame.rgb)
+                label = f"{psnr(both[1], both[0], image.mask):.2f} dB  {image.name}"
+                counts = 1.0 if image.mask is None else image.mask[..., None]  # masked pixels show no error
+                rows.append(SheetRow(label, *(to_uint8((x * counts).cpu().numpy()) for x in both)))
     writer.write_image(out_dir / "sheet.png", contact_sheet(rows))
     return writer.written
-
-
-def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
-    """Return a row of the sheet; masked pixels are black on both sides, so that they show no error."""
-    counts = 1.0 if mask is None else mask[..., None]
-    return SheetRow(label, to_uint8((truth * counts).cpu().numpy()), to_uint8((rendered * counts).cpu().numpy()))
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
@@ -229,11 +226,6 @@ def _sample(path: CameraPath) -> CameraPath:
     poses, intrinsics = path.cameras.cam_from_world[index], path.cameras.intrinsics[index]
     cameras = replace(path.cameras, cam_from_world=poses, intrinsics=intrinsics)
     return replace(path, cameras=cameras, times=path.times and tuple(path.times[i] for i in index.tolist()))
-
-
-def _shared_depth_limits(frames: Iterator[Frame]) -> tuple[float, float]:
-    seen = [(frame.depth.ravel(), frame.alpha.ravel()) for frame in frames if frame.depth is not None]
-    return depth_limits(np.concatenate([d for d, _ in seen]), np.concatenate([a for _, a in seen]))
 
 
 def _files(stem: str) -> set[str]:

@@ -68,7 +68,10 @@ def adam_step_(
     rows to update, None: all. Raises DyngsError: shapes or dtypes that do not fit, or constants out of range.
     """
     _check(param, grad, exp_avg, exp_avg_sq, rows, step)
-    _check_constants(param.dtype, eps, betas)
+    if not torch.finfo(param.dtype).tiny <= eps < math.inf:
+        raise DyngsError(f"Adam: eps must be at least {torch.finfo(param.dtype).tiny:.3g} and finite, got {eps}")
+    if not all(0 <= beta < 1 for beta in betas):
+        raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
     if param.numel() == 0:
         return torch.zeros((), dtype=torch.int64, device=param.device)
     row_size = param.numel() // len(param)
@@ -126,13 +129,6 @@ def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     if rates.shape != (row_size,):
         raise DyngsError(f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(rates.shape)}")
     return rates.contiguous()
-
-
-def _check_constants(dtype: torch.dtype, eps: float, betas: tuple[float, float]) -> None:
-    if not torch.finfo(dtype).tiny <= eps < math.inf:
-        raise DyngsError(f"Adam: eps must be at least {torch.finfo(dtype).tiny:.3g} and finite, got {eps}")
-    if not all(0 <= beta < 1 for beta in betas):
-        raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
 
 
 def _check(param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rows: Tensor | None, step: int) -> None:

@@ -96,7 +96,8 @@ def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -
     widths = _checked_widths(x, layers, skip)
     dtype = reduce(torch.promote_types, (t.dtype for layer in layers for t in (layer.weight, layer.bias)), x.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    if not has_kernel("perceptron", x.device) or (x.device.type != "cpu" and _is_large(widths)):
+    too_large = x.device.type != "cpu" and (len(layers) > GPU_LAYERS or max(widths) > GPU_WIDTH)
+    if too_large or not has_kernel("perceptron", x.device):
         return reference_perceptron(x, layers, skip=skip)
     params = torch.cat([t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)])
     x = x.to(dtype)
@@ -113,10 +114,6 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
         if i + 1 < len(layers):
             h = h.relu()
     return h
-
-
-def _is_large(widths: list[int]) -> bool:
-    return len(widths) - 1 > GPU_LAYERS or max(widths) > GPU_WIDTH
 
 
 def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:

@@ -59,9 +59,11 @@ def write_gltf(path: Path, splat: SplatFile) -> None:
 def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]:
     """Add the numbers of Gaussians to a document, harmonics up to degree 3; return their primitive."""
     sh = gaussians.sh.numpy()
+    srgb = (sh[:, 0] * SH_C0 + 0.5).clip(0, 1)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     arrays = {
         "POSITION": gaussians.means.numpy(),
-        "COLOR_0": np.concatenate([_linear(sh[:, 0] * SH_C0 + 0.5), gaussians.opacities.numpy()[:, None]], axis=1),
+        "COLOR_0": np.concatenate([linear, gaussians.opacities.numpy()[:, None]], axis=1),
         f"{EXTENSION}:ROTATION": gaussians.quats.numpy()[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": gaussians.scales.numpy(),
         f"{EXTENSION}:OPACITY": gaussians.opacities.numpy()[:, None],
@@ -77,11 +79,6 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
     own = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     own |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    inside = srgb.clip(0, 1)
-    return np.where(inside <= 0.04045, inside / 12.92, ((inside + 0.055) / 1.055) ** 2.4)
 
 
 def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:

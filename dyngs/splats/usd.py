@@ -40,9 +40,11 @@ def read_usd(path: Path) -> SplatFile:
     require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of a USD file")
     with TemporaryDirectory(prefix="dyngs-usd-") as folder:
         out = Path(folder) / "arrays.npz"
+        places = os.pathsep.join(name for name in sys.path if name)  # the child finds the same packages
+        environment = os.environ | {"PYTHONPATH": places, "PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
         command = [sys.executable, "-m", usd_child.__name__, str(path.resolve()), str(out)]
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=_SECONDS, check=False, env=_environment(), errors="replace"
+            command, capture_output=True, text=True, timeout=_SECONDS, check=False, env=environment, errors="replace"
         )
         if done.returncode == 2 and done.stdout.strip():
             raise DyngsError(f"{path}: {done.stdout.strip().splitlines()[-1]:.200}")
@@ -70,7 +72,8 @@ def write_usd(path: Path, splat: SplatFile) -> None:
     prim = vol.ParticleField3DGaussianSplat.Define(stage, "/Gaussians")
     stage.SetDefaultPrim(prim.GetPrim())
     prim.CreatePositionsAttr(vt.Vec3fArray.FromNumpy(gaussians.means.numpy()))
-    prim.CreateOrientationsAttr(_quats(gaussians.quats.numpy(), vt))
+    xyzw = np.ascontiguousarray(gaussians.quats.numpy()[:, [1, 2, 3, 0]])  # USD keeps the real part last in memory
+    prim.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(xyzw))
     prim.CreateScalesAttr(vt.Vec3fArray.FromNumpy(gaussians.scales.numpy()))
     prim.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(gaussians.opacities.numpy()))
     prim.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
@@ -94,11 +97,6 @@ def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
     return sdf, usd, geom, vol
 
 
-def _quats(quats: np.ndarray, types: Any) -> Any:
-    """Return quaternions (N, 4) wxyz as an array of USD, which keeps the real part last in memory."""
-    return types.QuatfArray.FromNumpy(np.ascontiguousarray(quats[:, [1, 2, 3, 0]]))
-
-
 def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     """Return the Gaussians of a prim, in the axes of the stage."""
     degree, means, sh = int(arrays["degree"]), arrays["means"], arrays["sh"]
@@ -112,9 +110,3 @@ def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     if moved is None:
         raise DyngsError(f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting")
     return moved
-
-
-def _environment() -> dict[str, str]:
-    """Return an environment in which the child finds the same packages, and computes with one thread."""
-    found = os.pathsep.join(name for name in sys.path if name)
-    return os.environ | {"PYTHONPATH": found, "PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}

@@ -158,7 +158,9 @@ def decoded(data: bytes) -> Checkpoint:
     end = start + int.from_bytes(body[len(MAGIC) : start], "little")
     try:
         header = _Header.model_validate_json(decompressed(body[start:end], MAX_HEADER, exact=False))
-        _require_small(header, len(body))
+        num_values = sum(math.prod(entry.shape) for entry in header.tensors)
+        if num_values > FREE_VALUES + VALUES_PER_BYTE * len(body):
+            raise DyngsError(f"it claims {num_values} values, more than a file of its size holds")
         tensors: dict[str, Tensor] = {}
         for entry in header.tensors:
             block = body[end : end + entry.size + _FAR_BYTES * entry.far]
@@ -202,9 +204,3 @@ def _tensor(entry: _Entry, block: bytes, coarseness: Tensor | None) -> Tensor:
     coding = Coding(entry.kind, entry.step, entry.by_coarseness)
     rows = checked_coarseness(coarseness, entry.shape[0]) if entry.by_coarseness and coarseness is not None else None
     return from_whole(Whole(numbers, far), coding, _DTYPES[entry.dtype], rows)
-
-
-def _require_small(header: _Header, num_bytes: int) -> None:
-    num_values = sum(math.prod(entry.shape) for entry in header.tensors)
-    if num_values > FREE_VALUES + VALUES_PER_BYTE * num_bytes:
-        raise DyngsError(f"it claims {num_values} values, more than a file of its size holds")

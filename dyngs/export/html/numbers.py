@@ -170,15 +170,14 @@ def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float
     lists.quantised("clip_quats", quats, 16)
     told: dict[str, Any] = {"bones": {"parents": list(skeleton.parents)}}
     if scene.shapes is not None:
-        heads, error = fitted_curves(lambda time: _rest_offsets(scene, time), len(clip), tolerance)
+
+        def offsets(time: float) -> Offsets:
+            found = rest_offsets(scene.anchors, frame_pose(clip.at(time), 0), scene.shapes)
+            return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
+
+        heads, error = fitted_curves(offsets, len(clip), tolerance)
         told["curves"] = _add_curves(Curves(heads, error=error), order, lists)
     return told
-
-
-def _rest_offsets(scene: HumanScene, time: float) -> Offsets:
-    posing = frame_pose(scene.moves_as.at(time), 0)
-    found = rest_offsets(scene.anchors, posing, scene.shapes)
-    return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
 
 
 def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:

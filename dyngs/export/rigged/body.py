@@ -67,7 +67,8 @@ def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
         raise DyngsError(f"the template '{body.name}' is not the one that this person was trained on")
     if body.shape_dirs is None or body.joint_shape_dirs is None:
         return body.vertices
-    rows = _on_the_skin(anchors)
+    rows = torch.nonzero(anchors.height == 0)[:, 0]  # on the skin
+    rows = rows[:: max(len(rows) // _MOST_ROWS, 1)]
     around = body.faces[anchors.face[rows]]
     corners = anchors.barycentric[rows].double()
     mean = (corners[..., None] * body.vertices[around].double()).sum(1)
@@ -77,11 +78,6 @@ def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
     right = torch.cat([x.flatten() for x in offsets])
     betas = torch.linalg.lstsq(left, right[:, None], driver="gelsd").solution[:, 0]
     return apply_shape(body, betas.to(body.vertices))[0]
-
-
-def _on_the_skin(anchors: Anchors) -> Tensor:
-    rows = torch.nonzero(anchors.height == 0)[:, 0]
-    return rows[:: max(len(rows) // _MOST_ROWS, 1)]
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -123,6 +123,8 @@ def texture_size(scene: HumanScene) -> int:
 
 def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointAnimation | None) -> GlbDocument:
     """Return a mesh with its skeleton, texture and animation as a glTF document."""
+    from PIL import Image
+
     document, nodes = GlbDocument(), list[dict[str, Any]]()
     armature, first = add_skeleton(document, rig, nodes)
     nodes.append({"name": "person", "mesh": 0, "skin": 0})
@@ -134,7 +136,9 @@ def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointA
     } | add_weights(document, mesh.weights)
     kind = np.uint16 if len(mesh.vertices) < 2**16 - 1 else np.uint32
     indices = document.add_numbers(mesh.faces.flatten().numpy().astype(kind), INDICES)
-    view = document.add_bytes(_png(image))
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "PNG")
+    view = document.add_bytes(stream.getvalue())
     texture = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
     document.json |= {
         "scene": 0,
@@ -150,11 +154,3 @@ def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointA
     if animation is not None:
         add_animation(document, animation, first)
     return document
-
-
-def _png(image: np.ndarray) -> bytes:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "PNG")
-    return stream.getvalue()

@@ -85,7 +85,8 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
         posing = frame_pose(upright.moves_as, 0)
         skeleton = scene.learned_skeleton
         joints = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
-        seen_along = _turned(blend_transforms(scene.weights, joints)[..., :3], seen_along)
+        linear = blend_transforms(scene.weights, joints)[..., :3]
+        seen_along = torch.nn.functional.normalize((linear @ seen_along[..., None])[..., 0], dim=1)
     basis = harmonics_basis(seen_along, gaussians.sh_degree)
     return ((basis[..., None] * gaussians.sh).sum(1) + 0.5).clamp(0, 1)
 
@@ -108,10 +109,6 @@ def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Te
     fraction = weight / total.clamp_min(1e-8)[:, None]
     first = (fraction.cumsum(1) < _TOP).sum(1, keepdim=True).clamp_max(fraction.shape[1] - 1)
     return (fraction[..., None] * colours).sum(1), total, height.gather(1, first)[:, 0]
-
-
-def _turned(linear: Tensor, directions: Tensor) -> Tensor:
-    return torch.nn.functional.normalize((linear @ directions[..., None])[..., 0], dim=1)
 
 
 @dataclass(frozen=True)

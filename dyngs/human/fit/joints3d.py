@@ -5,6 +5,7 @@ Local letters: K joints of a format, N vertices.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -124,7 +125,10 @@ def _of_json(path: Path) -> _Found:
     if not isinstance(listed, dict) or not listed:
         raise DyngsError(f"{path}: 'joints' must be an object of frames and their joints; export it again")
     require_at_most(path, len(listed), _MOST_FRAMES, "frames")
-    joints = {_key(name): _joints_of(f"{path}, joints of {name:.40}", value) for name, value in listed.items()}
+    joints = {
+        int(name) if re.fullmatch("[0-9]{1,9}", name) else name: _joints_of(f"{path}, joints of {name:.40}", value)
+        for name, value in listed.items()
+    }
     return _checked(path, joints, fields.get("order"), fields.get("space"))
 
 
@@ -173,10 +177,6 @@ def _of_frame_data(path: Path, body: BodyTemplate) -> _Found:
     rows = joints_of_vertices(path, body, vertices) * np.array(_TURNED)
     joints: dict[int | str, np.ndarray] = {i: _joints_of(f"{path}, frame {i}", row) for i, row in enumerate(rows)}
     return _checked(path, joints, "smplx_body", "camera")
-
-
-def _key(name: str) -> int | str:
-    return int(name) if name.isascii() and name.isdigit() and len(name) < 10 else name
 
 
 def _joints_of(where: str, value: object) -> np.ndarray:
