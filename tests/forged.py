@@ -20,8 +20,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import prefixed, tensors_of
-from dyngs.storage.coding import compressed
-from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, _Header, _Info, _stored
+from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, _Header, _Info, _stored, compressed
 from dyngs.storage.tensors import Coding, Kind
 
 Tensors = dict[str, Tensor]

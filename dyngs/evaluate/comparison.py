@@ -14,8 +14,8 @@ from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.evaluate.drawing import Drawing, seconds_in_turn
 from dyngs.evaluate.report import parameter_megabytes, scene_of_split, split_views
+from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
 from dyngs.metrics import psnr
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU

@@ -17,11 +17,10 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
-from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.regions import REGION_METRICS, Regions
 from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
-from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
+from dyngs.evaluate.view_scores import Drawing, PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images

@@ -21,7 +21,7 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
-from dyngs.evaluate.drawing import Drawing
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.metrics import MetricValue
 
 MAX_MOMENTS = 60  # number of training times up to which flicker is measured at all of them

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
+from dyngs.ops.device import sent
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
-from dyngs.ops.transfer import sent
 
 Count: TypeAlias = int | Tensor  # a number, or a tensor () of one that may still be on a GPU, where int waits for it
 

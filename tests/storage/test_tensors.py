@@ -25,10 +25,10 @@ from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.state import Role, part_of
 from dyngs.static.scene import StaticScene
-from dyngs.storage.coding import packed, unpacked
+from dyngs.storage.file import packed, unpacked
 from dyngs.storage.tensors import (
     COARSENESS,
     FIXED_STEPS,

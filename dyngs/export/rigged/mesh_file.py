@@ -12,14 +12,17 @@ import torch
 
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.export.rigged.body import BodyMesh, anchor_normals, body_mesh, rest_vertices
 from dyngs.export.rigged.skeleton import (
+    BodyMesh,
     JointAnimation,
     Rig,
     add_animation,
     add_skeleton,
     add_weights,
+    anchor_normals,
     animation_of,
+    body_mesh,
+    rest_vertices,
     rig_of,
 )
 from dyngs.export.rigged.surface import fitted_surface

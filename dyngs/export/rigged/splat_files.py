@@ -13,9 +13,17 @@ import torch
 
 from dyngs.conventions import SH_C0
 from dyngs.errors import DyngsError
-from dyngs.export.rigged.body import anchor_normals, rest_vertices
 from dyngs.export.rigged.mesh_file import Played, person_and_template
-from dyngs.export.rigged.skeleton import Rig, add_animation, add_skeleton, add_weights, animation_of, rig_of
+from dyngs.export.rigged.skeleton import (
+    Rig,
+    add_animation,
+    add_skeleton,
+    add_weights,
+    anchor_normals,
+    animation_of,
+    rest_vertices,
+    rig_of,
+)
 from dyngs.export.rigged.texture import frontal_colours
 from dyngs.files.gltf import GlbDocument
 from dyngs.files.write import atomic_file

@@ -15,7 +15,7 @@ from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES

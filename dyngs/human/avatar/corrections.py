@@ -15,10 +15,10 @@ from torch import Tensor
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.joints import mirrored_joints
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import sent
 from dyngs.state import Role, fields_moved_to
 
 LR = {

@@ -17,7 +17,7 @@ from dyngs.human.avatar.observations import Subject, in_colours_of
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.clip import captured_motion
+from dyngs.human.motion.motion import captured_motion
 from dyngs.human.template.body_reader import load_template, rest_shape
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Kind, Setting

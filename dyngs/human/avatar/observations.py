@@ -14,7 +14,7 @@ from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
-from dyngs.human.motion.clip import CapturedMotion
+from dyngs.human.motion.motion import CapturedMotion
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
 
 FACING_EXPONENT = 4

@@ -14,7 +14,7 @@ from torch import Tensor
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 from dyngs.ops.posing import pose_by_joints

@@ -31,7 +31,7 @@ from dyngs.human.avatar.posing import (
     pose_gaussians,
     rest_offsets,
 )
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import check_tree
 from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.models.renderable import Renderable, clamped_time

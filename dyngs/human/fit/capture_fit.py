@@ -15,8 +15,7 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.fit.joints3d import Joints3D
-from dyngs.human.fit.keypoints import Keypoints
+from dyngs.human.fit.keypoints import Joints3D, Keypoints
 from dyngs.human.fit.silhouettes import ObservedFrame, longest_box_side, observed_frame, surface_of
 from dyngs.human.fit.solve import (
     FRAMES,
@@ -31,7 +30,7 @@ from dyngs.human.fit.solve import (
     usual,
 )
 from dyngs.human.fit.start import first_poses, num_ticks
-from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
+from dyngs.human.motion.motion import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 
 IMAGE_SIDE = 512  # longest side of the images that are read, px
@@ -63,7 +62,7 @@ class FitEffort:
 class Known:
     """What is known beside images and given poses."""
 
-    joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without
+    joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.keypoints``; None without
     # the capture is one camera that stands at the origin, with a guessed focal length to be refined
     guessed_lens: bool = False
     shape: bool = False  # the body has the shape of the person already

@@ -32,12 +32,11 @@ from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, NewClip, fit_capture, fitted_clips, placed_clip
-from dyngs.human.fit.joints3d import read_joints
-from dyngs.human.fit.keypoints import read_keypoints
+from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.fit.known_person import AvatarPoses, KnownAvatar, known_shape, posed_by_avatar, shape_of, with_shape
 from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
 from dyngs.human.fit.solve import LensFit
-from dyngs.human.motion.clip import CapturedMotion
+from dyngs.human.motion.motion import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES

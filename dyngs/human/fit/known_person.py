@@ -19,7 +19,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted, reading
 from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.clip import CapturedMotion, MotionClip
+from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import rest_shape
 

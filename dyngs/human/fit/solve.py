@@ -18,7 +18,7 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, drawn_silhouettes
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import NUM_BONE_SHAPES
 from dyngs.human.template.joints import JOINT_NAMES

@@ -16,7 +16,7 @@ from dyngs.data.images.maps import silhouette_box
 from dyngs.data.times import evenly_spaced
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface
 from dyngs.human.fit.solve import NUM_TURNED, Fitting, Observations, frame_error, new_fit, prior, usual, usual_pose
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 
 NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor

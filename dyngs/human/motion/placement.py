@@ -9,8 +9,7 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from dyngs.human.motion.clip import MotionClip
-from dyngs.human.motion.motion import Motion, frame_chunks
+from dyngs.human.motion.motion import Motion, MotionClip, frame_chunks
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import sent
 
 
 def axis_angle_to_matrix(poses: Tensor) -> Tensor:

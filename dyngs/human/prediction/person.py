@@ -20,7 +20,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes
-from dyngs.human.motion.clip import captured_motion
+from dyngs.human.motion.motion import captured_motion
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import rest_shape

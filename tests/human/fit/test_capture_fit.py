@@ -29,7 +29,7 @@ from dyngs.human.fit.capture_fit import (
 )
 from dyngs.human.fit.silhouettes import surface_of
 from dyngs.human.fit.solve import body_fit, new_fit
-from dyngs.human.motion.clip import captured_motion
+from dyngs.human.motion.motion import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body_reader import default_template, rest_shape

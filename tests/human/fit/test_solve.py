@@ -31,7 +31,7 @@ from dyngs.human.fit.solve import (
     usual,
     with_lens,
 )
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
 
