@@ -203,7 +203,12 @@ def tracks_of(
     moving = scene_part(scene, "moving") if part == "moving" or not scene.is_static else None
     ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
     kind = np.float64 if any(world_offset) else np.float32
-    _require_room(len(ids), len(times), np.dtype(kind).itemsize)
+    size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
+    if size > MAX_BYTES:
+        raise DyngsError(
+            f"tracks of {len(ids)} Gaussians at {len(times)} times would take {size / 1e9:.1f} GB, the limit is "
+            f"{MAX_BYTES / 1e9:.0f} GB; give fewer --times, or --dynamic for only those that move"
+        )
     positions = np.empty((len(ids), len(times), 3), kind)
     positions[:] = scene.gaussians.means[ids].numpy()[:, None]
     if moving is not None:
@@ -225,15 +230,6 @@ def write_tracks(path: Path, tracks: Tracks) -> Path:
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **asdict(tracks))
     return path
-
-
-def _require_room(count: int, num_times: int, item_bytes: int) -> None:
-    size = 3 * count * num_times * item_bytes
-    if size > MAX_BYTES:
-        raise DyngsError(
-            f"tracks of {count} Gaussians at {num_times} times would take {size / 1e9:.1f} GB, the limit is "
-            f"{MAX_BYTES / 1e9:.0f} GB; give fewer --times, or --dynamic for only those that move"
-        )
 
 
 SUFFIX = ".4dgs"

@@ -88,7 +88,11 @@ def measured_precision(
         return mean_square_change(wanted, draw(completed(rounded(exact, steps, names))))
 
     allowed = (max_change / GREY_LEVELS) ** 2
-    groups = _groups(exact)
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, x in exact.items():
+        group = group_of(name, x)
+        if group is not None and x.numel():
+            groups.setdefault(group, {})[name] = x
     num_values = sum(sum(x.numel() for x in group.values()) for group in groups.values())
     steps, too_coarse = {}, {}
     for name, group in groups.items():
@@ -187,12 +191,3 @@ def _usual_size(values: Tensor) -> tuple[float, float]:
     usual = nonzero.kthvalue(max(int(USUAL_FRACTION * len(nonzero)), 1)).values
     sizes = sizes[sizes <= OUTLYING * usual]
     return float(sizes.max()), float(sizes.square().mean())
-
-
-def _groups(tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    groups: dict[str, dict[str, Tensor]] = {}
-    for name, x in tensors.items():
-        group = group_of(name, x)
-        if group is not None and x.numel():
-            groups.setdefault(group, {})[name] = x
-    return groups

@@ -241,8 +241,12 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     require_positive("clip.scale", state["clip.scale"])
     if not f:
         raise ValueError("the clip has no frame")
-    prefix = "anchors."
-    require_anchors({name.removeprefix(prefix): x for name, x in state.items() if name.startswith(prefix)}, n, j)
+    k = state["anchors.weights"].shape[-1]
+    shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
+    for name, shape in shapes.items():
+        require_tensor(f"anchors.{name}", state[f"anchors.{name}"], shape)
+    require_indices("anchors.joints", state["anchors.joints"], (n, k), j)
+    require_indices("anchors.face", state["anchors.face"], (n,), _MOST_FACES)
     if bool((state["anchors.weights"] < 0).any()) or not bool((state["anchors.weights"].sum(1) > 0).all()):
         raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
     require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
@@ -262,16 +266,6 @@ def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: in
     if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
         raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
     check_tree(tuple(parents.tolist()))
-
-
-def require_anchors(anchors: Mapping[str, Tensor], num_gaussians: int, num_joints: int) -> None:
-    """Check the anchors of N Gaussians on J joints. Raises KeyError or ValueError."""
-    n, k = num_gaussians, anchors["weights"].shape[-1]
-    shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
-    for name, shape in shapes.items():
-        require_tensor(f"anchors.{name}", anchors[name], shape)
-    require_indices("anchors.joints", anchors["joints"], (n, k), num_joints)
-    require_indices("anchors.face", anchors["face"], (n,), _MOST_FACES)
 
 
 def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:

@@ -118,10 +118,18 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
         elif word == "OFFSET" and inside == _END_SITE:
             continue
         elif word == "OFFSET" and inside is not None:
-            joints[inside].offset = _offset(path, joints[inside].name, words[1:])
+            offset = _numbers(path, words[1:])
+            if len(offset) != 3:
+                raise DyngsError(
+                    f"{path}: the OFFSET of '{joints[inside].name}' must be three numbers; export it again"
+                )
+            joints[inside].offset = offset
             without_offset.discard(inside)
         elif word == "CHANNELS" and inside is not None and inside >= 0:
-            joints[inside].channels = _channels(path, joints[inside].name, words[1:])
+            joints[inside].channels = channels = [word.lower() for word in words[2:]]
+            if words[1:2] != [str(len(channels))] or not set(channels) <= set(_CHANNELS):
+                what = "a count and so many of Xposition ... Zrotation"
+                raise DyngsError(f"{path}: the CHANNELS of '{joints[inside].name}' must be {what}")
         else:
             raise DyngsError(f"{path}: HIERARCHY: did not expect '{line.strip():.60}'; export it again")
     if not joints or blocks or announced is not None:
@@ -129,21 +137,6 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
     if without_offset:
         raise DyngsError(f"{path}: the joint '{joints[min(without_offset)].name}' has no OFFSET; export it again")
     return joints
-
-
-def _offset(path: Path, name: str, words: list[str]) -> np.ndarray:
-    offset = _numbers(path, words)
-    if len(offset) != 3:
-        raise DyngsError(f"{path}: the OFFSET of '{name}' must be three numbers; export it again")
-    return offset
-
-
-def _channels(path: Path, name: str, words: list[str]) -> list[str]:
-    """Return the channels of a joint in lower case, in the order of the file."""
-    channels = [word.lower() for word in words[1:]]
-    if words[:1] != [str(len(channels))] or not set(channels) <= set(_CHANNELS):
-        raise DyngsError(f"{path}: the CHANNELS of '{name}' must be a count and so many of Xposition ... Zrotation")
-    return channels
 
 
 def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray, float]:

@@ -99,9 +99,13 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
     train = dict(enumerate(_ring(options.num_cameras)))
     test = {len(train) + i: pose for i, pose in enumerate(_ring_between(options.num_test, options.num_cameras))}
-    clips = {"train": _clip(body, options.num_frames, options.clip_seed, 0)}
+    seed, lengths = options.clip_seed, {"train": options.num_frames}
     if options.num_new and test:
-        clips["pose"] = _clip(body, options.num_new, options.clip_seed, 1)
+        lengths["pose"] = options.num_new
+    if seed is None:
+        clips = {name: (walk if name == "train" else squat)(body, count) for name, count in lengths.items()}
+    else:
+        clips = {name: random_clip(body, n, 2 * seed + (name == "pose")) for name, n in lengths.items()}
     with new_capture(out) as started:
         for name, clip in clips.items():
             motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
@@ -135,12 +139,6 @@ def random_light(seed: int | None) -> Lamp:
     tint = 1.0 + make.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
     red, green, blue = (float(diffuse * part) for part in tint)
     return Lamp((float(np.sin(azimuth)), float(height), float(np.cos(azimuth))), (float(ambient),), (red, green, blue))
-
-
-def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> Motion:
-    if seed is not None:
-        return random_clip(body, num_frames, 2 * seed + which)
-    return squat(body, num_frames) if which else walk(body, num_frames)
 
 
 def render_mesh(
