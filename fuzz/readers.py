@@ -64,7 +64,7 @@ def read_whole_capture(root: Path) -> object:
     from dyngs.data.read import read_capture
     from dyngs.data.tracks import read_tracks
     from dyngs.errors import DyngsError
-    from dyngs.human.motion.clip import captured_motion
+    from dyngs.human.motion.motion import captured_motion
 
     options = DataConfig.model_validate({"root": root})
     try:
@@ -179,7 +179,7 @@ def read_a_body(root: Path) -> object:
 
 def read_a_motion(root: Path) -> object:
     """Read a motion and make it a clip on a small body."""
-    from dyngs.human.motion.clip import motion_clip
+    from dyngs.human.motion.motion import motion_clip
     from dyngs.human.motion.read import read_motion
 
     motion = read_motion(only(root), small_body(55))
@@ -188,7 +188,7 @@ def read_a_motion(root: Path) -> object:
 
 def read_given_joints(root: Path) -> object:
     """Read 3D joints, for two images of a capture."""
-    from dyngs.human.fit.joints3d import read_joints
+    from dyngs.human.fit.keypoints import read_joints
 
     return read_joints(only(root), two_images(root), small_body(24))
 

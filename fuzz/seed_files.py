@@ -28,10 +28,9 @@ from dyngs.kinds import restored_scene
 from dyngs.runs.avatar import _KIND as AVATAR_KIND
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
 from dyngs.splats import formats
-from dyngs.splats.ply import write_ply
 from dyngs.splats.splat_file import SplatFile, with_degree
 from dyngs.state import tensors_of
-from dyngs.storage.file import SceneInfo, encoded
+from dyngs.storage.file import encoded
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
@@ -218,7 +217,7 @@ def write_cubic_glb(root: Path) -> None:
 
 def write_splats(root: Path) -> None:
     """Write a .ply of five Gaussians."""
-    write_ply(root / "a.ply", row_of_balls(), world_offset=(1.0, 2.0, 3.0))
+    formats.write_splats(root / "a.ply", SplatFile(row_of_balls(), world_offset=(1.0, 2.0, 3.0)))
 
 
 def write_packed(name: str, root: Path) -> None:
@@ -369,8 +368,8 @@ def _scene(tensors: dict[str, torch.Tensor], model: SceneModel) -> Scene:
     return restored_scene(Checkpoint(_INFO, tensors), model)
 
 
-def _scene_info() -> SceneInfo:
-    return SceneInfo(step=7, extent=1.0, world_offset=(1, 0, 0), background="white", rasterize_mode="classic")
+def _scene_info() -> CheckpointInfo:
+    return CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
 
 def _moving(kind: str) -> tuple[Config, dict[str, torch.Tensor]]:

@@ -16,7 +16,7 @@ from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template

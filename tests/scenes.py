@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import reference
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
-from dyngs.ops import harmonics, projection, rasterization, reference
+from dyngs.ops import harmonics, projection, rasterization
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.rasterization import Blended, BlendOptions
 

@@ -25,7 +25,7 @@ from dyngs.cli import doctor, export, main
 from dyngs.cli.train import parse_config
 from dyngs.config.io import load_config, save_config
 from dyngs.errors import DyngsError, reading
-from dyngs.splats.ply import read_ply
+from dyngs.splats.formats import read_splats
 
 VERBS = (
     "demo",
@@ -502,7 +502,7 @@ def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: Captur
         return capsys.readouterr().out
 
     def x_of(path: Path) -> list[float]:
-        return read_ply(path).gaussians.means[:, 0].tolist()
+        return read_splats(path).gaussians.means[:, 0].tolist()
 
     every, moving, still = (0, 1, 2, 3, 4), (1, 3), (0, 2, 4)
     assert "note: this is time 0" in export()

@@ -41,6 +41,7 @@ WITHOUT_MIRROR = {
     "test_fuzz.py": "about all readers, by the folder fuzz beside the tests",
     "test_layout.py": "about the repository, not one module",
     "test_quality.py": "about training as a whole, on small captures",
+    "test_reference.py": "about the reference that the kernels are tested against",
     "test_numerics.py": "the table of docs/numerics.md",
 }
 

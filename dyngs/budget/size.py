@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,17 +13,16 @@ from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
 from dyngs.kinds import GaussianTrainer, restored_scene
-from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.ops.device import CPU
 from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores, probe_images, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
-from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
+from dyngs.storage.file import decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
-from dyngs.storage.quantize import step_below
-from dyngs.storage.tensors import drawable
+from dyngs.storage.tensors import drawable, step_below
 
 KEPT = 0.7
 """Fraction of the Gaussians that each trial keeps of those of the trial before."""
@@ -98,14 +97,13 @@ def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> S
     images = probe_images(trainer)
     before = quality_of(trainer, scene, images)
     plan = storage_plan(config, whole, scene, None)
-    info = SceneInfo(**asdict(whole.info))
 
     def stored(kept: Scene, coarseness: Tensor | None) -> _File | None:
-        found = _fitted(info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
+        found = _fitted(whole.info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
         if found is None:
             return None
         data, coarser = found
-        read = restored_scene(Checkpoint(whole.info, decoded(data).tensors), config.model)
+        read = restored_scene(decoded(data), config.model)
         return _File(data, quality_of(trainer, read, images), len(kept), coarser)
 
     chosen = stored(scene, plan.coarseness)
@@ -126,7 +124,7 @@ def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> S
 
 
 def _fitted(
-    info: SceneInfo, scene: Scene, coarseness: Tensor | None, steps: Mapping[str, float], most: int
+    info: CheckpointInfo, scene: Scene, coarseness: Tensor | None, steps: Mapping[str, float], most: int
 ) -> tuple[bytes, float] | None:
     """Return the bytes of a file of at most ``most``, and the factor on ``steps`` that this took; None: none fits."""
     num_values = sum(x.numel() for x in drawable(scene).values())

@@ -20,7 +20,7 @@ from dyngs.budget.run import LimitedRun, stage, two_digits
 from dyngs.config import Config
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
-from dyngs.evaluate.drawing import Drawing
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import flip, ssim

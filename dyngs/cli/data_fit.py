@@ -11,7 +11,7 @@ from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import as_word
 
 if TYPE_CHECKING:
-    from dyngs.human.fit.inputs import KnownAvatar
+    from dyngs.human.fit.known_person import KnownAvatar
 
 _GIVEN = ("keypoints", "masks", "background", "joints", "body", "person")
 
@@ -65,8 +65,7 @@ def add_parser(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 
 def run_fit(arguments: argparse.Namespace) -> int:
     """Fit a body and print how good the fit is, and the next command."""
-    from dyngs.human.fit.fitted_capture import write_fitted_capture
-    from dyngs.human.fit.inputs import FitInputs
+    from dyngs.human.fit.fitted_capture import FitInputs, write_fitted_capture
 
     options = data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
     given = FitInputs(**{name: getattr(arguments, name) for name in _GIVEN}, avatar=_avatar_in(arguments.person))
@@ -84,7 +83,7 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
     if person is None or not (person / RESOLVED_NAME).is_file():
         return None
     from dyngs.human.avatar.scene import avatar_of
-    from dyngs.human.fit.inputs import KnownAvatar
+    from dyngs.human.fit.known_person import KnownAvatar
     from dyngs.runs.checkpoint import load_run
 
     run = load_run(person)

@@ -298,9 +298,8 @@ def _redrawn(opened: Opened, scene: Scene, time: float, written: Written) -> Red
 
 def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]) -> list[Path]:
     """Write all times as one file of moving Gaussians."""
-    from dyngs.export.moving_file import SUFFIX, UP, read_moment, write_moving
     from dyngs.export.redrawn import compare_run
-    from dyngs.export.splat_files import scene_part, writing_of
+    from dyngs.export.splat_files import SUFFIX, UP, read_moment, scene_part, write_moving, writing_of
 
     if arguments.sh_degree is not None:
         raise DyngsError(f"--sh-degree does not go with --format {MOVING}, which holds no harmonics")
@@ -318,7 +317,7 @@ def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[f
 
 
 def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None) -> list[Path]:
-    from dyngs.export.tracks import tracks_of, write_tracks
+    from dyngs.export.splat_files import tracks_of, write_tracks
 
     part = "moving" if arguments.dynamic else "all"
     tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.ops.transfer import Upload
+from dyngs.ops.device import Upload
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ from dyngs.data.images.images import (
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.errors import DyngsError
 from dyngs.files.containment import images_up_to
-from dyngs.ops.device import CPU, gpu_memory
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import CPU, gpu_memory, sent
 
 FULLY_KEPT = 1 - 1e-4  # mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
 

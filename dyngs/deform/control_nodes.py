@@ -24,7 +24,7 @@ from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, tu
 from dyngs.deform.spline_fit import SPAN, cubic_fractions, refitted
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import sent
 from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 

@@ -14,36 +14,29 @@ from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.evaluate.drawing import Drawing, seconds_in_turn
 from dyngs.evaluate.report import parameter_megabytes, scene_of_split, split_views
+from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
 from dyngs.metrics import psnr
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 
-COMPARED_VIEWS = 20
-"""Number of views compared per split; enough for before and after, not for a benchmark."""
+COMPARED_VIEWS = 20  # number of views compared per split; enough for before and after, not for a benchmark
 ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Quality, size and speed of a run.
-
-    Attributes:
-        psnr_train, psnr_test: means over at most 20 views, dB; None without such a split.
-        fps: one over the median time of drawing a view, deformation included.
-        megabytes: float32 parameters, the field and masks, in 1e6 bytes.
-        stored: size of the file in 1e6 bytes, where the run is only there as one; else None.
-    """
+    """Quality, size and speed of a run."""
 
     num_gaussians: int
+    # ``psnr_train, psnr_test``: means over at most 20 views, dB; None without such a split
     psnr_train: float | None
     psnr_test: float | None
-    fps: float
-    megabytes: float
-    stored: float | None = None
+    fps: float  # one over the median time of drawing a view, deformation included
+    megabytes: float  # float32 parameters, the field and masks, in 1e6 bytes
+    stored: float | None = None  # size of the file in 1e6 bytes, where the run is only there as one; else None
 
 
 def compared(
@@ -76,7 +69,6 @@ def _stored(folder: Path) -> float | None:
 
 
 def _psnrs(drawings: Sequence[Drawing], images: Sequence[Image]) -> list[float]:
-    """Return the mean PSNR of each drawing, dB."""
     truths = [(image, image.composite(drawings[0].background)) for image in images]
     return [
         fmean(psnr(drawing.image(image.cameras, image.time), truth, image.mask) for image, truth in truths)
@@ -87,7 +79,6 @@ def _psnrs(drawings: Sequence[Drawing], images: Sequence[Image]) -> list[float]:
 def _views(
     runs: Sequence[LoadedRun], capture: Capture, split: str, device: torch.device
 ) -> tuple[list[Drawing], list[Image]]:
-    """Return one drawing per run as a split shows it, and some images of that split."""
     config = runs[0].config
     loader = ImageLoader(split_views(capture, split), config.data)
     loader.device = device

@@ -19,12 +19,10 @@ from dyngs.metrics import psnr
 RegionMetric = Literal["psnr_foreground", "psnr_moving", "psnr_static"]
 REGION_METRICS: tuple[RegionMetric, ...] = ("psnr_foreground", "psnr_moving", "psnr_static")
 
-FEWEST_PIXELS = 25
-"""A region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing."""
+FEWEST_PIXELS = 25  # a region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing
 CHANGE = 0.05
 """Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as moving."""
-MEDIAN_IMAGES = 31
-"""Number of images, spread over the clip, from which a camera's median is taken."""
+MEDIAN_IMAGES = 31  # number of images, spread over the clip, from which a camera's median is taken
 FEWEST_IMAGES = 3
 
 NO_ALPHA = "the images have no alpha and no silhouettes"
@@ -34,17 +32,11 @@ TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
 
 
 class Regions:
-    """The regions of the images of one split.
+    """The regions of the images of one split; ``loader`` holds those of ``views``, ``background`` (3,) is behind them.
 
     The foreground is where the true image is not fully transparent. What moves is known, in this order, from motion
-    masks that the views come with, and from the truth's change over time before cameras that stand still: where it
-    differs by ``CHANGE`` from the camera's median over time, less single pixels. What is left does not move. Where
-    there is a foreground, both are parts of it, so that an empty background counts nowhere.
-
-    Args:
-        views: the split.
-        loader: images of ``views``, in their order.
-        background: (3,) colour behind the truth.
+    masks, and before cameras that stand still from pixels that differ by ``CHANGE`` from their median over time. What
+    is left does not move. Where there is a foreground, both are parts of it.
     """
 
     def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:
@@ -62,7 +54,8 @@ class Regions:
 
     def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[str, float | None]:
         """Return the PSNR of a view's regions, dB, by metric; None for too few such pixels, or unknown ones."""
-        foreground, moves = foreground_of(image), self.moving(image)
+        moves = self.moving(image)
+        foreground = None if image.alpha is None else image.alpha > 0
         self._has_alpha |= foreground is not None
         inside = torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
         parts = {
@@ -74,10 +67,9 @@ class Regions:
 
     def moving(self, image: Image) -> Tensor | None:
         """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
-        given = given_motion(image)
-        if given is not None:
+        if image.moves is not None:
             self._moving_from.add("motion masks")
-            return given
+            return image.moves >= 0.5
         indices = self._cameras.get(image.name)
         if indices is None:
             return None
@@ -106,16 +98,6 @@ class Regions:
             shown = [(255 * self._loader[i].composite(self._background).clamp(0, 1)).round().byte() for i in chosen]
             self._medians[key] = torch.stack(shown).median(dim=0).values
         return self._medians[key].float() / 255
-
-
-def foreground_of(image: Image) -> Tensor | None:
-    """Return (H, W) bool, the pixels that are not fully transparent; None where the image has no alpha."""
-    return None if image.alpha is None else image.alpha > 0
-
-
-def given_motion(image: Image) -> Tensor | None:
-    """Return (H, W) bool, the pixels of which the view's motion mask says that they move; None without one."""
-    return None if image.moves is None else image.moves >= 0.5
 
 
 def _psnr_inside(part: Tensor | None, image: Image, rendered: Tensor, truth: Tensor) -> float | None:

@@ -17,51 +17,93 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
-from dyngs.evaluate.drawing import Drawing
-from dyngs.evaluate.own_poses import PoseRefinement, images_of_split, scores_from_own_poses
 from dyngs.evaluate.regions import REGION_METRICS, Regions
 from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, psnr_per_time
 from dyngs.evaluate.tracks import TrackScores, track_scores
-from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
+from dyngs.evaluate.view_scores import Drawing, PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene
-from dyngs.metrics import LpipsNet, MetricValue, load_lpips
+from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
+from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
+from dyngs.runs.cameras import found_corrections
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
+from dyngs.training.corrections.camera_fit import fitted_to_image
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """Scores from poses that were fitted to the tested images; None where that was not done."""
+
+    psnr: float | None = None  # from cameras, or of a person from body poses, fitted to the whole images
+    to_images: PoseScores | None = None  # of a person, all scores of these
+    # of a person, from poses fitted to the silhouettes alone; None without silhouettes
+    to_silhouettes: PoseScores | None = None
+
+
+def scores_from_own_poses(drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips) -> PoseRefinement:
+    """Return the scores of images from poses that were fitted to them; the scene stays as it is."""
+    avatar = avatar_of(drawing.scene)
+    if avatar is None:
+        return PoseRefinement(psnr_from_own_poses(drawing, images, size))
+    outlined = all(images[i].alpha is not None for i in range(len(images)))
+    whole = _person_scores(avatar, drawing, images, lpips, IMAGES)
+    outlines = _person_scores(avatar, drawing, images, lpips, SILHOUETTES) if outlined else None
+    return PoseRefinement(whole.psnr, whole, outlines)
+
+
+def _person_scores(
+    avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
+) -> PoseScores:
+    fitted = fitted_to_images(avatar, images, drawing.background, avatar.options, comparison)
+    each = (images[i] for i in range(len(images)))
+    views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
+    return PoseScores(**means_of(views), updates=fmean(fitted.updates), per_view=tuple(views))
+
+
+def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
+    """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in world units."""
+    scene, background = require_gaussians(drawing.scene, "what cameras are fitted to"), drawing.background
+    options = scene.options
+    scores: list[float] = []
+    for image in (images[i] for i in range(len(images))):
+        fitted = fitted_to_image(scene, image, background, size, options=options)
+        with torch.no_grad():
+            rendering = scene.render(fitted.cameras, image.time, options=options, background=background)
+        scores.append(psnr(rendering.rgb[0], image.composite(background), image.mask))
+    return fmean(scores)
+
+
+def images_of_split(capture: Capture, views: Sequence[View], run_dir: Path, run: LoadedRun) -> ImageLoader:
+    """Return the images of ``views``, a split of ``capture``, with the cameras that training found, if any.
+
+    Images that were not trained on have the lens that they share with others, and the pose of a camera that stands
+    still; all other poses are those of the capture.
+    """
+    images = ImageLoader(views, run.config.data)
+    found = found_corrections(run_dir, run, capture.splits["train"])
+    if found is not None:
+        images.corrected = lambda index, cameras: found.applied_to(images.views[index], cameras)
+    return images
 
 
 @dataclass(frozen=True)
 class EvalReport:
-    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see docs/formats.md.
-
-    Attributes:
-        width, height: size of the first view in pixels.
-        psnr, ssim, flip, lpips and the like: means over the views of what ``ViewScore`` holds, None where one has none.
-        psnr_foreground, psnr_moving, psnr_static: means over the views that have such a region (``Regions``).
-        model_mb: float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per
-            Gaussian.
-        field_mb: of these, the field's.
-        colour_floats: numbers per Gaussian that its colour takes, with its fraction of a network.
-        fps: one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and
-            metrics not counted.
-        deform_fraction: median fraction of that time that the deformation takes.
-        stored_mb: size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others.
-        reasons: metric name to why it is None.
-        notes: anything else that a reader of the numbers should know.
-        moving_from: how it was found what moves, None where it was not.
-        track_error_px, track_within_5px, track_motion_px: see ``TrackScores``.
-        psnr_own_poses, own_poses, silhouette_poses: see ``PoseRefinement``; None where that was not requested.
-    """
+    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see docs/formats.md."""
 
     split: str
     num_views: int
+    # ``width, height``: size of the first view in pixels
     width: int
     height: int
     background: str
+    # ``psnr, ssim, flip, lpips and the like``: means over the views of what ``ViewScore`` holds, None where one has
+    # none
     psnr: float
     ssim: float
     flip: float | None
@@ -70,31 +112,37 @@ class EvalReport:
     num_gaussians: int
     num_moving: int
     moving_fraction: float
+    # float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12 bytes per Gaussian
     model_mb: float
-    field_mb: float
-    colour_floats: float
+    field_mb: float  # of these, the field's
+    colour_floats: float  # numbers per Gaussian that its colour takes, with its fraction of a network
+    # one over the median time of drawing one view, after a warm-up: deformation and rendering; loading and metrics not
+    # counted
     fps: float
-    deform_fraction: float
+    deform_fraction: float  # median fraction of that time that the deformation takes
     seconds_train: float
     step: int
     flicker: float | None = None
     flicker_error: float | None = None
     psnr_per_time: tuple[TimeScore, ...] = ()
-    reasons: dict[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    reasons: dict[str, str] = field(default_factory=dict)  # metric name to why it is None
+    notes: tuple[str, ...] = ()  # anything else that a reader of the numbers should know
     per_view: tuple[ViewScore, ...] = ()
     psnr_person: float | None = None
     ssim_person: float | None = None
-    stored_mb: float | None = None
+    stored_mb: float | None = None  # size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others
+    # ``psnr_foreground, psnr_moving, psnr_static``: means over the views that have such a region (``Regions``)
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
-    moving_from: str | None = None
+    moving_from: str | None = None  # how it was found what moves, None where it was not
+    # ``track_error_px, track_within_5px, track_motion_px``: see ``TrackScores``
     track_error_px: float | None = None
     track_within_5px: float | None = None
     track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
+    # ``psnr_own_poses, own_poses, silhouette_poses``: see ``PoseRefinement``; None where that was not requested
     psnr_own_poses: float | None = None
     psnr_black: float | None = None
     ssim_black: float | None = None
@@ -120,16 +168,9 @@ def evaluate_run(
 ) -> EvalReport:
     """Return the report of a run on one split and write it into its folder: ``metrics.json``, ``metrics_SPLIT.json``.
 
-    Args:
-        run_dir: folder of a run with at least one checkpoint.
-        split: "test", "val", "train" or "pose".
-        lpips_net: "alex", "vgg" or "squeeze".
-        threads: for rendering and metrics; 0 leaves the number as it is.
-        refine_poses: also score from poses, of a person's body, otherwise of the cameras, that were refined on the
-            images themselves; always done for a run that refined its cameras.
-        device: "auto", "cpu" or "cuda": draws the views, and compares images, but for FLIP.
-        data_root: where the capture lies by now, if it was moved.
-        capture: of the run, if it was read already.
+    ``threads``: 0 leaves their number as it is. ``refine_poses``: also score from poses of a person, else of the
+    cameras, that were fitted to the images themselves; always done for a run that refined its cameras. ``data_root``:
+    where the capture lies by now. ``capture``: of the run, if it was read already.
     """
     draws_on = device_for(device)
     _require_possible(run_dir, split, refine_poses)
@@ -145,7 +186,8 @@ def evaluate_run(
         regions = Regions(views, loader, drawing.background)
         images, lpips = (loader[i] for i in range(len(loader))), load_lpips(lpips_net, draws_on)
         scores, reasons = score_views(scene, images, drawing.options, drawing.background, lpips, regions)
-        temporal = _temporal(drawing, loader, views)
+        temporal = {"flicker": flicker_of_split(drawing, loader, views)}
+        temporal["flicker_error"] = flicker_error(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
         asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
         fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips) if asked else PoseRefinement()
@@ -180,7 +222,6 @@ def _require_possible(run_dir: Path, split: str, refine_poses: bool) -> None:
 
 
 def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
-    """Return the fields of a report that no image is needed for."""
     facts = {
         "seconds_train": run.seconds_train,
         "step": run.step,
@@ -231,16 +272,7 @@ def report_path(run_dir: Path, split: str) -> Path:
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
 
 
-def _temporal(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> dict[str, MetricValue]:
-    """Return the flicker of a split, and the error of its changes in time."""
-    return {
-        "flicker": flicker_of_split(drawing, loader, views),
-        "flicker_error": flicker_error(drawing, loader, views),
-    }
-
-
 def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:
-    """Return the errors of the scene's motion where the capture has true tracks."""
     tracks = read_true_tracks(capture.root, capture.world_offset)
     cameras = training_cameras(views, run.config.data)
     if not isinstance(scene, Scene):
@@ -258,7 +290,6 @@ def parameter_megabytes(scene: Scene) -> float:
 
 
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
-    """Return notes on how to read the numbers."""
     notes = []
     if run.step < run.config.total_steps:
         notes.append(
@@ -276,7 +307,6 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
 
 @contextmanager
 def _num_threads(threads: int) -> Iterator[None]:
-    """Run the block with ``threads`` threads (0 = as they are)."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads or before)
     try:

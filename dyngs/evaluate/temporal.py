@@ -21,11 +21,10 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
-from dyngs.evaluate.drawing import Drawing
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.metrics import MetricValue
 
-MAX_MOMENTS = 60
-"""Number of training times up to which flicker is measured at all of them."""
+MAX_MOMENTS = 60  # number of training times up to which flicker is measured at all of them
 
 _SAMPLED_TRIPLES = MAX_MOMENTS // 3
 _NO_TIMES = "the images have no times"
@@ -63,15 +62,9 @@ def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeSco
 def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
     """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one camera, without truth.
 
-    Smooth motion has little of it, flickering much. Where moments are not evenly spaced, R_k is compared with the
-    straight line between its neighbours: 2 |w R_{k-1} + (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} -
-    t_{k-1}), which is the same for even ones. Of more than 60 moments, 20 triples of neighbours are taken, evenly
-    spaced. A scene in which nothing moves has 0.
-
-    Args:
-        drawing: what is drawn.
-        cameras: one camera.
-        times: distinct, ascending; those of training.
+    Where moments are not evenly spaced, R_k is compared with the straight line between its neighbours: 2 |w R_{k-1} +
+    (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 moments, 20 triples of
+    neighbours are taken, evenly spaced. A scene in which nothing moves has 0.
     """
     if drawing.scene.is_static:
         return MetricValue(0.0)
@@ -79,11 +72,13 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
         return MetricValue(None, f"needs at least three training times, there are {len(times)}")
     seen: dict[int, Tensor] = {}
     values = []
-    for k in _middles(len(times)):
+    last = len(times) - 1
+    sampled = np.linspace(1, last - 1, _SAMPLED_TRIPLES).round().astype(int).tolist()
+    for k in range(1, last) if last < MAX_MOMENTS else sampled:
         seen = {i: seen[i] if i in seen else drawing.image(cameras, times[i]).clamp(0, 1) for i in (k - 1, k, k + 1)}
         before, now, after = (times[i] for i in (k - 1, k, k + 1))
         line = torch.lerp(seen[k + 1], seen[k - 1], (after - now) / (after - before))
-        values.append(2 * 255 * _mean_change(line, seen[k]))
+        values.append(2 * 255 * float((line - seen[k]).abs().double().mean()))
     return MetricValue(fmean(values))
 
 
@@ -116,19 +111,8 @@ def flicker_of_split(drawing: Drawing, loader: ImageLoader, views: Sequence[View
     return flicker(drawing, loader[0].cameras, drawing.scene.times)
 
 
-def _middles(num_times: int) -> list[int]:
-    """Return the indices of the moments that are compared with their neighbours."""
-    if num_times <= MAX_MOMENTS:
-        return list(range(1, num_times - 1))
-    return np.linspace(1, num_times - 2, _SAMPLED_TRIPLES).round().astype(int).tolist()
-
-
 def _signed_error(drawing: Drawing, image: Image) -> tuple[Tensor, Tensor]:
     """Return (H, W, 3) render minus truth and its mask (H, W): R' - R - (G' - G) is the difference of two of them."""
     truth = image.composite(drawing.background).clamp(0, 1)
     counts = torch.ones(truth.shape[:2], device=truth.device) if image.mask is None else image.mask
     return drawing.image(image.cameras, image.time).clamp(0, 1) - truth, counts
-
-
-def _mean_change(a: Tensor, b: Tensor) -> float:
-    return float((a - b).abs().double().mean())

@@ -18,10 +18,8 @@ from dyngs.data.times import SAME_TIME
 from dyngs.data.tracks import TRACKS_FILE, TrueTracks
 from dyngs.gaussians.scene import Scene
 
-CARRIERS = 4
-"""K, nearest Gaussians that carry a point, weighted by opacity."""
-MIN_OPACITY = 0.3
-"""Fainter Gaussians carry nothing."""
+CARRIERS = 4  # K, nearest Gaussians that carry a point, weighted by opacity
+MIN_OPACITY = 0.3  # fainter Gaussians carry nothing
 CLOSE_PX = 5.0
 
 NO_TRACKS = f"the capture has no {TRACKS_FILE}"
@@ -31,36 +29,23 @@ NONE_OPAQUE = f"no Gaussian is more opaque than {MIN_OPACITY:g}"
 
 @dataclass(frozen=True)
 class TrackScores:
-    """Errors of tracks over all pairs of a view and a point that it shows; None where ``reason`` says why.
+    """Errors of tracks over all pairs of a view and a point that it shows; None where ``reason`` says why."""
 
-    Attributes:
-        error_px: mean distance in the image between where the model carries a point and where it truly is.
-        within_5px: fraction of distances below ``CLOSE_PX``.
-        motion_px: mean distance of a model in which nothing moves, for comparison.
-    """
-
+    # mean distance in the image between where the model carries a point and where it truly is
     error_px: float | None = None
-    within_5px: float | None = None
-    motion_px: float | None = None
+    within_5px: float | None = None  # fraction of distances below ``CLOSE_PX``
+    motion_px: float | None = None  # mean distance of a model in which nothing moves, for comparison
     reason: str | None = None
 
 
 def track_scores(
-    scene: Scene,
-    tracks: TrueTracks | None,
-    split: Sequence[tuple[View, Cameras]],
-    views: Sequence[View],
+    scene: Scene, tracks: TrueTracks | None, split: Sequence[tuple[View, Cameras]], views: Sequence[View]
 ) -> TrackScores:
-    """Return the errors of a scene's motion in the images of a split.
+    """Return the errors of a scene's motion in the images of a split, of which each view has its camera.
 
-    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any
-    view shows it; from there their mean displacement carries it. Distances are at most the diagonal of the image.
-
-    Args:
-        scene: whose motion is measured.
-        tracks: of its capture, in the same world; None without any.
-        split: views that are measured, each with its camera at the size of the evaluated image.
-        views: of all splits.
+    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any of
+    ``views``, of all splits, shows it; from there their mean displacement carries it. Distances are at most the
+    diagonal of the image.
     """
     if tracks is None:
         return TrackScores(reason=NO_TRACKS)
@@ -93,21 +78,13 @@ def track_scores(
 
 @dataclass(frozen=True)
 class _Bound:
-    """Points and the Gaussians that carry them.
+    """Points and the Gaussians that carry them."""
 
-    Attributes:
-        points: (P, 3) where they were bound, NaN where they were not.
-        times: (P,) when they were bound, NaN where they were not.
-        carriers: (P, K) rows of Gaussians.
-        weights: (P, K), each row sums to 1.
-        positions: (P, K, 3) of the carriers when they were bound.
-    """
-
-    points: np.ndarray
-    times: np.ndarray
-    carriers: np.ndarray
-    weights: np.ndarray
-    positions: np.ndarray
+    points: np.ndarray  # (P, 3) where they were bound, NaN where they were not
+    times: np.ndarray  # (P,) when they were bound, NaN where they were not
+    carriers: np.ndarray  # (P, K) rows of Gaussians
+    weights: np.ndarray  # (P, K), each row sums to 1
+    positions: np.ndarray  # (P, K, 3) of the carriers when they were bound
 
     def carried(self, scene: Scene, time: float) -> np.ndarray:
         """Return the (P, 3) points at ``time``."""

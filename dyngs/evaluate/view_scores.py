@@ -1,11 +1,7 @@
-"""Scores of single views, and their means.
+"""Scores of single views, and their means: the render against the truth, and how long it took to draw.
 
-Everything is measured on one view at a time: the render against the truth, and how long it took to draw.
-
-Most of an image of a person is background, which costs nothing to get right: on black, as published figures have it,
-the same render scores many dB more than inside the person's box. Where training images differ in exposure and white
-balance, so do test images: the published protocol (Martin-Brualla et al. 2021) fits what is particular to a test image
-on its left half, and scores the right half.
+Of people also inside their box, and on black, as published figures have it. Where training images differ in exposure,
+so do test images: the published protocol (Martin-Brualla et al. 2021) fits the left half, and scores the right half.
 """
 
 from __future__ import annotations
@@ -17,9 +13,11 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
@@ -32,12 +30,51 @@ from dyngs.ops.device import finish
 
 
 @dataclass(frozen=True)
+class Drawing:
+    """A scene and how it is drawn."""
+
+    scene: Renderable
+    options: DrawOptions  # as in training, without depth
+    background: Tensor  # (3,) colour
+    scale: float = 1.0  # width and height drawn, relative to those of the image
+
+    @torch.no_grad()
+    def image(self, cameras: Cameras, time: float | None) -> Tensor:
+        """Return the image (H, W, 3) of the one camera at ``time``; upscaled bilinearly if ``scale`` < 1."""
+        small = cameras.scaled(self.scale)
+        rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[0]
+        size = (cameras.height, cameras.width)
+        if rgb.shape[:2] == size:
+            return rgb
+        upscaled = torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None], size=size, mode="bilinear")
+        return upscaled[0].permute(1, 2, 0)
+
+
+def seconds_in_turn(drawings: Sequence[Drawing], images: Sequence[Image], rounds: int) -> np.ndarray:
+    """Return the seconds (D, ``rounds`` * I) that each of D drawings takes for each image.
+
+    All draw each image in turn, starting with another one each time, so that other load on the machine affects all
+    alike. ``images``: I; their cameras and times are drawn.
+    """
+    seconds = np.zeros((len(drawings), rounds * len(images)))
+    for drawing in drawings:
+        drawing.image(images[0].cameras, images[0].time)  # warm-up
+    for column in range(seconds.shape[1]):
+        image = images[column % len(images)]
+        for turn in range(len(drawings)):
+            row = (column + turn) % len(drawings)
+            start = time.perf_counter()
+            finish(drawings[row].image(image.cameras, image.time).device)
+            seconds[row, column] = time.perf_counter() - start
+    return seconds
+
+
+@dataclass(frozen=True)
 class ViewScore:
     """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
 
-    ``render_seconds`` holds ``deform_seconds``; ``time`` is None for a still capture. Of people, ``psnr_person``
-    and ``ssim_person`` are those inside the person's box, and ``psnr_black``, ``ssim_black`` and ``lpips_black`` those
-    of the whole image on black.
+    ``render_seconds`` holds ``deform_seconds``. Of people, ``psnr_person`` and ``ssim_person`` are inside the person's
+    box, ``psnr_black``, ``ssim_black`` and ``lpips_black`` of the full image on black.
     """
 
     name: str
@@ -64,11 +101,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class PoseScores:
-    """Means over views of a person in poses that were fitted to these views themselves; names as in ``ViewScore``.
-
-    Attributes:
-        updates: mean number of updates that the pose of a moment took.
-    """
+    """Means over views of a person in poses that were fitted to these views themselves; names as in ``ViewScore``."""
 
     psnr: float
     ssim: float
@@ -78,7 +111,7 @@ class PoseScores:
     psnr_black: float | None
     ssim_black: float | None
     lpips_black: float | None
-    updates: float
+    updates: float  # mean number of updates that the pose of a moment took
     per_view: tuple[ViewScore, ...]
 
 
@@ -92,13 +125,8 @@ def score_views(
 ) -> tuple[list[ViewScore], dict[str, str]]:
     """Return scores of the Gaussians against images, and the reasons for metrics that are None.
 
-    Args:
-        scene: what to draw, at the time of each image; on the device of all else.
-        images: truth and camera of each view, drawn one at a time.
-        options: as in training, without depth.
-        background: (3,) colour behind both the truth and the render.
-        lpips: from ``load_lpips``.
-        regions: of the split of the images; None: they are not measured.
+    The scene is drawn at the time of each image on ``background`` (3,); ``regions`` are of the split, None: not
+    measured.
     """
     scores: list[ViewScore] = []
     reasons: dict[str, str] = {}
@@ -138,7 +166,7 @@ def score_views(
 
 def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips: Lpips) -> dict[str, float | None]:
     """Return the scores by their names in ``ViewScore``; none where nobody is to be seen."""
-    box = person_box(image)
+    box = None if image.alpha is None else silhouette_box(image.alpha)
     if box is None:
         return {}
     truth, mask, rendered = image.composite(background), image.mask, rendering.rgb[0]
@@ -151,11 +179,6 @@ def person_scores(image: Image, rendering: Rendering, background: Tensor, lpips:
         "ssim_black": ssim(black, image.rgb_premultiplied, mask),
         "lpips_black": lpips(black, image.rgb_premultiplied, mask).value,
     }
-
-
-def person_box(image: Image) -> tuple[slice, slice] | None:
-    """Return rows and columns of the smallest box around opaque pixels; None without alpha or where there are none."""
-    return None if image.alpha is None else silhouette_box(image.alpha)
 
 
 def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float | None]:

@@ -21,18 +21,10 @@ _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 def write_cameras(path: Path, capture: Capture, splits: Mapping[Split, Sequence[View]]) -> Path:
-    """Write cameras in nerfstudio's layout, and the capture's points beside them; return ``path``.
+    """Write cameras of train, val and test in nerfstudio's layout, and the capture's points; return ``path``.
 
-    Images stay where they are: ``file_path`` is the way to them from the folder of ``path``. Poses are in the world
-    of the capture's files. Coefficients of distortion are those of the capture.
-
-    Args:
-        path: the file.
-        capture: whose views they are.
-        splits: views of train, val and test, with the cameras to write.
-
-    Raises:
-        DyngsError: the folder cannot be written.
+    ``file_path`` is the way to the images from the folder of ``path``. Poses are in the world of the capture's files;
+    coefficients of distortion are those of the capture.
     """
     for out in (path, path.with_name(POINTS_NAME)):
         inputs_of(capture).require_output(out)
@@ -97,7 +89,6 @@ def _way(file: Path, folder: Path) -> str:
 
 
 def _write_points(path: Path, points: PointCloud, offset: np.ndarray) -> None:
-    """Write points with their colours as a binary .ply."""
     colours = ("red", "green", "blue")
     rows = np.empty(len(points.xyz), dtype=[*((name, "<f8") for name in "xyz"), *((name, "u1") for name in colours)])
     for i, name in enumerate("xyz"):

@@ -24,40 +24,32 @@ from dyngs.splats.rotation import AXES, with_scene
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
-_SAMPLED_TIMES = 8
-"""Times of a motion whose Gaussians the images of an orbit must hold."""
+_SAMPLED_TIMES = 8  # times of a motion whose Gaussians the images of an orbit must hold
 _RING = 24
 
 
 @dataclass(frozen=True)
 class PathOptions:
-    """Cameras and times to render.
+    """Cameras and times to render."""
 
-    Attributes:
-        path: "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None:
-            one fixed camera.
-        num_frames: frames of a path that is not a file; None: as many as a motion has, else 120.
-        size: width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file.
-        times: scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view
-            for a fixed camera, from 0 to 1 along a path.
-        view: the view of the fixed camera: its name, the name of its image, or its number from 0.
-        split: split of that view; None: test, or val or train if there is none.
-    """
-
+    # "orbit", "spiral", "along" (the training cameras), a JSON file of cameras (docs/camera_paths.md), or None: one
+    # fixed camera
     path: str | None = "orbit"
-    num_frames: int | None = None
+    num_frames: int | None = None  # frames of a path that is not a file; None: as many as a motion has, else 120
+    # width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file
     size: tuple[int, int] | None = None
+    # scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of the view for a
+    # fixed camera, from 0 to 1 along a path
     times: tuple[float, ...] | None = None
-    view: str | None = None
-    split: str | None = None
+    view: str | None = None  # the view of the fixed camera: its name, the name of its image, or its number from 0
+    split: str | None = None  # split of that view; None: test, or val or train if there is none
 
 
 def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     """Return the cameras and times along which a scene is rendered, with notes about defaults that were chosen.
 
-    Raises:
-        DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what a
-            file cannot have.
+    Raises DyngsError: a missing capture, no such view, an invalid path file, times that do not fit its frames, or what
+    a file cannot have.
     """
     scene, times = opened.renderable, options.times
     if opened.captured is None:
@@ -77,14 +69,8 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
 def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
     """Return the view called ``name``, by default the first one.
 
-    Args:
-        capture: with at least one view.
-        name: name of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0;
-            names take precedence over numbers.
-        split: "test", "val" or "train"; None looks for a name in all, for a number in the first that has views.
-
-    Raises:
-        DyngsError: no such view, or no such split.
+    ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the split, from 0. ``split``:
+    None looks for a name in all, for a number in the first that has views. Raises DyngsError: no such view or split.
     """
     order = [s for s in ("test", "val", "train") if capture.splits.get(s)] if split is None else [split]
     candidates = [split_views(capture, s) for s in order]
@@ -130,7 +116,6 @@ def front_of(opened: Opened, ring: Cameras) -> int:
 
 
 def _require_fitting(opened: Opened, options: PathOptions) -> None:
-    """Raise DyngsError for options that a file, which has no capture, does not support."""
     file = opened.config.data.root
     if options.path == "along":
         raise DyngsError(f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit")
@@ -143,7 +128,6 @@ def _require_fitting(opened: Opened, options: PathOptions) -> None:
 
 
 def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
-    """Return the path of one fixed camera at the times that are requested, or at the time of its view."""
     if opened.captured is None:
         ring = orbit_around(opened, _RING, options.size or DEFAULT_SIZE)
         camera, times = ring.select(front_of(opened, ring)), opened.renderable.times
@@ -155,7 +139,6 @@ def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
 
 
 def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
-    """Return the path called ``name``, with the times that are requested if there are any."""
     file = path_file(name)
     if file is None:
         found = _placed(opened, name, options)

@@ -17,14 +17,10 @@ BACKGROUND = 32
 
 @dataclass(frozen=True)
 class SheetRow:
-    """One view of a contact sheet.
+    """One view of a contact sheet."""
 
-    Attributes:
-        label: text above it, such as name and PSNR.
-        truth, rendered: (H, W, 3), uint8 or float in [0, 1], of the same size.
-    """
-
-    label: str
+    label: str  # text above it, such as name and PSNR
+    # ``truth, rendered``: (H, W, 3), uint8 or float in [0, 1], of the same size
     truth: np.ndarray
     rendered: np.ndarray
 
@@ -33,10 +29,8 @@ def contact_sheet(rows: Sequence[SheetRow], error_gain: float = 5.0, panel_width
     """Return a sheet (H', W', 3) uint8 with truth, render and error side by side, one labelled view per row.
 
     The error is the mean absolute difference of the channels times ``error_gain``, in magma colours (black = equal).
-    Images wider than ``panel_width`` are shrunk, after the difference was taken.
-
-    Raises:
-        ValueError: no rows, or a truth and a render of different sizes.
+    Images wider than ``panel_width`` are shrunk, after the difference was taken. Raises ValueError: no rows, or a truth
+    and a render of different sizes.
     """
     if not rows:
         raise ValueError("a contact sheet needs at least one row")
@@ -68,10 +62,8 @@ def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
 def depth_to_rgb(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
     """Return depth as colours (H, W, 3) uint8: near is red, far is blue (turbo), darkened to black where alpha is 0.
 
-    Args:
-        depth: (H, W) expected depth in world units; non-finite values count as far.
-        alpha: (H, W) in [0, 1].
-        limits: near and far; None: ``depth_limits`` of this image.
+    ``depth``: (H, W) expected depth in world units; non-finite values count as far. ``alpha``: (H, W) in [0, 1].
+    ``limits``: near and far; None: ``depth_limits`` of this image.
     """
     near, far = limits or depth_limits(depth, alpha)
     fraction = (far - np.nan_to_num(depth, nan=far, posinf=far, neginf=near)) / max(far - near, 1e-12)
@@ -94,7 +86,6 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
 
 
 def _band(label: str, error_name: str, panels: list[np.ndarray]) -> np.ndarray:
-    """Return a labelled row of panels."""
     height, width = panels[0].shape[:2]
     band = np.full((LABEL_HEIGHT + height, GAP + len(panels) * (width + GAP), 3), BACKGROUND, np.uint8)
     for i, panel in enumerate(panels):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.path import CameraPath
@@ -32,34 +31,22 @@ _DEPTH_SAMPLES = 8
 
 @dataclass(frozen=True)
 class Frame:
-    """One rendered image, float32.
+    """One rendered image, float32."""
 
-    Attributes:
-        rgb: (H, W, 3), composited on the background, clamped to [0, 1].
-        alpha: (H, W) in [0, 1].
-        depth: (H, W) expected depth, 0 where nothing is hit; None if it was not rendered.
-    """
-
-    rgb: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray | None
+    rgb: np.ndarray  # (H, W, 3), composited on the background, clamped to [0, 1]
+    alpha: np.ndarray  # (H, W) in [0, 1]
+    depth: np.ndarray | None  # (H, W) expected depth, 0 where nothing is hit; None if it was not rendered
 
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Files to write in addition to the colour images.
+    """Files to write in addition to the colour images."""
 
-    Attributes:
-        depth: ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis).
-        alpha: ``NAME_alpha.png``, white = opaque.
-        video: MP4 of the colour images in order.
-        fps: frames per second of the video.
-    """
-
+    # ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis)
     depth: bool = False
-    alpha: bool = False
-    video: Path | None = None
-    fps: float = 30.0
+    alpha: bool = False  # ``NAME_alpha.png``, white = opaque
+    video: Path | None = None  # MP4 of the colour images in order
+    fps: float = 30.0  # frames per second of the video
 
 
 def render_frame(
@@ -67,11 +54,8 @@ def render_frame(
 ) -> Frame:
     """Render one camera, without gradients.
 
-    Args:
-        scene: scene to render.
-        camera: one camera.
-        time: in [0, 1], or the scene at that time, so that it is not computed again.
-        options: None: those of the scene; ``depth`` other than "none" fills ``Frame.depth``.
+    ``time``: in [0, 1], or the scene at that time, so that it is not computed again. ``options``: None: those of the
+    scene; ``depth`` other than "none" fills ``Frame.depth``.
     """
     with torch.no_grad():
         rendering = scene.render(camera, time, options=options)
@@ -102,15 +86,8 @@ def write_path_images(
 ) -> list[Path]:
     """Render a scene along a path to ``frame_0000.png`` and so on, and to a video if requested; return the paths.
 
-    Args:
-        opened: scene to render. Images of its capture are not overwritten.
-        path: F >= 1 cameras and times, in the order of the video.
-        out_dir: folder for the images; None writes only the video.
-        output: depth, alpha, video. Depth colours share one range over the full path.
-        report: is told of each frame.
-
-    Raises:
-        DyngsError: no cameras, nothing to write, or a file cannot be written.
+    ``out_dir``: None writes only the video. Images of the capture are not overwritten; depth colours share one range
+    over the full path. Raises DyngsError: no cameras, nothing to write, or a file cannot be written.
     """
     if len(path) == 0:
         raise DyngsError("the camera path has no cameras")
@@ -118,7 +95,10 @@ def write_path_images(
         raise DyngsError("nothing to write: give a folder for the images or a video file")
     options, limits = _with_depth(opened.renderable, output), None
     if output.depth and out_dir is not None:
-        limits = _shared_depth_limits(path_frames(opened.renderable, _sample(path), options))
+        seen = [
+            (x.depth, x.alpha) for x in path_frames(opened.renderable, _sample(path), options) if x.depth is not None
+        ]
+        limits = depth_limits(*(np.concatenate([x.ravel() for x in part]) for part in zip(*seen, strict=True)))
     digits = max(4, len(str(len(path) - 1)))
     with _FrameWriter(out_dir, output, inputs_of(opened), limits) as writer:
         for i, frame in enumerate(path_frames(opened.renderable, path, options)):
@@ -137,19 +117,9 @@ def write_split_images(
 ) -> list[Path]:
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error); return the paths.
 
-    The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that
-    of training, black if that was random.
-
-    Args:
-        opened: a run.
-        split: "test", "val" or "train".
-        out_dir: folder for the images, which are named after the views (``file_stems``).
-        output: depth, alpha, video (views of one size only).
-        report: is told of each view.
-        device: draws.
-
-    Raises:
-        DyngsError: no such split, unreadable images, a file cannot be written.
+    The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The background is that of
+    training, black if that was random. Raises DyngsError: no such split, unreadable images, or a video of several
+    sizes.
     """
     inputs = inputs_of(opened)
     inputs.require_output(out_dir)
@@ -166,17 +136,12 @@ def write_split_images(
             writer.write(stem, frame)
             report("views", i + 1, len(views))
             if i in shown:
-                truth = image.composite(background)
-                label = f"{psnr(torch.from_numpy(frame.rgb), truth, image.mask):.2f} dB  {image.name}"
-                rows.append(_sheet_row(label, truth, torch.from_numpy(frame.rgb), image.mask))
+                both = image.composite(background), torch.from_numpy(frame.rgb)
+                label = f"{psnr(both[1], both[0], image.mask):.2f} dB  {image.name}"
+                counts = 1.0 if image.mask is None else image.mask[..., None]  # masked pixels show no error
+                rows.append(SheetRow(label, *(to_uint8((x * counts).cpu().numpy()) for x in both)))
     writer.write_image(out_dir / "sheet.png", contact_sheet(rows))
     return writer.written
-
-
-def _sheet_row(label: str, truth: Tensor, rendered: Tensor, mask: Tensor | None) -> SheetRow:
-    """Return a row of the sheet; masked pixels are black on both sides, so that they show no error."""
-    counts = 1.0 if mask is None else mask[..., None]
-    return SheetRow(label, to_uint8((truth * counts).cpu().numpy()), to_uint8((rendered * counts).cpu().numpy()))
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
@@ -206,11 +171,7 @@ class _FrameWriter:
     """Context manager that writes frames to images and a video; ``written`` lists the files."""
 
     def __init__(
-        self,
-        out_dir: Path | None,
-        output: OutputOptions,
-        inputs: Inputs,
-        limits: tuple[float, float] | None = None,
+        self, out_dir: Path | None, output: OutputOptions, inputs: Inputs, limits: tuple[float, float] | None = None
     ) -> None:
         self.written: list[Path] = []
         self._inputs = inputs
@@ -265,12 +226,6 @@ def _sample(path: CameraPath) -> CameraPath:
     poses, intrinsics = path.cameras.cam_from_world[index], path.cameras.intrinsics[index]
     cameras = replace(path.cameras, cam_from_world=poses, intrinsics=intrinsics)
     return replace(path, cameras=cameras, times=path.times and tuple(path.times[i] for i in index.tolist()))
-
-
-def _shared_depth_limits(frames: Iterator[Frame]) -> tuple[float, float]:
-    """Return near and far over all of the frames."""
-    seen = [(frame.depth.ravel(), frame.alpha.ravel()) for frame in frames if frame.depth is not None]
-    return depth_limits(np.concatenate([d for d, _ in seen]), np.concatenate([a for _, a in seen]))
 
 
 def _files(stem: str) -> set[str]:

@@ -22,23 +22,16 @@ from dyngs.splats.splat_file import SplatFile, splat_options
 
 VIEWS = 4
 _LONGEST_SIDE = 240
-_LEAST_FRACTION = 0.002
-"""Cameras that see the scene in fewer pixels than this are replaced by an orbit."""
-FAINT = 30.0
-"""dB, below which a line about the difference is a warning."""
+_LEAST_FRACTION = 0.002  # cameras that see the scene in fewer pixels than this are replaced by an orbit
+FAINT = 30.0  # dB, below which a line about the difference is a warning
 
 
 @dataclass(frozen=True)
 class Redrawn:
-    """A file drawn again.
+    """A file drawn again."""
 
-    Attributes:
-        psnr: dB, mean over the images; 100 where they are equal.
-        views: number of images.
-    """
-
-    psnr: float
-    views: int
+    psnr: float  # dB, mean over the images; 100 where they are equal
+    views: int  # number of images
 
     @property
     def line(self) -> str:
@@ -55,15 +48,8 @@ class Redrawn:
 def compare_run(opened: Opened, scene: Scene, time: float, meant: SplatFile, read: SplatFile) -> Redrawn:
     """Return how a file differs from a scene at one time, seen by cameras of its capture, else from an orbit.
 
-    Args:
-        opened: what was exported.
-        scene: the part of it.
-        time: in [0, 1].
-        meant: what the file is meant to hold, turned from the axes of the scene.
-        read: what it holds.
-
-    Raises:
-        DyngsError: no camera sees anything.
+    ``time``: in [0, 1]. ``meant``: what the file is meant to hold, turned from the axes of the scene. Raises
+    DyngsError: no camera sees anything.
     """
     with torch.no_grad():
         moment = scene.time_step(time)
@@ -79,12 +65,7 @@ def compare_run(opened: Opened, scene: Scene, time: float, meant: SplatFile, rea
 def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
     """Return how a file differs from what it was converted from, seen from an orbit.
 
-    Args:
-        splat: before it was turned.
-        written: the file.
-
-    Raises:
-        DyngsError: the file cannot be read.
+    Raises DyngsError: the file cannot be read.
     """
     cameras = around(splat)
     with torch.no_grad():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import Tensor
@@ -13,12 +13,11 @@ from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import Scene
 from dyngs.kinds import restored_scene
-from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
 from dyngs.runs.inputs import inputs_of
-from dyngs.storage.file import SceneInfo, decoded, encoded, write_scene
+from dyngs.storage.file import decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.precision import GREY_LEVELS, Precision, mean_square_change
 from dyngs.storage.tensors import FIELD, drawable
@@ -29,41 +28,23 @@ MISSED = 1.05
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A stored run.
+    """A stored run."""
 
-    Attributes:
-        path: of the file.
-        precision: steps, and how much the images change.
-        num_bytes: of the file.
-        num_bytes_exact: of the same tensors before, 4 bytes per value.
-    """
-
-    path: Path
-    precision: Precision
-    num_bytes: int
-    num_bytes_exact: int
+    path: Path  # of the file
+    precision: Precision  # steps, and how much the images change
+    num_bytes: int  # of the file
+    num_bytes_exact: int  # of the same tensors before, 4 bytes per value
 
 
 def write_scene_file(
-    run_dir: Path,
-    out: Path,
-    max_change: float | None = None,
-    field_step: float = 1.0,
-    data_root: Path | None = None,
+    run_dir: Path, out: Path, max_change: float | None = None, field_step: float = 1.0, data_root: Path | None = None
 ) -> SceneFile:
-    """The file in the folder ``out``, with the run's ``config.yaml`` beside it: together a run that can be drawn.
+    """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that can be drawn.
 
-    Args:
-        run_dir: a run with a checkpoint.
-        out: a folder, made where it is missing; it may be the run's own, or hold a former export of that run.
-        max_change: root mean square over all values of some training images, grey levels of 255. None: what lowers
-            their PSNR by ``LOSS_DB``, if it is independent of the model's own errors.
-        field_step: how many times as coarsely as that the field is rounded.
-        data_root: where the capture lies by now, if it was moved.
-
-    Raises:
-        DyngsError: no such run, ``out`` holds another one, the images would change by more than ``max_change``, or
-            the file cannot be written. Nothing is written then.
+    ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean square over all values
+    of some training images, grey levels of 255; None: what lowers their PSNR by ``LOSS_DB``. ``field_step``: how many
+    times as coarsely the field is rounded. Raises DyngsError: no such run, ``out`` holds another one, or the images
+    would change by more than ``max_change``; nothing is written then.
     """
     config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)
@@ -73,9 +54,9 @@ def write_scene_file(
         plan = storage_plan(config, checkpoint, scene, max_change)
         precision = plan.precision
         steps = {name: step * (field_step if name.startswith(FIELD) else 1) for name, step in precision.steps.items()}
-        data = encoded(SceneInfo(**asdict(checkpoint.info)), scene, steps, plan.coarseness)
+        data = encoded(checkpoint.info, scene, steps, plan.coarseness)
         if plan.images is not None and precision.allowed is not None and field_step == 1:
-            stored = restored_scene(Checkpoint(checkpoint.info, decoded(data).tensors), config.model)
+            stored = restored_scene(decoded(data), config.model)
             precision = _checked(run_dir, precision, plan.images(scene), plan.images(stored))
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
@@ -86,8 +67,7 @@ def write_scene_file(
 def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], after: Sequence[Tensor]) -> Precision:
     """The precision with the change from the images ``before`` to those of the file.
 
-    Raises:
-        DyngsError: it is more than what is allowed.
+    Raises DyngsError: it is more than what is allowed.
     """
     change = GREY_LEVELS * math.sqrt(mean_square_change(before, after))
     if precision.allowed is not None and not change <= MISSED * precision.allowed:

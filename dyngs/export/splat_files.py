@@ -1,4 +1,4 @@
-"""Runs as files of Gaussians: all Gaussians, only the moving or only the static ones; at one time or at many."""
+"""Runs as files of Gaussians: all, only the moving or only the static ones; at one time, at many, as tracks."""
 
 from __future__ import annotations
 
@@ -6,38 +6,37 @@ import os
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
 
-from dyngs.errors import DyngsError
+from dyngs.conventions import SH_C0
+from dyngs.errors import DyngsError, counted
 from dyngs.files.temporary import temporary_folder_beside
+from dyngs.files.write import atomic_file
 from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.scene import Scene
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.formats import Written, turned_file, write_splats
 from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
-from dyngs.splats.splat_file import SplatFile
+from dyngs.splats.splat_file import SplatFile, drawable, from_linear, unit_rotations
 
 Part = Literal["all", "moving", "still"]
 
 
 @dataclass(frozen=True)
 class Writing:
-    """How Gaussians are written.
+    """How Gaussians are written."""
 
-    Attributes:
-        turn: unit quaternion wxyz, from the axes of the capture to those of the file.
-        up: axis that then points up, such as "-y"; None: not known.
-        sh_degree: degree of the harmonics in the file; None: as they are, up to what the format holds.
-    """
-
+    # unit quaternion wxyz, from the axes of the capture to those of the file
     turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    up: str | None = None
-    sh_degree: int | None = None
+    up: str | None = None  # axis that then points up, such as "-y"; None: not known
+    sh_degree: int | None = None  # degree of the harmonics in the file; None: as they are, up to what the format holds
 
 
 AS_THEY_ARE = Writing()
@@ -48,15 +47,8 @@ def writing_of(
 ) -> tuple[Writing, str]:
     """Return how a scene is written, and a line about which way is up in the file.
 
-    Args:
-        opened: the scene.
-        target: axis that viewers of the format take for up.
-        up: axis that is requested instead; "keep": nothing is turned.
-        from_up: axis that is up in the scene; None: found as ``up_of`` does.
-        sh_degree: degree of the harmonics in the file.
-
-    Raises:
-        DyngsError: no such axis.
+    ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep": nothing is turned.
+    ``from_up``: axis that is up in the scene; None: found as ``up_of`` does. Raises DyngsError: no such axis.
     """
     if up == "keep":
         return Writing(sh_degree=sh_degree), "axes are those of the capture"
@@ -85,20 +77,10 @@ def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
 def write_run_splats(
     opened: Opened, path: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
 ) -> Written:
-    """Write a run as a file of Gaussians; its suffix names the format.
+    """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
     A 3D filter is fused, and colours of a network become harmonics; the header, where the format has one, states the
-    render mode, and the time if something moves.
-
-    Args:
-        opened: a trained model.
-        path: output file; an old one is replaced when the new one is complete.
-        time: scene time in [0, 1].
-        part: all Gaussians, or only the moving or static ones.
-        how: axes, degree of the harmonics.
-
-    Raises:
-        DyngsError: the part is empty, an unknown suffix, or the file cannot be written.
+    render mode, and the time if something moves. Raises DyngsError: the part is empty, or an unknown suffix.
     """
     inputs_of(opened).require_output(path)
     return _write(opened, scene_part(opened.scene, part), path, time, how)
@@ -112,21 +94,11 @@ def write_run_sequence(
     how: Writing = AS_THEY_ARE,
     suffix: str = ".ply",
 ) -> list[Written]:
-    """Write a sequence ``frame_0000.ply`` and so on, one file per time, for players.
+    """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
 
-    All files are written into a hidden folder first and appear together, so that a failed export leaves no incomplete
-    sequence behind.
-
-    Args:
-        opened: a trained model.
-        folder: output folder, created if missing. Files of an earlier sequence of the same length are replaced.
-        times: T >= 1 times in [0, 1].
-        part: as in ``write_run_splats``.
-        how: axes, degree of the harmonics.
-        suffix: of the files, names the format.
-
-    Raises:
-        DyngsError: the part is empty, the folder holds other such files, or the files cannot be written.
+    All files are written into a hidden folder first and appear together; those of an earlier sequence of the same
+    length are replaced. Raises DyngsError: the part is empty, the folder holds other such files, or they cannot be
+    written.
     """
     scene = scene_part(opened.scene, part)
     names = frame_names(len(times), suffix)
@@ -191,8 +163,7 @@ def _write(opened: Opened, scene: Scene, path: Path, time: float, how: Writing) 
 def _require_no_others(folder: Path, names: Sequence[str], suffix: str) -> None:
     """Check that the folder holds no files that players would take for frames.
 
-    Raises:
-        DyngsError: there is a file that is not among ``names``, or the folder is a file.
+    Raises DyngsError: there is a file that is not among ``names``, or the folder is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")
@@ -202,3 +173,141 @@ def _require_no_others(folder: Path, names: Sequence[str], suffix: str) -> None:
             f"{folder}: holds other {suffix} files ({others[0]}), which players would take for frames; give an empty "
             "folder"
         )
+
+
+MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in memory
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays of the file."""
+
+    # (N, T, 3) in the coordinates of the capture, float32; float64 if the scene was rebased because it is far from its
+    # origin, where float32 is too coarse
+    positions: np.ndarray
+    times: np.ndarray  # (T,) float64 in [0, 1]
+    moving: np.ndarray  # (N,) bool, false if the position never changes
+    ids: np.ndarray  # (N,) int64 index of each Gaussian in the model, which is also its row in an exported .ply
+
+
+def tracks_of(
+    scene: Scene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
+) -> Tracks:
+    """Return the tracks of a scene, or with ``part`` "moving" of what moves, in coordinates of the capture.
+
+    Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
+    """
+    device = scene.gaussians.means.device
+    moves = torch.zeros(len(scene), dtype=torch.bool, device=device)
+    moves[scene.rows] = not scene.is_static
+    moving = scene_part(scene, "moving") if part == "moving" or not scene.is_static else None
+    ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
+    kind = np.float64 if any(world_offset) else np.float32
+    size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
+    if size > MAX_BYTES:
+        raise DyngsError(
+            f"tracks of {len(ids)} Gaussians at {len(times)} times would take {size / 1e9:.1f} GB, the limit is "
+            f"{MAX_BYTES / 1e9:.0f} GB; give fewer --times, or --dynamic for only those that move"
+        )
+    positions = np.empty((len(ids), len(times), 3), kind)
+    positions[:] = scene.gaussians.means[ids].numpy()[:, None]
+    if moving is not None:
+        rows = moves[ids].numpy()
+        for k, time in enumerate(times):
+            positions[rows, k] = moving.at(time).means.numpy()
+    if any(world_offset):
+        positions += np.asarray(world_offset)
+    return Tracks(positions, np.array(times, np.float64), moves[ids].numpy(), ids.numpy())
+
+
+def write_tracks(path: Path, tracks: Tracks) -> Path:
+    """Write tracks as uncompressed .npz, atomically: one array per field of ``Tracks``, no pickle. Return the path.
+
+    Raises DyngsError: non-finite positions, or the file cannot be written.
+    """
+    if not np.isfinite(tracks.positions).all():
+        raise DyngsError(f"{path}: not written, some positions are not finite")
+    with atomic_file(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **asdict(tracks))
+    return path
+
+
+SUFFIX = ".4dgs"
+UP = "-y"
+FPS = 30.0
+_KEYFRAME_EVERY = 8
+_FOREVER = 1e4  # standard deviation in time, in lengths of the clip: a Gaussian never fades
+
+
+@dataclass(frozen=True)
+class MovingFile:
+    """A file that was written."""
+
+    path: Path  # of it
+    splats: tuple[SplatFile, ...]  # what it is meant to hold at each time
+    notes: tuple[str, ...]  # a line about each thing that the format could not hold
+
+
+def write_moving(
+    opened: Opened, path: Path, times: Sequence[float], part: Part = "all", how: Writing = AS_THEY_ARE
+) -> MovingFile:
+    """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s.
+
+    Raises DyngsError: the package is missing, the part is empty, or the file cannot be written.
+    """
+    inputs_of(opened).require_output(path)
+    model, delta = _packages(path)
+    scene = scene_part(opened.scene, part)
+    splats = tuple(splats_at(opened, scene, time, how) for time in times)
+    duration = len(times) / FPS
+    samples = [_sample(splat, i / FPS, duration, model, delta) for i, splat in enumerate(splats)]
+    options = delta.KeyframeDeltaOptions(keyframe_every=_KEYFRAME_EVERY)
+    writer = import_module("fourdgs.keyframe_delta_file")
+    data = writer.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(data)
+    notes = (f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",)
+    if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
+        notes = (*notes, "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians")
+    return MovingFile(path, splats, notes)
+
+
+def read_moment(path: Path, index: int) -> SplatFile:
+    """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package fourdgs.
+
+    Raises DyngsError: the package is missing, or values that are not finite.
+    """
+    _packages(path)
+    reader = import_module("fourdgs.keyframe_delta_file")
+    found = reader.render_at(reader.decode_streamed(path.read_bytes()), (index + 0.5) / FPS)
+    sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
+    gaussians = from_linear(
+        found["centers"], found["rotations"][:, [3, 0, 1, 2]], found["scales"], found["opacity"], sh
+    )
+    return drawable(SplatFile(gaussians), path, "error")
+
+
+def _sample(splat: SplatFile, start: float, duration: float, model: Any, delta: Any) -> Any:
+    """Return the Gaussians of one time as fourdgs takes them."""
+    gaussians = replace(splat.gaussians, quats=unit_rotations(splat.gaussians.quats))
+    n = len(gaussians)
+    rgba = torch.cat([gaussians.base_rgb.clamp(0, 1), gaussians.opacities[:, None]], dim=1)
+    states = model.GaussianSet(
+        positions=gaussians.means.numpy(),
+        scales=gaussians.scales.numpy(),
+        rotations=gaussians.quats.numpy()[:, [1, 2, 3, 0]],
+        colors=rgba.numpy(),
+        motions=np.zeros((n, 3), np.float32),
+        mu_t=np.full(n, start, np.float32),
+        sigma_t=np.full(n, _FOREVER * duration, np.float32),
+        win_lo=np.zeros(n, np.float32),
+        win_hi=np.full(n, duration, np.float32),
+    )
+    return delta.Sample(t0=start, ids=np.arange(n), gaussians=states)
+
+
+def _packages(path: Path) -> tuple[Any, Any]:
+    try:
+        return import_module("fourdgs.model"), import_module("fourdgs.keyframe_delta_writer")
+    except ImportError:
+        raise DyngsError(f"{path}: .4dgs files need the package fourdgs: pip install 'dyngs[4dgs]'") from None

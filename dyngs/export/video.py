@@ -25,18 +25,14 @@ class VideoWriter:
             video.add(rgb)
     """
 
-    def __init__(self, path: Path, fps: float = 30.0, quality: int = 18, threads: int = 1) -> None:
+    def __init__(self, path: Path, fps: float = 30.0, quality: int = 18) -> None:
         """Prepare a writer; nothing is written yet.
 
-        Args:
-            path: output file; its suffix chooses the container, only ``.mp4`` is tested.
-            fps: frames per second, more than 0.
-            quality: x264's constant rate factor, 0 (lossless) to 51; 18 is visually lossless.
-            threads: of the encoder; the bytes depend on their number.
+        ``fps`` is more than 0; ``quality`` x264's constant rate factor, 0 (lossless) to 51; 18 is visually lossless.
         """
         if not 0 < fps <= 1000:
             raise DyngsError(f"cannot write {path}: fps must be in (0, 1000], got {fps:g}")
-        self.path, self.fps, self.quality, self.threads = path, fps, quality, threads
+        self.path, self.fps, self.quality = path, fps, quality
         self.num_frames = 0
         self._size: tuple[int, int] | None = None
         self._temporary: Path | None = None
@@ -77,7 +73,7 @@ class VideoWriter:
 
     def _open(self, height: int, width: int) -> None:
         import av
-        from av.video.reformatter import ColorPrimaries, ColorTrc
+        from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
         rate = Fraction(self.fps).limit_denominator(1001)
         try:
@@ -94,10 +90,11 @@ class VideoWriter:
         stream = self._stream
         stream.width, stream.height = width + width % 2, height + height % 2
         stream.pix_fmt = "yuv420p"
-        stream.thread_count = self.threads
+        stream.thread_count = 1  # the bytes depend on their number
         stream.options = {"crf": str(self.quality), "preset": "medium"}
         context = stream.codec_context
-        context.color_range, context.colorspace = _tv_range(), _bt709()
+        self._colours = int(Colorspace.ITU709), int(ColorRange.MPEG)
+        context.colorspace, context.color_range = self._colours
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
 
     def _encode(self, rgb: np.ndarray | None) -> None:
@@ -110,9 +107,8 @@ class VideoWriter:
                 self._container.mux(self._stream.encode(None))
                 return
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
-            frame = frame.reformat(
-                format="yuv420p", dst_colorspace=_bt709(), dst_color_range=_tv_range(), interpolation="AREA"
-            )
+            space, extent = self._colours
+            frame = frame.reformat(format="yuv420p", dst_colorspace=space, dst_color_range=extent, interpolation="AREA")
             frame.pts = self.num_frames
             frame.time_base = 1 / self._stream.codec_context.framerate
             self._container.mux(self._stream.encode(frame))
@@ -125,20 +121,7 @@ class VideoWriter:
             container.close()
 
     def _discard(self) -> None:
-        """Remove an unfinished video."""
         with suppress(OSError):
             self._close()
         if self._temporary is not None:
             self._temporary.unlink(missing_ok=True)
-
-
-def _bt709() -> int:
-    from av.video.reformatter import Colorspace
-
-    return int(Colorspace.ITU709)
-
-
-def _tv_range() -> int:
-    from av.video.reformatter import ColorRange
-
-    return int(ColorRange.MPEG)

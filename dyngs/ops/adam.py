@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 
 from dyngs.errors import DyngsError
+from dyngs.ops.device import sent
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
-from dyngs.ops.transfer import sent
 
-Count: TypeAlias = int | Tensor
-"""A number, or a tensor () of one that may still be on a GPU, where ``int`` waits for it."""
+Count: TypeAlias = int | Tensor  # a number, or a tensor () of one that may still be on a GPU, where int waits for it
 
 
 def _adam_step(
@@ -62,28 +61,17 @@ def adam_step_(
 ) -> Tensor:
     """Update ``param`` and its two moments in place; return the number () int64 of rows skipped for a bad gradient.
 
-    The update of Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step``
-    also for rows that were skipped before. Rows skipped keep their value and moments unchanged. A gradient cannot be
-    used if it is NaN, infinite, or so large that its square is not safely finite (2^63 = 9.2e18 in float32, 2^511 in
-    float64): an infinite second moment would hold the value for ever.
-
-    Args:
-        param: (N, ...) contiguous parameter, seen as N rows of C numbers; a vector (N,) has rows of one number.
-        grad: same shape; copied if not contiguous.
-        exp_avg: same shape, contiguous: running mean of the gradient.
-        exp_avg_sq: same shape, contiguous: running mean of its square.
-        lr: learning rate, or (C,) rates, one per column of a row, better on the CPU: they are checked.
-        step: count of this step, 1 for the first.
-        eps: added to the root of the second moment.
-        betas: decay rates of the moments.
-        rows: (N,) bool, the rows to update; None = all. Rows left out by it are not counted.
-
-    Raises:
-        DyngsError: shapes or dtypes that do not fit, a parameter or moment that is not contiguous, ``step`` < 1, or
-            constants out of range.
+    Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step`` (from 1) also for
+    rows skipped before. A gradient is bad if it is NaN, infinite, or so large that its square is not safely finite
+    (2^63 in float32, 2^511 in float64). ``param`` (N, ...) contiguous: N rows of C numbers; ``grad`` and the moments
+    have its shape, the moments contiguous; ``lr``: a rate, or (C,) rates, better on the CPU; ``rows`` (N,) bool: the
+    rows to update, None: all. Raises DyngsError: shapes or dtypes that do not fit, or constants out of range.
     """
     _check(param, grad, exp_avg, exp_avg_sq, rows, step)
-    _check_constants(param.dtype, eps, betas)
+    if not torch.finfo(param.dtype).tiny <= eps < math.inf:
+        raise DyngsError(f"Adam: eps must be at least {torch.finfo(param.dtype).tiny:.3g} and finite, got {eps}")
+    if not all(0 <= beta < 1 for beta in betas):
+        raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
     if param.numel() == 0:
         return torch.zeros((), dtype=torch.int64, device=param.device)
     row_size = param.numel() // len(param)
@@ -141,13 +129,6 @@ def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     if rates.shape != (row_size,):
         raise DyngsError(f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(rates.shape)}")
     return rates.contiguous()
-
-
-def _check_constants(dtype: torch.dtype, eps: float, betas: tuple[float, float]) -> None:
-    if not torch.finfo(dtype).tiny <= eps < math.inf:
-        raise DyngsError(f"Adam: eps must be at least {torch.finfo(dtype).tiny:.3g} and finite, got {eps}")
-    if not all(0 <= beta < 1 for beta in betas):
-        raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
 
 
 def _check(param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rows: Tensor | None, step: int) -> None:

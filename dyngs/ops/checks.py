@@ -12,15 +12,12 @@ from dyngs.errors import DyngsError
 from dyngs.ops.native import core, num_threads
 from dyngs.ops.registration import has_kernel, launch, register, shapes_only
 
-LARGEST = 3.4e38
-"""Options are computed with in float32."""
+LARGEST = 3.4e38  # options are computed with in float32
 
 LARGEST_COUNT = 2**31 - 1
-MAX_SIDE: int = core.MAX_SIDE
-"""px; float32 has no pixel centres beyond 2^23"""
+MAX_SIDE: int = core.MAX_SIDE  # px; float32 has no pixel centres beyond 2^23
 
-UNASKED = 1 << 26
-"""Bytes up to which the free memory is not asked for, because asking takes 0.1 ms."""
+UNASKED = 1 << 26  # bytes up to which the free memory is not asked for, because asking takes 0.1 ms
 
 REMEDY = "lower the resolution, the scales or the number of views"
 
@@ -72,10 +69,8 @@ def check_size(width: int, height: int) -> None:
 def check_memory(size: int, what: str, like: Tensor) -> None:
     """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and RLIMIT_AS leave free.
 
-    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit.
-
-    Raises:
-        DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
+    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit. Raises DyngsError:
+    with both figures. (Where the system does not say, more than 16 GiB at once is refused.)
     """
     if shapes_only() or like.device.type != "cpu" or size <= UNASKED:
         return

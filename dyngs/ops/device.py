@@ -1,16 +1,17 @@
-"""Which device computes, the CPU or a CUDA GPU where torch, driver and compiled core can use one; and its memory."""
+"""Which device computes, the CPU or a CUDA GPU that torch, driver and compiled core can use; its memory and copies."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.ops.checks import check_choice
@@ -18,8 +19,7 @@ from dyngs.ops.native import core, cuda_core, has_cuda_core
 
 CPU = torch.device("cpu")
 CHOICES = ("auto", "cpu", "cuda")
-OLDEST = (7, 5)
-"""Compute capability of the oldest GPUs that the kernels are compiled for."""
+OLDEST = (7, 5)  # compute capability of the oldest GPUs that the kernels are compiled for
 
 _TORCH = "install a torch for CUDA, see pytorch.org"
 _BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc (docs/gpu.md)"
@@ -81,15 +81,10 @@ def deterministic(device: torch.device, wanted: bool = True) -> Generator[None]:
 def keep_freed_memory() -> bool:
     """Keep freed blocks for reuse from now on; return whether that worked. Call it once, before training.
 
-    Why: by default glibc takes a block of 32 MiB or more (in a fresh process 128 KiB or more) from the system at each
-    allocation and gives it back at each release, and the kernel clears all its pages again at first touch. A training
-    step allocates and frees images and gradients of such sizes, so that much of its time goes into page faults.
-
-    What it costs: memory once used stays with the process until it ends. As torch's aligned blocks rarely fit exactly
-    where one was freed, the first steps take fresh memory until the gaps suit: expect the large temporary blocks two or
-    three times over (measured: 600 MB resident instead of 225 MB for a loop over one tensor of 48 MB). Results do not
-    change, so programs that embed dyngs and have other plans for their memory may leave it out. Without glibc (macOS,
-    musl) nothing happens and the answer is False.
+    By default glibc takes blocks of 32 MiB or more from the system at each allocation, and the kernel clears their
+    pages again: much of a training step goes into page faults. Memory once used then stays with the process; the first
+    steps take large temporary blocks two or three times over. Results do not change. Without glibc nothing happens:
+    False.
     """
     return core.keep_freed_memory()
 
@@ -118,7 +113,6 @@ def why_no_gpu() -> str | None:
 
 
 def _why_torch_has_none() -> str:
-    """Return why torch, built with CUDA, finds no GPU."""
     try:
         torch.cuda.init()
     except Exception as error:  # of torch: RuntimeError, or an AssertionError where it was built otherwise
@@ -132,7 +126,6 @@ def _why_torch_has_none() -> str:
 
 
 def _why_kernels_fail() -> str | None:
-    """Return why the kernels cannot run on the GPU that torch has found; None where they can."""
     try:
         kernels = cuda_core()
     except DyngsError as error:
@@ -176,3 +169,64 @@ def findings() -> Mapping[str, str]:
 def _said(version: int) -> str:
     """Return a version as CUDA writes it, 13020, for people: 13.2."""
     return f"{version // 1000}.{version % 1000 // 10}"
+
+
+def sent(x: Tensor, device: torch.device | str) -> Tensor:
+    """Return ``x`` on ``device``; the copy of a tensor of the CPU is queued.
+
+    The driver has taken a copy of pageable memory before the call returns, so that ``x`` may change at once.
+    """
+    return x.to(device, non_blocking=x.device.type == "cpu")
+
+
+class ReadBack:
+    """Numbers of a tensor, which a GPU copies to the CPU as soon as it has them, while more work is queued."""
+
+    def __init__(self, x: Tensor) -> None:
+        self._ready: torch.cuda.Event | None = None
+        if x.device.type != "cuda":
+            self._numbers = x.detach().to("cpu", copy=True)
+            return
+        self._numbers = torch.empty(x.shape, dtype=x.dtype, device="cpu", pin_memory=True)
+        self._numbers.copy_(x.detach(), non_blocking=True)
+        self._ready = torch.cuda.Event()
+        self._ready.record(torch.cuda.current_stream(x.device))
+
+    def numbers(self) -> Tensor:
+        """Return them on the CPU; waits until the GPU has come to them, not for what was queued later."""
+        if self._ready is not None:
+            self._ready.synchronize()
+        return self._numbers
+
+
+class Upload:
+    """Arrays of the CPU that are copied to a GPU beside its work: by a stream of their own, from pinned memory.
+
+    May be made in any thread. What has no such streams gets them when they are asked for.
+    """
+
+    def __init__(self, arrays: Sequence[Tensor], device: torch.device) -> None:
+        self._device, self._arrays = device, list(arrays)
+        self._done: torch.cuda.Event | None = None
+        if device.type != "cuda":
+            return
+        stream = _upload_stream(device)
+        with torch.cuda.stream(stream):
+            self._arrays = [x.pin_memory().to(device, non_blocking=True) for x in arrays]
+            self._done = torch.cuda.Event()
+            self._done.record(stream)
+
+    def arrays(self) -> list[Tensor]:
+        """Return them on the GPU; what is queued after this in the current stream finds them there."""
+        if self._done is None:
+            return [sent(x, self._device) for x in self._arrays]
+        current = torch.cuda.current_stream(self._device)
+        current.wait_event(self._done)
+        for x in self._arrays:
+            x.record_stream(current)  # not lent anew before that stream is done with it
+        return self._arrays
+
+
+@cache
+def _upload_stream(device: torch.device) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from dyngs.ops.native import num_threads
@@ -46,15 +47,45 @@ harmonics_op = register("harmonics", _harmonics, gradient=Gradient(_save, _backw
 
 
 def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
-    """Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from the camera centres, zero where culled.
+    """Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from ``centers`` (V, 3), zero where culled.
 
-    Differentiable in means, centers and sh.
-
-    Args:
-        means: (N, 3) world.
-        centers: (V, 3) camera centres, world.
-        sh: (N, K, 3) coefficients.
-        radii: (V, N, 2) int32; Gaussians with radius 0 are skipped.
-        degree: 0 to 4, at most the degree of ``sh``.
+    Differentiable in means, centers and sh (N, K, 3); ``radii`` (V, N, 2) int32; ``degree`` 0 to 4, at most that of
+    ``sh``.
     """
     return harmonics_op(means, centers, sh, radii, degree)
+
+
+def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
+    """Return (..., K) real spherical harmonics of unit directions (..., 3), from the associated Legendre recursion.
+
+    Independent of the kernels' polynomials; signs as in 3DGS (Condon-Shortley phase included). Slow.
+    """
+    x, y, z = directions.unbind(-1)
+    azimuth = torch.complex(x, y)
+    terms: list[Tensor] = []
+    for order in range(degree + 1):
+        for m in range(-order, order + 1):
+            norm = ((2 * order + 1) / (4 * torch.pi) * _factorial_ratio(order, abs(m))) ** 0.5
+            polynomial = norm * _legendre_without_sine(order, abs(m), z)
+            power = azimuth ** abs(m)
+            part = power.imag if m < 0 else power.real
+            terms.append(polynomial * part * (1.0 if m == 0 else 2**0.5))
+    return torch.stack(terms, -1)
+
+
+def _factorial_ratio(order: int, m: int) -> float:
+    ratio = 1.0
+    for k in range(order - m + 1, order + m + 1):
+        ratio /= k
+    return ratio
+
+
+def _legendre_without_sine(order: int, m: int, z: Tensor) -> Tensor:
+    """Return the associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley phase (-1)^m."""
+    current = torch.ones_like(z)
+    for k in range(1, m + 1):
+        current = current * -(2 * k - 1)
+    previous = torch.zeros_like(z)
+    for k in range(m + 1, order + 1):
+        current, previous = ((2 * k - 1) * z * current - (k + m - 1) * previous) / (k - m), current
+    return current

@@ -52,20 +52,12 @@ l1_ssim_op = register("l1_ssim", _l1_ssim, gradient=Gradient(_save, _backward))
 def l1_ssim_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
     """Return the training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, differentiable in ``rendered``.
 
-    L1 is the mean of ``|x - y|``; SSIM is the mean over pixels and channels of the SSIM map with an 11x11 Gaussian
-    window of sigma 1.5, zero padding and data range 1, as in 3DGS. With a mask both images are multiplied by it, and
-    both means are weighted by it: ``sum(m |x - y|) / (3 sum m)`` and ``sum(m SSIM(m x, m y)) / (3 sum m)``; a mask of
-    zeros gives a loss of 0. In float32 on the CPU only first derivatives exist. Images may have any finite values:
-    where they go beyond about 2, SSIM is computed in float64.
-
-    Args:
-        rendered: (H, W, 3) image x, any strides. Half precision is computed in float32.
-        target: (H, W, 3) image y, a constant: no gradient flows to it.
-        ssim_weight: fraction of the SSIM part, in [0, 1]; at 0 no SSIM is computed.
-        mask: (H, W) weights in [0, 1], a constant.
-
-    Raises:
-        DyngsError: shapes that do not fit, an empty image, or integer images.
+    L1 is the mean of ``|x - y|``; SSIM the mean of the SSIM map with an 11x11 Gaussian window of sigma 1.5, zero
+    padding and data range 1, as in 3DGS. A mask (H, W) in [0, 1] multiplies both images and weights both means: ``sum(m
+    |x - y|) / (3 sum m)``; a mask of zeros gives 0. In float32 on the CPU only first derivatives exist. Where values go
+    beyond about 2, SSIM is computed in float64. ``rendered`` x and the constant ``target`` y are (H, W, 3), any
+    strides; half precision is computed in float32. Raises DyngsError: shapes that do not fit, an empty image, or
+    integer images.
     """
     _check(rendered, target, mask)
     x, y, m = _in_common_precision(rendered, target, mask)

@@ -1,9 +1,7 @@
 """The compiled cores for this processor and for CUDA GPUs, the number of threads, and tensors passed to a core.
 
-There is one module per x86-64 level: all of them in a wheel, that of the compiling machine in an installation from
-source. The newest that the processor runs is imported; ``DYNGS_ISA=v2|v3|v4`` picks an older one, for tests. The module
-for CUDA GPUs is there if dyngs was built with it (docs/gpu.md), has the same functions, and is imported when the first
-tensor on a GPU comes.
+There is one module per x86-64 level; the newest that the processor runs is imported, ``DYNGS_ISA=v2|v3|v4`` picks an
+older one, for tests. That for CUDA GPUs (docs/gpu.md) is imported when the first tensor on a GPU comes.
 """
 
 from __future__ import annotations
@@ -27,8 +25,7 @@ from torch.utils.dlpack import to_dlpack  # pyright: ignore[reportPrivateImportU
 from dyngs.errors import DyngsError
 
 _BASELINE = "SSE4.2" if platform.machine() in ("x86_64", "AMD64") else "NEON"
-ISA_NAMES = {"v2": _BASELINE, "v3": "AVX2", "v4": "AVX-512"}
-"""Instruction sets, x86-64 levels, oldest first."""
+ISA_NAMES = {"v2": _BASELINE, "v3": "AVX2", "v4": "AVX-512"}  # instruction sets, x86-64 levels, oldest first
 
 
 def built_isas() -> tuple[str, ...]:
@@ -39,13 +36,8 @@ def built_isas() -> tuple[str, ...]:
 def choose_isa(built: tuple[str, ...], newest: str, requested: str | None) -> str:
     """Return the instruction set to load.
 
-    Args:
-        built: instruction sets that were compiled, oldest first.
-        newest: that this processor runs.
-        requested: value of ``DYNGS_ISA``; None where unset.
-
-    Raises:
-        DyngsError: the processor runs none of these, or not the requested one.
+    ``built``: instruction sets that were compiled, oldest first. ``requested``: value of ``DYNGS_ISA``; None where
+    unset. Raises DyngsError: the processor runs none of these, or not the requested one.
     """
     usable = [isa for isa in built if isa <= newest]
     if not usable:
@@ -85,11 +77,7 @@ def has_cuda_core() -> bool:
 
 @cache
 def cuda_core() -> ModuleType:
-    """Return the compiled core for CUDA GPUs.
-
-    Raises:
-        DyngsError: it was not built, or cannot be loaded.
-    """
+    """Return the compiled core for CUDA GPUs. Raises DyngsError: it was not built, or cannot be loaded."""
     try:
         return import_module(_CUDA_CORE)
     except ImportError as error:
@@ -100,8 +88,7 @@ def cuda_core() -> ModuleType:
 def core_for(x: Tensor) -> ModuleType:
     """Return the compiled core that computes where ``x`` lies; on a GPU it goes on in torch's current stream there.
 
-    Raises:
-        DyngsError: ``x`` is float64 on a GPU.
+    Raises DyngsError: ``x`` is float64 on a GPU.
     """
     if x.device.type == "cpu":
         return core
@@ -134,10 +121,8 @@ def num_threads() -> int:
 class Fork:
     """Handling of the threads of OpenMP in a process made by ``os.fork``.
 
-    The child has the parent's list of waiting threads, but not the threads: the next parallel loop, of the kernels as
-    of torch, would wait for them without end. Where the parent had started any, the child therefore runs kernels and
-    torch's operators on one thread, as torch's own DataLoader workers do, and says so once; results are the same bytes.
-    An error instead would end programs that fork for other reasons than speed.
+    The child has the parent's list of waiting threads, but not the threads: the next parallel loop would wait without
+    end. Where the parent had started any, the child runs kernels and torch's operators on one thread, and says so once.
     """
 
     def __init__(self) -> None:
@@ -212,8 +197,7 @@ def array(x: Tensor) -> object:
 def writable(x: Tensor) -> object:
     """Return ``x`` as ``array`` does, for a kernel that writes to it; autograd then counts ``x`` as changed.
 
-    Raises:
-        DyngsError: ``x`` is not contiguous, so that the kernel would write to a copy.
+    Raises DyngsError: ``x`` is not contiguous, so that the kernel would write to a copy.
     """
     if not x.is_contiguous():
         raise DyngsError("a tensor that is updated in place must be contiguous; call .contiguous() first")

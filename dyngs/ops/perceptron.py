@@ -1,9 +1,7 @@
 """A small multilayer perceptron over many rows, fused.
 
-Per-Gaussian decoders of deformation fields have tens of thousands of rows but layers of only 10 to 256 features. A
-matrix product, a bias and a ReLU per layer each go through memory once per step and direction; the fused kernel runs
-all layers of a hundred rows while they are in the cache, on a GPU in shared memory. Its results do not depend on the
-number of threads.
+Each layer of a few features would go through memory once per step and direction; the kernel runs all layers of a
+hundred rows while they are in the cache, on a GPU in shared memory. Results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -88,24 +86,18 @@ weight and bias of each layer, flat; ``skip`` 0 means none."""
 
 
 def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable in all of them.
+    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable once in all of them.
 
-    Only first derivatives exist. A row with NaN gives an output row of NaN and leaves the other rows alone;
-    gradients by the layers are sums over all rows, so a NaN in one reaches them.
-
-    Args:
-        x: (M, K) inputs, any strides; M may be 0. Half precision is computed in float32.
-        layers: first to last, at least one; each takes the width that the one before gives.
-        skip: layer, from 1 on, whose input is the hidden activations followed by ``x``: its weight is
-            (out, width + K). As in NeRF (Mildenhall et al. 2020, figure 7), there for the layer after the fifth.
-
-    Raises:
-        DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
+    A row with NaN gives an output row of NaN; gradients by the layers are sums over all rows, so a NaN in one reaches
+    them. ``x`` (M, K), any strides; half precision is computed in float32. ``skip``: layer, from 1 on, whose input is
+    the hidden activations followed by ``x``: its weight is (out, width + K) (Mildenhall et al. 2020, figure 7). Raises
+    DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
     """
     widths = _checked_widths(x, layers, skip)
     dtype = reduce(torch.promote_types, (t.dtype for layer in layers for t in (layer.weight, layer.bias)), x.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    if not has_kernel("perceptron", x.device) or (x.device.type != "cpu" and _is_large(widths)):
+    too_large = x.device.type != "cpu" and (len(layers) > GPU_LAYERS or max(widths) > GPU_WIDTH)
+    if too_large or not has_kernel("perceptron", x.device):
         return reference_perceptron(x, layers, skip=skip)
     params = torch.cat([t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)])
     x = x.to(dtype)
@@ -124,13 +116,7 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
     return h
 
 
-def _is_large(widths: list[int]) -> bool:
-    """Return whether the kernel of a GPU does not take the network."""
-    return len(widths) - 1 > GPU_LAYERS or max(widths) > GPU_WIDTH
-
-
 def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:
-    """Return the widths of the input and of every layer's output, once all shapes, types and devices are checked."""
     if x.ndim != 2 or x.shape[1] == 0:
         raise DyngsError(f"perceptron: the inputs must be (M, K) with K at least 1, got {tuple(x.shape)}")
     if not layers:

@@ -23,19 +23,13 @@ MAX_POINTS = 2**31 - 1
 
 @dataclass(frozen=True)
 class PlaneLevel:
-    """The six planes of one level, channels last. The first axis of a plane's name varies fastest.
+    """The six planes of one level, channels last. The first axis of a plane's name varies fastest."""
 
-    Attributes:
-        space: (3, R, R, C) planes xy, xz, yz; their rows are y, z, z.
-        time: (3, T, R, C) planes xt, yt, zt; their rows are times.
-    """
-
-    space: Tensor
-    time: Tensor
+    space: Tensor  # (3, R, R, C) planes xy, xz, yz; their rows are y, z, z
+    time: Tensor  # (3, T, R, C) planes xt, yt, zt; their rows are times
 
 
 def _pairs(planes: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Return the space and time planes of each level, as the kernels take them."""
     return list(zip(planes[::2], planes[1::2], strict=True))
 
 
@@ -113,19 +107,12 @@ plane_penalty_op = register("plane_penalty", _plane_penalty, gradient=Gradient(_
 
 
 def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel]) -> Tensor:
-    """Return (M, L * C) features of points at one time: the product of the six planes, level after level.
+    """Return (M, L * C) features of points (M, 3) at one time in [0, 1]: the product of the six planes, by level.
 
-    Each plane is interpolated bilinearly. Sample 0 lies at coordinate -1 or time 0, the last one at coordinate 1 or
-    time 1. What lies outside is clamped, infinity too, and has no gradient there; NaN coordinates give NaN features.
-    Differentiable once, in coordinates and planes. Results are the same bits on any number of threads.
-
-    Args:
-        coords: (M, 3) float32 or float64, within [-1, 1] where the planes reach.
-        time: in [0, 1], the same for all points.
-        levels: at least one; dtype and device of the coordinates, and all of the same C.
-
-    Raises:
-        DyngsError: shapes or dtypes that do not fit each other, no levels, or a time that is no number.
+    Bilinear: sample 0 lies at coordinate -1 or time 0, the last one at 1. What lies outside is clamped, without
+    gradient; NaN coordinates give NaN features. Differentiable once, in coordinates and planes; the same bits on any
+    number of threads. Raises DyngsError: shapes or dtypes that do not fit each other, no levels, or a time that is no
+    number.
     """
     _check_levels(levels)
     if coords.ndim != 2 or coords.shape[1] != 3 or len(coords) > MAX_POINTS:
@@ -144,16 +131,10 @@ def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel])
 def plane_penalty(levels: Sequence[PlaneLevel], weights: tuple[float, float, float]) -> Tensor:
     """Return ``w_space R_space + w_time R_time + w_one R_one``, the regularizers of 4DGS: (), differentiable once.
 
-    R_space is the mean squared second difference along both axes of a space plane, averaged over the two axes; R_time
-    that along the time axis of a time plane; R_one the mean of ``|1 - plane|`` of a time plane; each summed over planes
-    and levels. An axis of fewer than 3 samples counts 0. The gradient is computed along with the value.
-
-    Args:
-        levels: at least one, float32 or float64, all of the same C and on one device.
-        weights: ``(w_space, w_time, w_one)``, finite.
-
-    Raises:
-        DyngsError: shapes or dtypes that do not fit each other, no levels, or weights that are not finite.
+    R_space is the mean squared second difference along both axes of a space plane, averaged over the two; R_time that
+    along the time axis of a time plane; R_one the mean of ``|1 - plane|`` of a time plane; each summed over planes and
+    levels. An axis of fewer than 3 samples counts 0. Raises DyngsError: levels that do not fit, weights that are not
+    finite.
     """
     _check_levels(levels)
     if not all(math.isfinite(w) for w in weights):

@@ -17,8 +17,7 @@ from dyngs.ops.checks import check_tensors
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, launch, register
 
-_KEPT = 12
-"""Numbers per Gaussian that the forward pass keeps for the backward pass."""
+_KEPT = 12  # numbers per Gaussian that the forward pass keeps for the backward pass
 
 
 _Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -78,39 +77,23 @@ posing_op = register("posing", _posing, gradient=Gradient(_save, _backward))
 
 @dataclass(frozen=True)
 class Posed:
-    """Gaussians in a pose.
+    """Gaussians in a pose."""
 
-    Attributes:
-        means: (N, 3).
-        quats: (N, 4) wxyz, of unit length, the largest component positive.
-        log_scales: (N, 3).
-        transforms: (N, 3, 4) blended, by which each was moved.
-    """
-
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    transforms: Tensor
+    means: Tensor  # (N, 3)
+    quats: Tensor  # (N, 4) wxyz, of unit length, the largest component positive
+    log_scales: Tensor  # (N, 3)
+    transforms: Tensor  # (N, 3, 4) blended, by which each was moved
 
 
 def pose_by_joints(means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor) -> Posed:
     """Return Gaussians moved by their joints, T_i = sum_j w_ij A_j: means T x, covariances T S T^T, both exactly.
 
-    With S = R diag(s^2) R^T and T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T, for every T. The axes
-    come in no order; a rigid map leaves theirs. Differentiable, once, in everything: the gradient of U divides by
-    d_i^2 - d_j^2; where these are nearly equal its numerator vanishes too, and the quotient is set to zero. Gradients
-    are finite. Axes of less than e^-16 of a Gaussian's longest count as that. The same bits on any number of threads.
-    NaN in a Gaussian or its weights stays there, but for gradients by the transforms, which are sums over all.
-
-    Args:
-        means: (N, 3) at rest; N may be 0. Half precision is computed in float32.
-        quats: (N, 4) wxyz, of any length; zero counts as the identity.
-        log_scales: (N, 3).
-        weights: (N, J) skinning weights.
-        transforms: (J, 3, 4) of the joints, posed from rest.
-
-    Raises:
-        DyngsError: shapes that do not fit each other, integers, or tensors on different devices.
+    With S = R diag(s^2) R^T and T R diag(s) = U diag(d) V^T the covariance is U diag(d^2) U^T. The axes come in no
+    order; a rigid map leaves theirs. Differentiable, once, in everything; where d_i^2 - d_j^2 nearly vanishes, so does
+    its part of the gradient. Axes of less than e^-16 of the longest count as that. The same bits on any number of
+    threads. NaN stays in its Gaussian, but for gradients by the transforms. ``weights`` (N, J) skin; ``transforms`` (J,
+    3, 4) posed from rest; half precision is computed in float32. Raises DyngsError: shapes that do not fit, integers,
+    or other devices.
     """
     inputs = {"means": means, "quats": quats, "log_scales": log_scales, "weights": weights, "transforms": transforms}
     _check(inputs)

@@ -16,22 +16,15 @@ from dyngs.ops.registration import Gradient, Struct, empty_like, launch, registe
 
 @dataclass(frozen=True)
 class ProjectionOptions:
-    """Limits of the projection.
+    """Limits of the projection."""
 
-    Attributes:
-        eps2d: low-pass variance added to the 2D covariance, px^2.
-        near, far: Gaussians whose centre is not strictly between are culled, world units.
-        alpha_min: pixels with less alpha are not drawn; sets the extent of a splat.
-        radius_clip: splats with no larger half extent are culled, px.
-        antialiased: the extent uses the compensated opacity.
-    """
-
-    eps2d: float = 0.3
+    eps2d: float = 0.3  # low-pass variance added to the 2D covariance, px^2
+    # ``near, far``: Gaussians whose centre is not strictly between are culled, world units
     near: float = 0.2
     far: float = 1e10
-    alpha_min: float = 1 / 255
-    radius_clip: float = 0.0
-    antialiased: bool = False
+    alpha_min: float = 1 / 255  # pixels with less alpha are not drawn; sets the extent of a splat
+    radius_clip: float = 0.0  # splats with no larger half extent are culled, px
+    antialiased: bool = False  # the extent uses the compensated opacity
 
     def __post_init__(self) -> None:
         check_number("eps2d", self.eps2d, 0)
@@ -42,21 +35,13 @@ class ProjectionOptions:
 
 @dataclass(frozen=True)
 class Projection:
-    """Splats of N Gaussians in V views; rows of culled Gaussians are zero.
+    """Splats of N Gaussians in V views; rows of culled Gaussians are zero."""
 
-    Attributes:
-        means2d: (V, N, 2) px, centre of the first pixel at (0.5, 0.5).
-        depths: (V, N) view-space z.
-        factors: (V, N, 3) entries U, W, V of F = [[U, W], [0, V]] with conic = F^T F, 1/px.
-        compensations: (V, N) sqrt of the determinant ratio before / after the low-pass.
-        radii: (V, N, 2) int32 half extents, px; 0 = culled.
-    """
-
-    means2d: Tensor
-    depths: Tensor
-    factors: Tensor
-    compensations: Tensor
-    radii: Tensor
+    means2d: Tensor  # (V, N, 2) px, centre of the first pixel at (0.5, 0.5)
+    depths: Tensor  # (V, N) view-space z
+    factors: Tensor  # (V, N, 3) entries U, W, V of F = [[U, W], [0, V]] with conic = F^T F, 1/px
+    compensations: Tensor  # (V, N) sqrt of the determinant ratio before / after the low-pass
+    radii: Tensor  # (V, N, 2) int32 half extents, px; 0 = culled
 
     @property
     def conics(self) -> Tensor:
@@ -150,18 +135,9 @@ def project(
 ) -> Projection:
     """Return the splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023).
 
-    Differentiable in means, quats, scales and cameras: poses, focal lengths and principal points.
-
-    Args:
-        means: (N, 3) world.
-        quats: (N, 4) wxyz, any norm; zero means identity.
-        scales: (N, 3) standard deviations, world units.
-        opacities: (N,) in [0, 1]; they only set the extents.
-        cameras: V cameras.
-        options: see ``ProjectionOptions``.
-
-    Raises:
-        DyngsError: an image with sides above 2^23 px, or more splats than memory holds.
+    Differentiable in means, quats, scales and cameras. ``quats`` (N, 4) wxyz, any norm; zero means identity; ``scales``
+    (N, 3) standard deviations; ``opacities`` (N,) in [0, 1] only set the extents. Raises DyngsError: an image with
+    sides above 2^23 px, or more splats than memory holds.
     """
     check_size(cameras.width, cameras.height)  # before torch, which takes no integers from 2^63 on
     limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]

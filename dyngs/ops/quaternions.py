@@ -1,4 +1,4 @@
-"""Quaternions wxyz of any length: unit quaternions, products, rotations of vectors, rotation matrices.
+"""Quaternions wxyz of any length: unit quaternions, products, rotations of vectors, rotation matrices and back.
 
 Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/quaternion.hpp).
 """
@@ -7,8 +7,6 @@ Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/q
 # The stubs of torch leave parts of these functions untyped.
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -61,12 +59,26 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Return the rotation matrices (..., 3, 3) of ``quats`` (..., 4) of any length; the identity for zero."""
-    return torch.stack(matrix_entries(unit_quats(quats).unbind(-1)), dim=-1).unflatten(-1, (3, 3))
-
-
-def matrix_entries(unit: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Return the nine entries, row by row, of the rotation matrices of unit quaternions given as w, x, y, z."""
-    w, x, y, z = unit
+    w, x, y, z = unit_quats(quats).unbind(-1)
     xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
     xy, xz, yz, wx, wy, wz = 2 * x * y, 2 * x * z, 2 * y * z, 2 * w * x, 2 * w * y, 2 * w * z
-    return (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    entries = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+
+def quats_of(matrices: Tensor) -> Tensor:
+    """Return the unit quaternions wxyz (..., 4) of rotations (..., 3, 3), with their largest component positive.
+
+    Differentiable, at half turns too: the column of 4 q q^T with the largest diagonal entry, normalised (Shepperd
+    1978). Matrices that are not quite rotations still give unit quaternions.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = matrices.reshape(-1, 9).T.contiguous().unbind()
+    wx, wy, wz = zy - yz, xz - zx, yx - xy
+    sxy, sxz, syz = xy + yx, xz + zx, yz + zy
+    diagonal = (xx + yy + zz + 1, xx - yy - zz + 1, yy - xx - zz + 1, zz - xx - yy + 1)
+    w, x, y, z = diagonal
+    columns = ((w, wx, wy, wz), (wx, x, sxy, sxz), (wy, sxy, y, syz), (wz, sxz, syz, z))
+    chosen, largest = torch.stack(columns[0]), w
+    for column, entry in zip(columns[1:], diagonal[1:], strict=True):
+        chosen, largest = torch.where(entry > largest, torch.stack(column), chosen), torch.maximum(largest, entry)
+    return (chosen / chosen.square().sum(0).sqrt().clamp_min(1e-30)).T.reshape(*matrices.shape[:-2], 4)

@@ -30,21 +30,14 @@ MOMENTS = 6  # that the backward pass holds per (Gaussian, tile) pair, beside th
 
 @dataclass(frozen=True)
 class BlendOptions:
-    """Thresholds of the blending (3DGS): set the minima to 0 for exact comparisons.
+    """Thresholds of the blending (3DGS): set the minima to 0 for exact comparisons."""
 
-    Attributes:
-        alpha_min: a pixel skips Gaussians with less alpha.
-        alpha_max: alpha is clamped here, and the clamp stops the gradient.
-        transmittance_min: a pixel stops before the Gaussian that would take it below.
-        absgrad: also sum the absolute gradients of the 2D means into the probe.
-        max_entries: refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more than
-            memory holds, at 20 bytes each.
-    """
-
-    alpha_min: float = 1 / 255
-    alpha_max: float = 0.99
-    transmittance_min: float = 1e-4
-    absgrad: bool = False
+    alpha_min: float = 1 / 255  # a pixel skips Gaussians with less alpha
+    alpha_max: float = 0.99  # alpha is clamped here, and the clamp stops the gradient
+    transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would take it below
+    absgrad: bool = False  # also sum the absolute gradients of the 2D means into the probe
+    # refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more than memory holds,
+    # at 20 bytes each
     max_entries: int = MAX_ENTRIES
 
     def __post_init__(self) -> None:
@@ -60,19 +53,12 @@ class BlendOptions:
 
 @dataclass(frozen=True)
 class TileEntries:
-    """E pairs of a tile and a splat that meets it, sorted by view, tile, depth, index.
+    """E pairs of a tile and a splat that meets it, sorted by view, tile, depth, index."""
 
-    Attributes:
-        tile_offsets: (V T + 1,) int64: where each tile's pairs begin.
-        slot_ranges: (2 V N,) int32: begin and end of each splat's slots in a buffer of E records.
-        gaussians: (E,) int32: view * N + Gaussian.
-        slots: (E,) int32: the pair's own slot.
-    """
-
-    tile_offsets: Tensor
-    slot_ranges: Tensor
-    gaussians: Tensor
-    slots: Tensor
+    tile_offsets: Tensor  # (V T + 1,) int64: where each tile's pairs begin
+    slot_ranges: Tensor  # (2 V N,) int32: begin and end of each splat's slots in a buffer of E records
+    gaussians: Tensor  # (E,) int32: view * N + Gaussian
+    slots: Tensor  # (E,) int32: the pair's own slot
 
     def tensors(self) -> list[Tensor]:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
@@ -94,15 +80,10 @@ class TileEntries:
 
 @dataclass(frozen=True)
 class Blended:
-    """V blended images of D channels.
+    """V blended images of D channels."""
 
-    Attributes:
-        color: (V, H, W, D), background composited.
-        transmittance: (V, H, W) in [0, 1], the fraction of the background that is seen; alpha is 1 minus it.
-    """
-
-    color: Tensor
-    transmittance: Tensor
+    color: Tensor  # (V, H, W, D), background composited
+    transmittance: Tensor  # (V, H, W) in [0, 1], the fraction of the background that is seen; alpha is 1 minus it
 
 
 def _settings(size: list[int], thresholds: list[float]) -> Struct:
@@ -111,13 +92,11 @@ def _settings(size: list[int], thresholds: list[float]) -> Struct:
 
 
 def _arrays(*splats: Tensor) -> Struct:
-    """Return means2d, factors, opacities and radii as the kernels take them."""
     return Struct("SplatArraysF32" if splats[0].dtype == torch.float32 else "SplatArraysF64", splats)
 
 
 @contextmanager
 def _refusals(kernel: str) -> Generator[None]:
-    """Turn what the kernels say of lengths and indices into a ``DyngsError``."""
     try:
         yield
     except ValueError as error:
@@ -156,7 +135,6 @@ bin_tiles_op = register("bin_tiles", _bin_tiles)
 
 
 def _image(colors: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return uninitialised colours, transmittances and stops of V images."""
     check_size(*size)
     views, channels = colors.shape[0], colors.shape[2]
     needed = views * size[0] * size[1] * ((channels + 1) * colors.element_size() + 4)
@@ -296,23 +274,11 @@ def rasterize(
 ) -> Blended:
     """Return the splats blended front to back into V images of D channels.
 
-    Differentiable in means2d, factors, opacities, colors and background.
-
-    Args:
-        projection: splats, see ``project``.
-        opacities: (V, N) in [0, 1], compensated already if wanted.
-        colors: (V, N, D), D up to 40.
-        size: width, height in px.
-        background: (V, D) or None for black.
-        probe: (V, N, 4) zeros; its gradient is the signed gradient of the 2D means in px, then (with ``absgrad``) the
-            sum over pixels of its absolute values.
-        options: thresholds.
-        entries: what ``bin_tiles`` returned for the same splats, size and options, to save doing it again.
-
-    Raises:
-        DyngsError: too many channels, sides above 2^23 px, more (Gaussian, tile) pairs than ``options.max_entries`` or
-            than memory holds, an image larger than memory, or ``entries`` of another shape or with indices out of
-            range.
+    Differentiable in means2d, factors, opacities, colors and background. ``opacities`` (V, N), compensated already if
+    wanted; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None: black; ``probe`` (V, N, 4) zeros, whose
+    gradient is that of the 2D means in px, then (with ``absgrad``) the sum over pixels of its absolute values;
+    ``entries``: what ``bin_tiles`` returned for the same. Raises DyngsError: too many channels, sides above 2^23 px,
+    more (Gaussian, tile) pairs than ``options.max_entries`` or than memory holds, or ``entries`` that do not fit.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
         raise DyngsError(f"colors have {colors.shape[-1]} channels; 1 to {MAX_CHANNELS} can be blended in one call")

@@ -1,12 +1,9 @@
 """Registration of the native ops with torch's dispatcher, under the namespace ``dyngs``.
 
-One call of ``register`` holds all that an op is: its implementation, whose type hints are the schema, and the formula
-of its gradient. An implementation allocates its results and has them filled by ``launch``, which does nothing where
-only shapes are needed (``torch.compile``). Callers never ask where a tensor lies; the dispatcher picks the
-implementation. The compiled cores for CPU and CUDA have the same functions, so that one implementation serves both. A
-back end for another device adds its implementations with ``implement`` and changes nothing here.
-
-``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
+``register`` takes an implementation, whose type hints are the schema, and the formula of its gradient. An
+implementation allocates its results and has them filled by ``launch``, which does nothing where only shapes are needed
+(``torch.compile``). The compiled cores for CPU and CUDA have the same functions, so that one implementation serves
+both. ``torch.library.custom_op`` would do the same, but imports ``torch._dynamo`` when the first op is made: 2 s.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -32,21 +29,17 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _LIBRARY = torch.library.Library(NAMESPACE, "FRAGMENT")
-_kernels: dict[str, set[str]] = {}
-"""Devices of each op's implementations."""
+_kernels: dict[str, set[str]] = {}  # devices of each op's implementations
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """Formula of the first derivatives of an op, as of a ``torch.autograd.Function``.
+    """Formula of the first derivatives of an op, as of a ``torch.autograd.Function``."""
 
-    Attributes:
-        save: called as ``save(ctx, inputs, output)`` after the forward pass, keeps what the formula needs.
-        backward: called as ``backward(ctx, *gradients of the outputs)``, returns one gradient per input; for an input
-            that is a list of tensors, a list.
-    """
-
+    # called as ``save(ctx, inputs, output)`` after the forward pass, keeps what the formula needs
     save: Callable[[Any, tuple[Any, ...], Any], None]
+    # called as ``backward(ctx, *gradients of the outputs)``, returns one gradient per input; for an input that is a
+    # list of tensors, a list
     backward: Callable[..., Any]
 
 
@@ -58,16 +51,11 @@ def register(
     mutates: tuple[str, ...] = (),
     gradient: Gradient | None = None,
 ) -> Callable[P, R]:
-    """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments.
+    """Return the op ``torch.ops.dyngs.NAME``, called with positional arguments; elsewhere it raises DyngsError.
 
-    On a device without an implementation it raises ``DyngsError``, which names the device.
-
-    Args:
-        name: of the op.
-        kernel: the implementation; its type hints give the schema. No result may share memory with an input.
-        devices: for whose tensors ``kernel`` is; CUDA counts only where its core was built.
-        mutates: arguments that ``kernel`` writes to.
-        gradient: None: not differentiable.
+    ``kernel``: the implementation, whose type hints give the schema; no result may share memory with an input.
+    ``devices``: for whose tensors it is; CUDA counts only where its core was built. ``mutates``: arguments that it
+    writes to.
     """
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
     qualified = f"{NAMESPACE}::{name}"
@@ -114,10 +102,7 @@ def shapes_only() -> bool:
 def launch(like: Tensor, name: str, *arguments: object) -> Any:
     """Return what the function ``name`` of the core gives; None, without calling it, where only shapes are needed.
 
-    Args:
-        like: lies where the function computes.
-        name: of the function.
-        arguments: tensors, those written to included, are passed as arrays, also those in tuples and lists.
+    ``arguments``: tensors, those written to included, are passed as arrays, also those in tuples and lists.
     """
     if _mode.shapes_only:
         return None
@@ -131,7 +116,6 @@ def empty_like(x: Tensor) -> Tensor:
 
 
 def _passed(core: ModuleType, value: Any) -> Any:
-    """Return ``value`` as the functions of the core take it."""
     match value:
         case Tensor():
             return array(value)
@@ -146,8 +130,6 @@ def _passed(core: ModuleType, value: Any) -> Any:
 
 
 def _shapes_of(kernel: Callable[P, R]) -> Callable[P, R]:
-    """Return ``kernel`` without the calls of the core."""
-
     def shapes(*arguments: P.args, **named: P.kwargs) -> R:
         _mode.shapes_only = True
         try:
@@ -181,7 +163,6 @@ def _refusal(name: str) -> Callable[..., Any]:
 
 
 def _tensors(values: Iterable[object]) -> list[Tensor]:
-    """Return the tensors among ``values`` and in its lists and tuples."""
     found: list[Tensor] = []
     for value in values:
         if isinstance(value, Tensor):

@@ -73,23 +73,12 @@ def blend_skinning(
 ) -> tuple[Tensor, Tensor]:
     """Return offsets (M, 3) of points that follow moving nodes, and the nodes' values (M, D) blended alike.
 
-    A node turns what follows it about its own place p_b and shifts it, so that x is offset by
-    sum_b w_b (R_b (x - p_b) - (x - p_b) + d_b) with w = softmax_b(-|x - p_b|^2 / (2 radius_b^2)). Differentiable, once,
-    in ``points``, ``motion`` and ``values``; the weights count as constant. The same bits on any number of threads.
-    NaN in a point or in the motion or values of a node reaches that point or that node's followers only; but gradients
-    by nodes are sums over their followers, and there it shows.
-
-    Args:
-        points: (M, 3) x, world units; M may be 0. Half precision is computed in float32.
-        positions: (S, 3) p of the nodes, constant.
-        radii: (S,) of influence, world units, positive; constant.
-        followed: (M, B) int64 in [0, S); B at least 1.
-        motion: (S, 7) shift d, then quaternion wxyz of R, of any length; zero turns nothing.
-        values: (S, D) of whatever is blended linearly; D may be 0.
-
-    Raises:
-        DyngsError: shapes that do not fit each other, integers where floating point is needed or the reverse, tensors
-            on different devices, or an index of a node that does not exist.
+    x is offset by sum_b w_b (R_b (x - p_b) - (x - p_b) + d_b) with w = softmax_b(-|x - p_b|^2 / (2 radius_b^2)).
+    Differentiable, once, in ``points``, ``motion`` and ``values``; the weights count as constant. The same bits on any
+    number of threads. NaN reaches its point or its node's followers only, and gradients by nodes. ``positions`` (S, 3)
+    p and ``radii`` (S,) positive, constant; ``followed`` (M, B) int64; ``motion`` (S, 7) shift d, then quaternion wxyz
+    of R, of any length; ``values`` (S, D). Half precision is computed in float32. Raises DyngsError: shapes, types or
+    devices that do not fit, or a node that does not exist.
     """
     _check(points, positions, radii, followed, motion, values)
     floats = (points, positions, radii, motion, values)
@@ -144,15 +133,10 @@ add_offsets_op = register(
 def add_offsets_(gaussians: Sequence[Tensor], rows: Tensor | None, offsets: Sequence[Tensor | None]) -> None:
     """Move M of N Gaussians in place, as ``dyngs.deform.field.deformed`` defines it; no gradient.
 
-    Args:
-        gaussians: (N, 3) means, (N, 4) quats, (N, 3) log scales, (N,) opacity logits, (N, K, 3) harmonics; contiguous
-            where there are offsets.
-        rows: (M,) int64 without repetition; None: the first M.
-        offsets: (M, ...) of each in this order, of the base colour in place of harmonics; None but for the first: none.
-
-    Raises:
-        IndexError: a row that does not exist.
-        DyngsError: Gaussians that are not contiguous.
+    ``gaussians``: means, quats, log scales, opacity logits, harmonics (N, K, 3); contiguous where there are offsets.
+    ``rows`` (M,) int64 without repetition; None: the first M. ``offsets`` (M, ...) of each in this order, of the base
+    colour in place of harmonics; None but for the first: none. Raises IndexError: no such row; DyngsError: not
+    contiguous.
     """
     by_means, by_quats, by_log_scales, by_logits, by_colors = (
         None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets

@@ -16,7 +16,7 @@ from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_depen
 from dyngs.gaussians.scene import Scene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.views import background_colour
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import sent
 from dyngs.prune.stage import remove_
 
 

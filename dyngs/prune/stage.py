@@ -24,7 +24,7 @@ from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
 from dyngs.models.views import background_colour
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import sent
 from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop

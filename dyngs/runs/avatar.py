@@ -24,7 +24,7 @@ from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import TERMS, PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.motion.placement import rest_clip
 from dyngs.human.template.body_reader import template_path
 from dyngs.models.views import background_colour

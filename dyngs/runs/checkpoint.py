@@ -167,7 +167,7 @@ def _scene_checkpoint(run_dir: Path) -> Checkpoint:
     path = run_dir / SCENE_FILE
     stored = read_scene(path)
     with reading(path):
-        return Checkpoint(info_of(stored.info.model_dump()), stored.tensors, path)
+        return Checkpoint(info_of(asdict(stored.info)), stored.tensors, path)
 
 
 def last_good(run_dir: Path) -> str:

@@ -21,7 +21,7 @@ from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion import placement
-from dyngs.human.motion.clip import captured_motion, motion_clip, same_bodies
+from dyngs.human.motion.motion import captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.renderable import Renderable

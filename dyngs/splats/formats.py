@@ -14,28 +14,19 @@ from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.splats.rotation import axis_of, product, turn_between, turned
-from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, unit_rotations, with_degree
+from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, require_writable, unit_rotations, with_degree
 
 
 @dataclass(frozen=True)
 class Format:
-    """A file format of Gaussians.
+    """A file format of Gaussians."""
 
-    Attributes:
-        name: as ``--format`` takes it.
-        suffixes: of its files, lower case; the first one is written.
-        up: axis that viewers of these files take for up.
-        max_degree: largest degree of the harmonics that it holds.
-        states_mode: whether it can say that the scene is antialiased.
-        home: module and the names of its reader and its writer.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
-    up: str
-    max_degree: int
-    states_mode: bool
-    home: tuple[str, str, str]
+    name: str  # as ``--format`` takes it
+    suffixes: tuple[str, ...]  # of its files, lower case; the first one is written
+    up: str  # axis that viewers of these files take for up
+    max_degree: int  # largest degree of the harmonics that it holds
+    states_mode: bool  # whether it can say that the scene is antialiased
+    home: tuple[str, str, str]  # module and the names of its reader and its writer
 
     @property
     def reader(self) -> Callable[[Path], SplatFile]:
@@ -49,8 +40,8 @@ class Format:
 
 
 FORMATS = (
-    Format("compressed-ply", (".compressed.ply",), "-y", 3, True, ("ply", "read_raw", "write_compressed")),
-    Format("ply", (".ply",), "-y", 4, True, ("ply", "read_raw", "write_raw")),
+    Format("compressed-ply", (".compressed.ply",), "-y", 3, True, ("ply", "read_ply", "write_compressed")),
+    Format("ply", (".ply",), "-y", 4, True, ("ply", "read_ply", "write_ply")),
     Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz")),
     Format("splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")),
     Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
@@ -62,25 +53,15 @@ FORMATS = (
 
 @dataclass(frozen=True)
 class Written:
-    """A file that was written.
+    """A file that was written."""
 
-    Attributes:
-        path: of it.
-        splat: what it is meant to hold, before the format rounded it.
-        notes: a line about each thing that the format could not hold.
-    """
-
-    path: Path
-    splat: SplatFile
-    notes: tuple[str, ...] = ()
+    path: Path  # of it
+    splat: SplatFile  # what it is meant to hold, before the format rounded it
+    notes: tuple[str, ...] = ()  # a line about each thing that the format could not hold
 
 
 def format_of(path: Path) -> Format:
-    """Return the format that the suffix of ``path`` names.
-
-    Raises:
-        DyngsError: none does; names all of them.
-    """
+    """Return the format that the suffix of ``path`` names. Raises DyngsError: none does; names all of them."""
     found = known_format(path)
     if found is None:
         given = f"the suffix {path.suffix!r} names" if path.suffix else "a name without a suffix names"
@@ -113,14 +94,10 @@ def all_suffixes() -> str:
 def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFile:
     """Read a file of Gaussians; its suffix names the format.
 
-    Args:
-        path: the file.
-        nonfinite: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the file. Infinite logits
-            (opacities of exactly 0 or 1) and sizes of 0 are brought to finite values, with a note.
-
-    Raises:
-        DyngsError: an unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated
-            before the numbers in the header have been compared with the size of the file and the limits.
+    ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the file. Opacities of
+    exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError: an unknown suffix, or not such a file,
+    cut off, empty or non-finite; nothing large is allocated before the header has been compared with the size of the
+    file.
     """
     path = Path(path)
     own = format_of(path)
@@ -135,26 +112,16 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
 
 
 def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
-    """Write a file of Gaussians, atomically; its suffix names the format.
+    """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names the format.
 
-    Args:
-        path: file to write; its folder is created.
-        splat: N >= 1 Gaussians and what the file is to say about them; any 3D filter must be fused into them already.
-        sh_degree: degree of the harmonics in the file: higher ones are left out, missing ones zero. None: as they are,
-            up to what the format holds.
-
-    Raises:
-        DyngsError: an unknown suffix, no Gaussians, non-finite values, a degree that the format does not hold, or the
-            file cannot be written.
+    ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None: up to what the
+    format holds. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree that the format
+    does not hold.
     """
     path = Path(path)
     own = format_of(path)
     gaussians, notes = splat.gaussians.detach().to(device="cpu", dtype=torch.float32), []
-    if len(gaussians) == 0:
-        raise DyngsError(f"{path}: not written, there are no Gaussians")
-    bad = torch.stack([~x[:, None].flatten(1).isfinite().all(1) for x in gaussians.tensors().values()]).any(0)
-    if bool(bad.any()):
-        raise DyngsError(f"{path}: not written, {int(bad.sum())} of {len(gaussians)} Gaussians have non-finite values")
+    require_writable(path, gaussians)
     if sh_degree is not None and sh_degree > own.max_degree:
         raise DyngsError(f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}")
     degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree
@@ -176,10 +143,8 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
 def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
     """Return the contents turned so that what points up in them points along the axis ``up`` of a file.
 
-    Args:
-        splat: unchanged where it does not say what points up.
-        up: axis such as "-y"; None: what viewers of the format of ``path`` take for up; "keep": nothing is turned.
-        path: file to be written.
+    ``splat``: unchanged where it does not say what points up. ``up``: axis such as "-y"; None: what viewers of the
+    format of ``path`` take for up; "keep": nothing is turned.
     """
     if up == "keep" or splat.up is None:
         return splat

@@ -11,40 +11,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.files.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
-from dyngs.splats.packing import logit
-from dyngs.splats.rotation import turned
-from dyngs.splats.similarity import Placement, placement_of
-from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
+from dyngs.splats.rotation import joined, placed
+from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, from_linear
 
 EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
-_MOST_NODES, _MOST_DEPTH = 4096, 32
-"""Limits on the nodes that are visited, and on those above one another."""
+_MOST_NODES, _MOST_DEPTH = 4096, 32  # limits on the nodes that are visited, and on those above one another
 
 
 def read_gltf(path: Path) -> SplatFile:
     """Read all Gaussians of a .glb, placed as its nodes say.
 
-    Raises:
-        DyngsError: no primitive of Gaussians, a kernel or colour space other than those of 3DGS, or damaged contents.
+    Raises DyngsError: no primitive of Gaussians, a kernel or colour space other than those of 3DGS, or damaged
+    contents.
     """
     file = GltfFile(path)
     found: list[Gaussians] = []
-    for primitive, placement in _placed_primitives(file):
-        own = _gaussians(file, primitive)
-        found.append(turned(own, placement.rotation, placement.scale, placement.shift_tensor))
+    for primitive, world in _primitives(file):
+        own = placed(_gaussians(file, primitive), world)
+        if own is None:
+            raise file.error("a node distorts or mirrors its Gaussians; apply its transform before exporting")
+        found.append(own)
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
-    degree = min(g.sh_degree for g in found)
-    parts = [g.tensors() | {"sh": g.sh[:, : num_sh_terms(degree)]} for g in found]
-    return SplatFile(Gaussians(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]}))
+    return SplatFile(joined(found))
 
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
@@ -63,9 +59,11 @@ def write_gltf(path: Path, splat: SplatFile) -> None:
 def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]:
     """Add the numbers of Gaussians to a document, harmonics up to degree 3; return their primitive."""
     sh = gaussians.sh.numpy()
+    srgb = (sh[:, 0] * SH_C0 + 0.5).clip(0, 1)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     arrays = {
         "POSITION": gaussians.means.numpy(),
-        "COLOR_0": np.concatenate([_linear(sh[:, 0] * SH_C0 + 0.5), gaussians.opacities.numpy()[:, None]], axis=1),
+        "COLOR_0": np.concatenate([linear, gaussians.opacities.numpy()[:, None]], axis=1),
         f"{EXTENSION}:ROTATION": gaussians.quats.numpy()[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": gaussians.scales.numpy(),
         f"{EXTENSION}:OPACITY": gaussians.opacities.numpy()[:, None],
@@ -83,14 +81,8 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
     return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
 
 
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Return linear values of sRGB ones, clamped to [0, 1]."""
-    inside = srgb.clip(0, 1)
-    return np.where(inside <= 0.04045, inside / 12.92, ((inside + 0.055) / 1.055) ** 2.4)
-
-
-def _placed_primitives(file: GltfFile) -> Iterator[tuple[Primitive, Placement]]:
-    """Yield the primitives of Gaussians, and where nodes put them."""
+def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
+    """Yield the primitives of Gaussians, and the matrices (4, 4) by which nodes place them."""
     document, visited = file.document, 0
     if document.scenes and document.scene >= len(document.scenes):
         raise file.error(f"scene {document.scene} is missing; export it again")
@@ -111,10 +103,7 @@ def _placed_primitives(file: GltfFile) -> Iterator[tuple[Primitive, Placement]]:
         primitives = () if node.mesh is None else document.meshes[node.mesh].primitives
         for primitive in primitives:
             if EXTENSION in primitive.extensions:
-                placement = placement_of(world)
-                if placement is None:
-                    raise file.error("a node distorts or mirrors its Gaussians; apply its transform before exporting")
-                yield primitive, placement
+                yield primitive, world
 
 
 def _matrix(node: Node) -> np.ndarray:
@@ -130,7 +119,6 @@ def _matrix(node: Node) -> np.ndarray:
 
 
 def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
-    """Return the Gaussians of a primitive, in the axes of its node."""
     own, names = primitive.extensions[EXTENSION], primitive.attributes
     if not isinstance(own, dict) or "extensions" in own:
         raise file.error("its Gaussians are compressed by another extension; export them without")
@@ -156,12 +144,4 @@ def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
     rotations = numbers(f"{EXTENSION}:ROTATION", "VEC4")
     if any(len(x) != len(means) for x in (*terms, scales, opacities, rotations)):
         raise file.error("the attributes of its Gaussians have different lengths; export it again")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_scales = np.log(scales)
-    return Gaussians(
-        means=torch.from_numpy(means),
-        quats=unit_rotations(torch.from_numpy(rotations[:, [3, 0, 1, 2]])),
-        log_scales=torch.from_numpy(log_scales),
-        logit_opacities=torch.from_numpy(logit(opacities)),
-        sh=torch.from_numpy(np.stack(terms, axis=1)),
-    )
+    return from_linear(means, rotations[:, [3, 0, 1, 2]], scales, opacities, np.stack(terms, axis=1))

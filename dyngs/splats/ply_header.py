@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,19 +45,12 @@ class _Element:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The header of a .ply that has a ``vertex`` element.
+    """The header of a .ply that has a ``vertex`` element."""
 
-    Attributes:
-        byte_order: "<", ">" or None for ascii.
-        elements: all elements in file order.
-        comments: comments of the header.
-        data_start: offset of the first byte after the header.
-    """
-
-    byte_order: str | None
-    elements: tuple[_Element, ...]
-    comments: tuple[str, ...]
-    data_start: int
+    byte_order: str | None  # "<", ">" or None for ascii
+    elements: tuple[_Element, ...]  # all elements in file order
+    comments: tuple[str, ...]  # comments of the header
+    data_start: int  # offset of the first byte after the header
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,8 +65,7 @@ class PlyHeader:
     def read_element(self, file: BinaryIO, path: Path, name: str = "vertex") -> np.ndarray:
         """Read an element as a structured array (N,).
 
-        Raises:
-            DyngsError: the file is truncated, or list properties hide where the element is.
+        Raises DyngsError: the file is truncated, or list properties hide where the element is.
         """
         index = self.names.index(name)
         wanted, earlier = self.elements[index], self.elements[:index]
@@ -116,9 +109,7 @@ def _read_ascii(file: BinaryIO, path: Path, wanted: _Element, skipped: int, avai
 def header_bytes(elements: Sequence[tuple[str, int, Sequence[tuple[str, str]]]], comments: Iterable[str] = ()) -> bytes:
     """Return the header of a binary little-endian .ply.
 
-    Args:
-        elements: name, count, and properties as (type, name), such as ("float", "x").
-        comments: one line of ASCII each.
+    ``elements``: name, count, and properties as (type, name), such as ("float", "x").
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     for comment in comments:
@@ -150,15 +141,20 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
             comments.append(line[len(keyword) :].strip())
         elif keyword == "format" and len(words) == 3 and words[1] in _BYTE_ORDERS and not seen_format:
             byte_order, seen_format = _BYTE_ORDERS[words[1]], True
-        elif keyword == "element" and len(words) == 3 and _is_count(words[2]):
+        elif keyword == "element" and len(words) == 3 and re.fullmatch("[0-9]{1,18}", words[2]):
             require_at_most(path, len(elements) + 1, _MOST_ELEMENTS, "elements of a .ply")
             elements.append(_Element(words[1], int(words[2])))
             properties.append({})
         elif keyword == "property" and elements:
-            if not _is_list(words):
-                _add_property(properties[-1], words, path)
-            elif not elements[-1].has_list:
+            if len(words) == 5 and words[1] == "list":
                 elements[-1] = replace(elements[-1], has_list=True)
+                continue
+            if len(words) != 3 or words[1] not in _SCALARS:
+                raise DyngsError(f"{path}: bad .ply header line {_shown(line)}")
+            if words[2] in properties[-1]:
+                raise DyngsError(f"{path}: the .ply header has the property {words[2]:.60} twice")
+            require_at_most(path, len(properties[-1]) + 1, _MOST_PROPERTIES, "properties of an element of a .ply")
+            properties[-1][words[2]] = _SCALARS[words[1]]
         elif keyword:
             raise DyngsError(f"{path}: bad .ply header line {_shown(line)}")
     if not seen_format:
@@ -179,20 +175,6 @@ def _next_line(file: BinaryIO, path: Path) -> str:
     return raw.decode("utf-8", errors="replace").strip()
 
 
-def _is_list(words: list[str]) -> bool:
-    return len(words) == 5 and words[1] == "list"
-
-
-def _add_property(properties: dict[str, str], words: list[str], path: Path) -> None:
-    """Add the property of a header line to the types by name."""
-    if len(words) != 3 or words[1] not in _SCALARS:
-        raise DyngsError(f"{path}: bad .ply header line {_shown(' '.join(words))}")
-    if words[2] in properties:
-        raise DyngsError(f"{path}: the .ply header has the property {words[2]:.60} twice")
-    require_at_most(path, len(properties) + 1, _MOST_PROPERTIES, "properties of an element of a .ply")
-    properties[words[2]] = _SCALARS[words[1]]
-
-
 def _ascii_row(line: bytes, width: int, index: int, path: Path) -> list[float]:
     try:
         values = [float(word) for word in line.split()]
@@ -201,10 +183,6 @@ def _ascii_row(line: bytes, width: int, index: int, path: Path) -> list[float]:
     if len(values) != width:
         raise DyngsError(f"{path}: vertex {index} should hold {width} numbers")
     return values
-
-
-def _is_count(word: str) -> bool:
-    return word.isascii() and word.isdigit() and len(word) <= 18
 
 
 def _shown(line: str) -> str:

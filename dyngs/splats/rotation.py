@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,8 @@ from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import quat_product, rotation_matrices
-from dyngs.ops.reference import harmonics_basis
 
 AXES: dict[str, tuple[float, float, float]] = {
     f"{sign}{name}": (value * (i == 0), value * (i == 1), value * (i == 2))
@@ -22,8 +23,7 @@ AXES: dict[str, tuple[float, float, float]] = {
 }
 """Unit vectors by the names that ``--up`` takes: x, y, z, -x, -y, -z."""
 
-_ALONG_AXIS = 0.866
-"""A direction within 30 degrees of an axis is taken for the axis."""
+_ALONG_AXIS = 0.866  # a direction within 30 degrees of an axis is taken for the axis
 _DIRECTIONS = 200
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
@@ -33,11 +33,8 @@ def turned(
 ) -> Gaussians:
     """Return the Gaussians rotated about the origin, then scaled, then shifted.
 
-    Args:
-        gaussians: N Gaussians, harmonics of degree 0 to 4.
-        rotation: (4,) unit quaternion wxyz.
-        scale: positive factor of positions and sizes.
-        shift: (3,) added to the centres; None: nothing.
+    ``gaussians``: N Gaussians, harmonics of degree 0 to 4. ``rotation``: (4,) unit quaternion wxyz. ``scale``: positive
+    factor of positions and sizes. ``shift``: (3,) added to the centres; None: nothing.
     """
     if rotation == _NO_TURN and scale == 1 and shift is None:
         return gaussians
@@ -55,15 +52,35 @@ def turned(
     )
 
 
+def placed(gaussians: Gaussians, world: np.ndarray) -> Gaussians | None:
+    """Return the Gaussians where an affine matrix (4, 4) puts them, None where that distorts or mirrors them."""
+    from scipy.spatial.transform import Rotation
+
+    linear = world[:3, :3]
+    if not np.isfinite(world).all():
+        return None
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not 1e-9 < scale < 1e9 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > 1e-3:
+        return None
+    if abs(scale - 1) < 1e-7:
+        scale = 1.0
+    x, y, z, w = Rotation.from_matrix(linear / scale).as_quat(canonical=True).tolist()
+    shift = torch.from_numpy(world[:3, 3].copy()) if world[:3, 3].any() else None
+    return turned(gaussians, (w, x, y, z), scale, shift)
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """Return the Gaussians of all parts, with harmonics of the least degree among them."""
+    terms = num_sh_terms(min(part.sh_degree for part in parts))
+    tensors = [part.tensors() | {"sh": part.sh[:, :terms]} for part in parts]
+    return Gaussians(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
+
+
 def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
 
     A rotation mixes the harmonics of one degree only among themselves; how, is solved for from their values in many
-    directions.
-
-    Args:
-        sh: (N, K, 3), degree 0 to 4.
-        matrix: (3, 3) rotation, float64.
+    directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation, float64.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
     if degree == 0:
@@ -112,11 +129,7 @@ def product(
 
 
 def axis_of(text: str) -> tuple[float, float, float]:
-    """Return the unit vector of an axis name such as "-y".
-
-    Raises:
-        DyngsError: no such axis.
-    """
+    """Return the unit vector of an axis name such as "-y". Raises DyngsError: no such axis."""
     if text not in AXES:
         raise DyngsError(f"no axis {text!r:.20}; use one of {', '.join(AXES)}")
     return AXES[text]

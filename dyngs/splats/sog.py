@@ -27,8 +27,7 @@ from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile
 _PER_ROW = 64
 _MOST_META_BYTES = 1 << 20
 _MOST_PIXELS = 1 << 27
-_MODE = 252
-"""Alpha of a rotation: this plus the index of its largest entry."""
+_MODE = 252  # alpha of a rotation: this plus the index of its largest entry
 _HALF_ROOT = float(np.sqrt(0.5))
 
 _Table = Annotated[tuple[FiniteFloat, ...], Field(min_length=256, max_length=256)]
@@ -186,7 +185,6 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
 
 
 def _rest(path: Path, archive: zipfile.ZipFile, rest: _Rest, labels: np.ndarray) -> np.ndarray:
-    """Return the harmonics above degree 0, (N, K - 1, 3)."""
     name, terms = rest.files[0], num_sh_terms(rest.bands) - 1
     image = _image(path, archive, name)
     row = labels[:, 0].astype(np.int64) | (labels[:, 1].astype(np.int64) << 8)
@@ -219,7 +217,6 @@ def _meta(path: Path, archive: zipfile.ZipFile) -> _Meta:
 
 
 def _image(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """Return an image (H, W, 4) uint8 of the archive."""
     from PIL import Image
 
     try:

@@ -25,8 +25,7 @@ from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, un
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
 _ANTIALIASED = 1
-_MOST_RATIO = 1032
-"""Largest compression of deflate."""
+_MOST_RATIO = 1032  # largest compression of deflate
 _MOST_BYTES = 1 << 31
 _COLOUR_SCALE = 0.15
 _FRACTION_BITS = 12
@@ -64,8 +63,7 @@ def read_spz(path: Path) -> SplatFile:
 def write_spz(path: Path, splat: SplatFile) -> None:
     """Write a .spz of version 3.
 
-    Raises:
-        DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
+    Raises DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
     """
     gaussians = splat.gaussians
     means = gaussians.means.double().numpy()
@@ -94,7 +92,6 @@ def write_spz(path: Path, splat: SplatFile) -> None:
 
 
 def _sizes(path: Path, version: int, count: int, degree: int) -> dict[str, int]:
-    """Return the bytes of each attribute, in the order of the file."""
     if degree > MAX_SH_DEGREE:
         raise DyngsError(f"{path}: has harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known")
     each = {"means": 6 if version == 1 else 9, "alphas": 1, "colours": 3, "scales": 3, "quats": 3 if version < 3 else 4}
@@ -115,7 +112,6 @@ def _inflated(path: Path, data: bytes, most: int) -> bytes:
 
 
 def _read_streams(path: Path, data: bytes) -> SplatFile:
-    """Return the contents of a file of version 4."""
     if len(data) < 32:
         raise DyngsError(f"{path}: is truncated: it ends within its header")
     _, version, count, degree, fraction_bits, flags, streams = _HEADER.unpack(data[:16])
@@ -139,7 +135,6 @@ def _read_streams(path: Path, data: bytes) -> SplatFile:
 
 
 def _unpacked(path: Path, data: bytes, size: int) -> bytes:
-    """Return the ``size`` bytes of a Zstandard stream."""
     try:
         import zstandard
     except ImportError:
@@ -159,7 +154,6 @@ def _unpacked(path: Path, data: bytes, size: int) -> bytes:
 def _splat(
     path: Path, parts: Mapping[str, np.ndarray], version: int, degree: int, fraction_bits: int, flags: int
 ) -> SplatFile:
-    """Return the contents of attributes given as bytes."""
     count = len(parts["alphas"])
     if fraction_bits > 24:
         raise DyngsError(
@@ -201,7 +195,6 @@ def _packed_rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
-    """Return the quaternions (N, 4) wxyz that ``_packed_rotations`` packed."""
     fields = np.stack([(words >> np.uint32(shift)) & np.uint32(1023) for shift in (20, 10, 0)], axis=1)
     size = (fields & np.uint32(_TOP)).astype(np.float32) / _TOP * _ROOT_HALF
     others = np.where(fields >> np.uint32(9), -size, size)

@@ -16,19 +16,16 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import torch
 
 from dyngs.conventions import MAX_SH_DEGREE, num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats import usd_child
-from dyngs.splats.rotation import turned
-from dyngs.splats.similarity import placement_of
+from dyngs.splats.rotation import joined, placed
 from dyngs.splats.splat_file import SplatFile, from_linear
 
-_SECONDS = 600.0
-"""Of wall time; the child has less of processor time."""
+_SECONDS = 600.0  # of wall time; the child has less of processor time
 _NAMES = ("means", "scales", "opacities", "quats", "sh", "degree", "world")
 _MOST_BYTES = 1 << 31
 _UP = {"Y": "y", "Z": "z"}
@@ -37,16 +34,17 @@ _UP = {"Y": "y", "Z": "z"}
 def read_usd(path: Path) -> SplatFile:
     """Read all Gaussians of a .usd, .usda or .usdc, placed as their prims say, at the stage's default time.
 
-    Raises:
-        DyngsError: usd-core is missing, the file refers to others, holds no Gaussians, or is damaged.
+    Raises DyngsError: usd-core is missing, the file refers to others, holds no Gaussians, or is damaged.
     """
     _packages(path)
     require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of a USD file")
     with TemporaryDirectory(prefix="dyngs-usd-") as folder:
         out = Path(folder) / "arrays.npz"
+        places = os.pathsep.join(name for name in sys.path if name)  # the child finds the same packages
+        environment = os.environ | {"PYTHONPATH": places, "PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
         command = [sys.executable, "-m", usd_child.__name__, str(path.resolve()), str(out)]
         done = subprocess.run(
-            command, capture_output=True, text=True, timeout=_SECONDS, check=False, env=_environment(), errors="replace"
+            command, capture_output=True, text=True, timeout=_SECONDS, check=False, env=environment, errors="replace"
         )
         if done.returncode == 2 and done.stdout.strip():
             raise DyngsError(f"{path}: {done.stdout.strip().splitlines()[-1]:.200}")
@@ -58,10 +56,7 @@ def read_usd(path: Path) -> SplatFile:
     if not count:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
     found = [_gaussians(path, {name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
-    degree = min(g.sh_degree for g in found)
-    parts = [g.tensors() | {"sh": g.sh[:, : num_sh_terms(degree)]} for g in found]
-    whole = Gaussians(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
-    return SplatFile(whole, up=_UP.get(str(read["up"]), "y"))
+    return SplatFile(joined(found), up=_UP.get(str(read["up"]), "y"))
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
@@ -77,7 +72,8 @@ def write_usd(path: Path, splat: SplatFile) -> None:
     prim = vol.ParticleField3DGaussianSplat.Define(stage, "/Gaussians")
     stage.SetDefaultPrim(prim.GetPrim())
     prim.CreatePositionsAttr(vt.Vec3fArray.FromNumpy(gaussians.means.numpy()))
-    prim.CreateOrientationsAttr(_quats(gaussians.quats.numpy(), vt))
+    xyzw = np.ascontiguousarray(gaussians.quats.numpy()[:, [1, 2, 3, 0]])  # USD keeps the real part last in memory
+    prim.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(xyzw))
     prim.CreateScalesAttr(vt.Vec3fArray.FromNumpy(gaussians.scales.numpy()))
     prim.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(gaussians.opacities.numpy()))
     prim.CreateRadianceSphericalHarmonicsDegreeAttr(gaussians.sh_degree)
@@ -91,7 +87,6 @@ def write_usd(path: Path, splat: SplatFile) -> None:
 
 
 def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
-    """Return the modules Sdf, Usd, UsdGeom and UsdVol."""
     try:
         sdf, usd, geom, vol = (import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol"))
         _ = vol.ParticleField3DGaussianSplat
@@ -100,11 +95,6 @@ def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
             f"{path}: USD files need the package usd-core 26.3 or newer: pip install 'dyngs[usd]'"
         ) from None
     return sdf, usd, geom, vol
-
-
-def _quats(quats: np.ndarray, types: Any) -> Any:
-    """Return quaternions (N, 4) wxyz as an array of USD, which keeps the real part last in memory."""
-    return types.QuatfArray.FromNumpy(np.ascontiguousarray(quats[:, [1, 2, 3, 0]]))
 
 
 def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
@@ -116,13 +106,7 @@ def _gaussians(path: Path, arrays: Mapping[str, np.ndarray]) -> Gaussians:
     if any(len(arrays[name]) != n for name in ("scales", "opacities", "quats")) or len(sh) != n * terms:
         raise DyngsError(f"{path}: the attributes of its Gaussians have different lengths; export it again")
     found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh.reshape(n, terms, 3))
-    placement = placement_of(arrays["world"])
-    if placement is None:
+    moved = placed(found, arrays["world"])
+    if moved is None:
         raise DyngsError(f"{path}: a prim distorts or mirrors its Gaussians; apply its transform before exporting")
-    return turned(found, placement.rotation, placement.scale, placement.shift_tensor)
-
-
-def _environment() -> dict[str, str]:
-    """Return an environment in which the child finds the same packages, and computes with one thread."""
-    found = os.pathsep.join(name for name in sys.path if name)
-    return os.environ | {"PYTHONPATH": found, "PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
+    return moved

@@ -38,8 +38,7 @@ def main() -> int:
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
     """Return the attributes of all prims of Gaussians as ``0.means`` and so on, their ``world`` matrices, and ``up``.
 
-    Raises:
-        RefusedError: it refers to other files, holds no Gaussians, or is damaged.
+    Raises RefusedError: it refers to other files, holds no Gaussians, or is damaged.
     """
     sdf, tf, usd, geom = (import_module(f"pxr.{name}") for name in ("Sdf", "Tf", "Usd", "UsdGeom"))
     try:

@@ -1,4 +1,4 @@
-"""The file ``scene.dyngs``: a header, the tensors one after the other, a checksum.
+"""The file ``scene.dyngs``: a header, tensors as integers in LZMA, a checksum.
 
     8 bytes   b"dyngs\\x00\\x01\\n", the last but one is the version
     4 bytes   length of the header, little endian
@@ -13,6 +13,7 @@ taken than a file of this size can need.
 from __future__ import annotations
 
 import hashlib
+import lzma
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -27,7 +28,7 @@ from torch import Tensor
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians.scene import Scene
-from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.storage.tensors import (
     COARSENESS,
     Coding,
@@ -38,19 +39,105 @@ from dyngs.storage.tensors import (
     completed,
     drawable,
     from_whole,
-    group_of,
     restored,
     stored_edit,
     to_whole,
 )
 
+_SAMPLE = 2**15  # number of values by which the layout of an array is chosen
+_FEW = 512  # number of values below which the layout is not changed
+_MAX_PLANES = 8
+_SMALLEST_DICTIONARY, _LARGEST_DICTIONARY = 2**12, 2**24
+
+
+@dataclass(frozen=True)
+class Packing:
+    """The way an array of integers was packed into bytes."""
+
+    axis: int  # differences along it are stored, -1: the numbers themselves
+    by_rows: bool  # rows follow each other, otherwise columns
+    signed: bool  # there are negative numbers: 0, -1, 1, -2 ... are stored as 0, 1, 2, 3
+    planes: int  # bytes per number; all lowest bytes come first
+
+    def __post_init__(self) -> None:
+        if not (-1 <= self.axis <= 1 and 1 <= self.planes <= _MAX_PLANES):
+            raise ValueError(f"no such packing: {self}")
+
+
+def packed(whole: np.ndarray) -> tuple[Packing, bytes]:
+    """Return the smallest of some ways to store ``whole`` (int64, any shape) as bytes."""
+    if whole.size < _FEW:
+        packing, plain = _laid_out(whole, -1, by_rows=True)
+        return packing, compressed(plain)
+    sample = whole[: max(_SAMPLE // max(whole[:1].size, 1), 64)]
+    axes = [-1, *(axis for axis in range(min(whole.ndim, 2)) if whole.shape[axis] > 1)]
+    ways = [(axis, by_rows) for axis in axes for by_rows in ((True, False) if whole.ndim > 1 else (True,))]
+    sizes = [len(compressed(_laid_out(sample, axis, by_rows)[1], quick=True)) for axis, by_rows in ways]
+    packing, plain = _laid_out(whole, *ways[int(np.argmin(sizes))])
+    return packing, compressed(plain)
+
+
+def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    """Return int64 numbers of ``shape``. Raises DyngsError if the bytes do not hold that many numbers."""
+    count = math.prod(shape)
+    plain = np.frombuffer(decompressed(data, packing.planes * count), dtype=np.uint8).reshape(packing.planes, count)
+    stored = np.zeros(count, dtype=np.uint64)
+    for index, plane in enumerate(plain):
+        stored |= plane.astype(np.uint64) << np.uint64(8 * index)
+    if packing.signed:
+        stored = stored >> np.uint64(1) ^ (np.uint64(0) - (stored & np.uint64(1)))
+    whole = stored.view(np.int64)
+    if not packing.by_rows and count:
+        whole = whole.reshape(-1, shape[0]).T
+    whole = whole.reshape(shape)
+    return whole if packing.axis < 0 or packing.axis >= len(shape) else np.cumsum(whole, axis=packing.axis)
+
+
+def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) -> bytes:
+    """Return ``plain`` as LZMA2 without headers.
+
+    ``room``: the size that it will be read with, where that is not its own.
+    """
+    return lzma.compress(plain, format=lzma.FORMAT_RAW, filters=_filters(1 if quick else 6, room or len(plain)))
+
+
+def decompressed(data: bytes, size: int, *, exact: bool = True) -> bytes:
+    """Return the ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never takes memory for more.
+
+    Raises DyngsError: there are not so many, or something else follows them.
+    """
+    decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_filters(6, size))
+    try:
+        plain = decoder.decompress(data, max_length=size + 1)
+    except (lzma.LZMAError, EOFError):
+        raise DyngsError("its data cannot be decoded") from None
+    if len(plain) > size or (exact and len(plain) < size) or not decoder.eof or decoder.unused_data:
+        raise DyngsError("its data is not as long as it says")
+    return plain
+
+
+def _laid_out(whole: np.ndarray, axis: int, by_rows: bool) -> tuple[Packing, bytes]:
+    if axis >= 0:
+        whole = np.diff(whole, axis=axis, prepend=np.int64(0))
+    signed = bool((whole < 0).any())
+    stored = (whole << 1 ^ whole >> 63 if signed else whole).view(np.uint64)
+    stored = stored.ravel() if by_rows else stored.reshape(len(stored), -1).T.ravel()
+    planes = max(1, (int(stored.max(initial=0)).bit_length() + 7) // 8)
+    plain = b"".join((stored >> np.uint64(8 * index)).astype(np.uint8).tobytes() for index in range(planes))
+    return Packing(axis, by_rows, signed, planes), plain
+
+
+def _filters(preset: int, size: int) -> list[dict[str, int]]:
+    """Return LZMA2 filters with a dictionary for ``size`` bytes: a larger one only costs time and memory."""
+    dictionary = min(max(1 << max(size - 1, 1).bit_length(), _SMALLEST_DICTIONARY), _LARGEST_DICTIONARY)
+    return [{"id": lzma.FILTER_LZMA2, "preset": preset, "dict_size": dictionary, "lc": 4, "lp": 0, "pb": 0}]
+
+
 MAGIC = b"dyngs\x00\x01\n"
 MAX_HEADER = 2**20
-FREE_VALUES, VALUES_PER_BYTE = 2**22, 64
-"""Largest number of values in any file, and of further values per byte of it."""
+FREE_VALUES, VALUES_PER_BYTE = 2**22, 64  # largest number of values in any file, and of further values per byte of it
 _CHECKSUM = 32
-_FAR_BYTES = 16
-"""Bytes of an index and a value."""
+_FAR_BYTES = 16  # bytes of an index and a value
 _DTYPES = {
     str(dtype).removeprefix("torch."): dtype
     for dtype in (torch.float16, torch.float32, torch.float64, torch.int32, torch.int64, torch.uint8, torch.bool)
@@ -62,8 +149,8 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class SceneInfo(_Part):
-    """Metadata of a checkpoint; see ``dyngs.training.state.CheckpointInfo``."""
+class _Info(_Part):
+    """``CheckpointInfo``."""
 
     step: int
     extent: float
@@ -95,27 +182,8 @@ class _Entry(_Part):
 
 
 class _Header(_Part):
-    info: SceneInfo
+    info: _Info
     tensors: tuple[_Entry, ...]
-
-
-@dataclass(frozen=True)
-class StoredScene:
-    """Contents of a .dyngs file.
-
-    Attributes:
-        info: about the run.
-        tensors: of a checkpoint, those that drawing needs.
-        steps: of each group of tensors that is quantised.
-        sizes: bytes of each tensor as stored.
-        num_bytes: of the file.
-    """
-
-    info: SceneInfo
-    tensors: dict[str, Tensor]
-    steps: dict[str, float]
-    sizes: dict[str, int]
-    num_bytes: int
 
 
 def write_scene(path: Path, data: bytes) -> None:
@@ -124,11 +192,10 @@ def write_scene(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def read_scene(path: Path) -> StoredScene:
-    """Return the scene in a file.
+def read_scene(path: Path) -> Checkpoint:
+    """Return the checkpoint in a file: the tensors that drawing needs.
 
-    Raises:
-        DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
+    Raises DyngsError: a file that is missing, truncated, altered, or of another version; one line that names it.
     """
     require_regular(path)
     try:
@@ -139,17 +206,11 @@ def read_scene(path: Path) -> StoredScene:
         raise DyngsError(f"{path}: {error}") from None
 
 
-def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
-    """Return the bytes of a file; the same for what was read from it.
+def encoded(info: CheckpointInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
+    """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is not finite.
 
-    Args:
-        info: about the run.
-        scene: N Gaussians; what only training needs is left out.
-        steps: of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.
-        coarseness: (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are stored alike.
-
-    Raises:
-        DyngsError: a value is not finite.
+    ``steps`` are of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.
+    ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are stored alike.
     """
     means = scene.gaussians.means.detach()
     if not bool(means.isfinite().all()):
@@ -165,19 +226,17 @@ def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarsenes
         entry, block = _stored(name, kept[name], coding, scale)
         entries.append(entry)
         blocks.append(block)
-    header = compressed(_Header(info=info, tensors=tuple(entries)).model_dump_json().encode(), room=MAX_HEADER)
+    header = compressed(
+        _Header(info=_Info(**asdict(info)), tensors=tuple(entries)).model_dump_json().encode(), room=MAX_HEADER
+    )
     body = b"".join([MAGIC, len(header).to_bytes(4, "little"), header, *blocks])
     num_values = sum(math.prod(entry.shape) for entry in entries)
     body += bytes(max(0, (num_values - FREE_VALUES) // VALUES_PER_BYTE + 1 - len(body)))
     return body + hashlib.sha256(body).digest()
 
 
-def decoded(data: bytes) -> StoredScene:
-    """Return the scene in the bytes of a file.
-
-    Raises:
-        DyngsError: anything but what ``encoded`` makes.
-    """
+def decoded(data: bytes) -> Checkpoint:
+    """Return the checkpoint in the bytes of a file. Raises DyngsError: anything but what ``encoded`` makes."""
     if data[: len(MAGIC)] != MAGIC:
         is_other = data.startswith(MAGIC[:6]) and len(data) > len(MAGIC)
         raise DyngsError("written by another version of dyngs" if is_other else "not a stored scene of dyngs")
@@ -188,7 +247,9 @@ def decoded(data: bytes) -> StoredScene:
     end = start + int.from_bytes(body[len(MAGIC) : start], "little")
     try:
         header = _Header.model_validate_json(decompressed(body[start:end], MAX_HEADER, exact=False))
-        _require_small(header, len(body))
+        num_values = sum(math.prod(entry.shape) for entry in header.tensors)
+        if num_values > FREE_VALUES + VALUES_PER_BYTE * len(body):
+            raise DyngsError(f"it claims {num_values} values, more than a file of its size holds")
         tensors: dict[str, Tensor] = {}
         for entry in header.tensors:
             block = body[end : end + entry.size + _FAR_BYTES * entry.far]
@@ -205,23 +266,10 @@ def decoded(data: bytes) -> StoredScene:
         raise DyngsError(f"its header is wrong at {where or 'its start'}: {first['msg']}") from None
     except (ValueError, OverflowError, RuntimeError, IndexError) as error:
         raise DyngsError(f"its tensors are wrong: {str(error).splitlines()[0]}") from None
-    sizes = {entry.name: entry.size + _FAR_BYTES * entry.far for entry in header.tensors}
-    return StoredScene(header.info, full, _steps(header, tensors), sizes, len(data))
-
-
-def _steps(header: _Header, tensors: Mapping[str, Tensor]) -> dict[str, float]:
-    """Return the steps that would store the tensors again unchanged; 0 for tensors stored exactly without need."""
-    steps: dict[str, float] = {}
-    for entry in header.tensors:
-        x = tensors[entry.name]
-        group = group_of(entry.name, x) or entry.name
-        if entry.step or (entry.kind is Kind.EXACT and coding_of(entry.name, x, {}).kind is not Kind.EXACT):
-            steps[group] = max(entry.step, steps.get(group, 0.0))
-    return steps
+    return Checkpoint(CheckpointInfo(**header.info.model_dump()), full)
 
 
 def _stored(name: str, x: Tensor, coding: Coding, coarseness: np.ndarray | None) -> tuple[_Entry, bytes]:
-    """Return the header entry of a tensor, and its data."""
     whole = to_whole(x, coding, coarseness)
     packing, block = packed(whole.numbers)
     entry = _Entry(
@@ -245,9 +293,3 @@ def _tensor(entry: _Entry, block: bytes, coarseness: Tensor | None) -> Tensor:
     coding = Coding(entry.kind, entry.step, entry.by_coarseness)
     rows = checked_coarseness(coarseness, entry.shape[0]) if entry.by_coarseness and coarseness is not None else None
     return from_whole(Whole(numbers, far), coding, _DTYPES[entry.dtype], rows)
-
-
-def _require_small(header: _Header, num_bytes: int) -> None:
-    num_values = sum(math.prod(entry.shape) for entry in header.tensors)
-    if num_values > FREE_VALUES + VALUES_PER_BYTE * num_bytes:
-        raise DyngsError(f"it claims {num_values} values, more than a file of its size holds")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import torch
@@ -21,7 +21,7 @@ from dyngs.gaussians.scene import Scene, render_options
 from dyngs.kinds import restored_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.views import evaluation_background, training_cameras
-from dyngs.storage.file import SceneInfo, decoded, encoded
+from dyngs.storage.file import decoded, encoded
 from dyngs.storage.precision import (
     GREY_LEVELS,
     Precision,
@@ -30,20 +30,15 @@ from dyngs.storage.precision import (
     measured_precision,
     rounded,
 )
-from dyngs.storage.quantize import step_below
-from dyngs.storage.tensors import COARSENESS, completed, drawable
+from dyngs.storage.tensors import COARSENESS, completed, drawable, step_below
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""
-COMPARED = 6
-"""Number of training views in which the change is measured."""
-SMALLEST_CHANGE = 0.01
-"""Smallest change to allow, in grey levels of 255."""
-LOOKED_AT = 50
-"""Number of training views in which the visibility of each Gaussian is measured."""
+COMPARED = 6  # number of training views in which the change is measured
+SMALLEST_CHANGE = 0.01  # smallest change to allow, in grey levels of 255
+LOOKED_AT = 50  # number of training views in which the visibility of each Gaussian is measured
 
-FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))
-"""Factors on the usual steps that are tried, by bisection."""
+FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))  # factors on the usual steps that are tried, by bisection
 
 Images = Callable[[Scene], list[Tensor]]
 """Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
@@ -51,17 +46,11 @@ Images = Callable[[Scene], list[Tensor]]
 
 @dataclass(frozen=True)
 class StoragePlan:
-    """Precision and coarseness with which a scene is stored.
+    """Precision and coarseness with which a scene is stored."""
 
-    Attributes:
-        precision: steps, and how much the images change.
-        coarseness: (N,) uint8 of the Gaussians, or None.
-        images: draws what was compared; None where no image can be drawn.
-    """
-
-    precision: Precision
-    coarseness: Tensor | None = None
-    images: Images | None = None
+    precision: Precision  # steps, and how much the images change
+    coarseness: Tensor | None = None  # (N,) uint8 of the Gaussians, or None
+    images: Images | None = None  # draws what was compared; None where no image can be drawn
 
 
 @dataclass(frozen=True)
@@ -75,12 +64,8 @@ class _Shot:
 def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_change: float | None) -> StoragePlan:
     """Return how exactly ``scene`` must be stored: measured where the run's capture can be read.
 
-    Args:
-        config: of the run.
-        checkpoint: of ``scene``.
-        scene: N Gaussians.
-        max_change: root mean square over all values of some training images, grey levels of 255. None: what lowers
-            their PSNR by ``LOSS_DB``, if it is independent of the scene's own errors.
+    ``checkpoint``: of ``scene``. ``max_change``: root mean square over all values of some training images, grey levels
+    of 255. None: what lowers their PSNR by ``LOSS_DB``, if it is independent of the scene's own errors.
     """
     try:
         capture = read_capture(config.data)
@@ -109,19 +94,12 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_chang
 
 @dataclass(frozen=True)
 class CoarseFile:
-    """A file in memory.
+    """A file in memory."""
 
-    Attributes:
-        data: its bytes.
-        factor: on the usual steps.
-        quality: of the scene that is read from it.
-        refused: quality at the next coarser steps; None where none were tried.
-    """
-
-    data: bytes
-    factor: float
-    quality: float
-    refused: float | None
+    data: bytes  # its bytes
+    factor: float  # on the usual steps
+    quality: float  # of the scene that is read from it
+    refused: float | None  # quality at the next coarser steps; None where none were tried
 
 
 def coarsest_file(
@@ -130,12 +108,7 @@ def coarsest_file(
     """Return the file with the coarsest steps tried at which ``quality`` is at least ``least``; None: it never is.
 
     All steps are those that ``storage_plan`` measures, times one factor. The bytes are read again before they count.
-
-    Args:
-        config: of the run.
-        checkpoint: of its scene.
-        quality: of a scene, the higher the better.
-        least: that is enough.
+    ``quality``: of a scene, the higher the better.
     """
     scene = restored_scene(checkpoint, config.model)
     plan = storage_plan(config, checkpoint, scene, None)
@@ -156,7 +129,7 @@ def coarsest_file(
         else:
             refused, high = found, middle
     for index in range(low - 1, -1, -1):
-        data = encoded(SceneInfo(**asdict(checkpoint.info)), scene, steps(FACTORS[index]), plan.coarseness)
+        data = encoded(checkpoint.info, scene, steps(FACTORS[index]), plan.coarseness)
         found = quality(drawn(decoded(data).tensors))
         if found >= least:
             return CoarseFile(data, FACTORS[index], found, refused)
@@ -175,14 +148,12 @@ def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_
 
 
 def _chosen(capture: Capture, count: int) -> list[View]:
-    """Return at most ``count`` training views, evenly chosen."""
     views = capture.splits["train"]
     count = min(count, len(views))
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
 def _visibility(scene: Scene, shots: Sequence[_Shot]) -> Tensor:
-    """Return (N,) sums of blending weights over the images."""
     scene = scene.unmasked()
     total = torch.zeros(len(scene), device=scene.gaussians.means.device)
     for shot in shots:

@@ -15,30 +15,27 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians
-from dyngs.storage.quantize import LIMIT, step_below
 from dyngs.storage.tensors import (
     COARSENESS,
+    LIMIT,
     MAX_COARSENESS,
     checked_coarseness,
     coding_of,
     completed,
     group_of,
     restored,
+    step_below,
 )
 
 GREY_LEVELS = 255.0
-TRIALS = 4
-"""Number of steps tried per group."""
-CLOSE = 0.8
-"""Fraction of the allowed error from which the search ends."""
-FIRST_STEP = 2.0**-6
-"""First step as a fraction of the mean magnitude of the values."""
+TRIALS = 4  # number of steps tried per group
+CLOSE = 0.8  # fraction of the allowed error from which the search ends
+FIRST_STEP = 2.0**-6  # first step as a fraction of the mean magnitude of the values
 WIDEST_JUMP = 32.0
 OUTLYING, USUAL_FRACTION = 64.0, 0.95
 """Values so many times as large as this fraction of those that are not 0 are outliers: steps are chosen without
 them."""
-MOST_VISIBLE = 0.9
-"""Quantile of visibility above which Gaussians are stored most finely."""
+MOST_VISIBLE = 0.9  # quantile of visibility above which Gaussians are stored most finely
 ASSUMED_STEPS = {"quats": 2**-8, "log_scales": 2**-6, "logit_opacities": 2**-10, "sh_base": 2**-7, "sh_rest": 2**-7}
 
 Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]
@@ -47,26 +44,19 @@ Draw = Callable[[Mapping[str, Tensor]], Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class Precision:
-    """Quantisation steps and the change of images that they cause.
+    """Quantisation steps and the change of images that they cause."""
 
-    Attributes:
-        steps: of each group of tensors; 0: it is stored as it is.
-        change: root mean square change of the images, grey levels of 255; None where none could be drawn.
-        allowed: what it was to be at most; None likewise.
-    """
-
-    steps: dict[str, float]
+    steps: dict[str, float]  # of each group of tensors; 0: it is stored as it is
+    # root mean square change of the images, grey levels of 255; None where none could be drawn
     change: float | None = None
-    allowed: float | None = None
+    allowed: float | None = None  # what it was to be at most; None likewise
 
 
 def coarseness_of(visibility: Tensor) -> Tensor:
     """Return (N,) uint8 octaves by which each Gaussian may be stored more coarsely than the most visible ones.
 
     An error of a Gaussian counts with the square of its weight in the images: half an octave per octave.
-
-    Args:
-        visibility: (N,) sums of its blending weights over images.
+    ``visibility``: (N,) sums of its blending weights over images.
     """
     if not len(visibility):
         return torch.zeros(0, dtype=torch.uint8, device=visibility.device)
@@ -87,16 +77,10 @@ def assumed_precision(gaussians: Gaussians) -> Precision:
 def measured_precision(
     exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
 ) -> Precision:
-    """Return the largest steps found that change the images by at most ``max_change``.
+    """Return the largest steps found that change the images by at most ``max_change``, grey levels of 255.
 
-    Args:
-        exact: from ``drawable``, and the coarseness of the Gaussians if they have any.
-        wanted: the images that count.
-        draw: draws them anew from the tensors of a checkpoint.
-        max_change: root mean square over all of their values, grey levels of 255, more than 0.
-
-    Raises:
-        DyngsError: a value is not finite.
+    ``exact``: from ``drawable``, with the coarseness of the Gaussians if they have any; ``draw`` draws its like anew.
+    Raises DyngsError: a value is not finite.
     """
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
@@ -104,7 +88,11 @@ def measured_precision(
         return mean_square_change(wanted, draw(completed(rounded(exact, steps, names))))
 
     allowed = (max_change / GREY_LEVELS) ** 2
-    groups = _groups(exact)
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, x in exact.items():
+        group = group_of(name, x)
+        if group is not None and x.numel():
+            groups.setdefault(group, {})[name] = x
     num_values = sum(sum(x.numel() for x in group.values()) for group in groups.values())
     steps, too_coarse = {}, {}
     for name, group in groups.items():
@@ -127,10 +115,8 @@ def rounded(
 ) -> dict[str, Tensor]:
     """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
 
-    Args:
-        exact: from ``drawable``, and the coarseness of the Gaussians if they have any.
-        steps: of groups of tensors.
-        names: of the tensors that are rounded.
+    ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``names``: of the tensors that
+    are rounded.
     """
     coarseness = checked_coarseness(exact[COARSENESS], len(exact["gaussians.means"])) if COARSENESS in exact else None
     found = dict(exact)
@@ -205,13 +191,3 @@ def _usual_size(values: Tensor) -> tuple[float, float]:
     usual = nonzero.kthvalue(max(int(USUAL_FRACTION * len(nonzero)), 1)).values
     sizes = sizes[sizes <= OUTLYING * usual]
     return float(sizes.max()), float(sizes.square().mean())
-
-
-def _groups(tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
-    """Return the tensors by name of each group."""
-    groups: dict[str, dict[str, Tensor]] = {}
-    for name, x in tensors.items():
-        group = group_of(name, x)
-        if group is not None and x.numel():
-            groups.setdefault(group, {})[name] = x
-    return groups

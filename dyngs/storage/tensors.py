@@ -6,6 +6,7 @@ They have the names of checkpoints (``gaussians.means``, ``model.rows``), but fo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
@@ -18,27 +19,127 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.order import storage_order
 from dyngs.gaussians.scene import Scene
+from dyngs.ops.quaternions import quat_product
 from dyngs.state import tensors_of
-from dyngs.storage.quantize import (
-    FINEST_ROTATION,
-    LARGEST_STEP,
-    LIMIT,
-    NEAREST,
-    OPACITY_STEPS,
-    ROTATION_STEP,
-    SMALLEST_STEP,
-    SPARSE,
-    Steps,
-    from_grid,
-    is_step,
-    opacities_from_grid,
-    opacities_to_grid,
-    rotations_from_grid,
-    rotations_to_grid,
-    sorted_axes,
-    step_below,
-    to_grid,
-)
+
+LIMIT = 2**20  # bound on the magnitude of the integers; larger values are stored as they are
+SMALLEST_STEP, LARGEST_STEP = 2.0**-100, 2.0**60
+NEAREST, SPARSE = 0.5, 0.35
+"""Added before rounding down: to the nearest integer, or biased to zero, which costs least to store."""
+ROTATION_STEP = 1 / 32  # coarsest step for rotations, at which the component left out stays the largest
+FINEST_ROTATION = 2.0**-19  # finest step for rotations, at which the components of a unit quaternion are within LIMIT
+OPACITY_STEPS = 2.0**-12, 1 / 8  # finest and coarsest step for opacities
+
+
+def step_below(step: float) -> float:
+    """Return the largest allowed step that does not exceed ``step``, or the smallest one."""
+    fraction, exponent = math.frexp(min(max(step, SMALLEST_STEP), LARGEST_STEP))
+    return math.ldexp(math.floor(8 * fraction) / 8, exponent)
+
+
+def is_step(step: float) -> bool:
+    """Return whether ``step`` is one of those allowed."""
+    return SMALLEST_STEP <= step <= LARGEST_STEP and step_below(step) == step
+
+
+Steps = float | np.ndarray  # one step for all, or one per row, of a shape that broadcasts
+
+
+def to_grid(values: np.ndarray, step: Steps, rounding: float = NEAREST) -> tuple[np.ndarray, np.ndarray]:
+    """Return int32 multiples of ``step`` nearest to ``values``, and where they are out of reach (there they are 0).
+
+    ``rounding``: ``NEAREST`` or ``SPARSE``.
+    """
+    scaled = np.asarray(values, dtype=np.float64) / step
+    far = ~(np.abs(scaled) < LIMIT - 1)
+    scaled[far] = 0
+    return (np.sign(scaled) * np.floor(np.abs(scaled) + rounding)).astype(np.int32), far
+
+
+def from_grid(whole: np.ndarray, step: Steps) -> np.ndarray:
+    """Return float64 values, exact in float32."""
+    return whole.astype(np.float64) * step
+
+
+def opacities_to_grid(logits: np.ndarray, step: float) -> np.ndarray:
+    """Return int32 multiples of ``step`` nearest to the opacities of ``logits``."""
+    opacities = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))
+    return np.floor(opacities / step + 0.5).astype(np.int32)
+
+
+def opacities_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
+    """Return float64 logits; finite, as 0 becomes an eighth of a step (not drawn) and 1 a little less than 1."""
+    opacities = np.clip(from_grid(whole, step), step / 8, 1 - step / 64)
+    return np.log(opacities) - np.log1p(-opacities)
+
+
+def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
+    """Return (N, 3) int32 multiples of ``step``: vector parts of unit quaternions with an about largest scalar part.
+
+    Half turns about its own axes do not change a Gaussian: of the four quaternions one with a large scalar part is
+    taken. A zero quaternion is the identity. Coded again, the result stays the same. ``step``: at most
+    ``ROTATION_STEP``.
+    """
+    turned = quats.astype(np.float64)
+    while True:
+        whole, _ = to_grid(_scalar_largest(turned, 4 * step)[:, 1:], step)
+        turned = rotations_from_grid(whole, step)
+        # A turn gains four steps of the scalar part, rounding loses fewer: this ends.
+        again, _ = to_grid(_scalar_largest(turned, 4 * step)[:, 1:], step)
+        if np.array_equal(whole, again):
+            return whole
+
+
+def rotations_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
+    """Return (N, 4) unit quaternions wxyz, float64."""
+    vector = from_grid(whole, step)
+    scalar = np.sqrt(np.clip(1 - np.square(vector).sum(1), 0, None))
+    return np.concatenate([scalar[:, None], vector], axis=1)
+
+
+def sorted_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same N Gaussians with their shortest axis first and their longest last.
+
+    ``quats``: (N, 4) wxyz; zero is the identity. ``log_scales``: (N, 3).
+    """
+    order = np.argsort(log_scales, axis=1, kind="stable")
+    turns = np.zeros((27, 4))
+    for (first, second, third), turn in _AXIS_TURNS.items():
+        turns[9 * first + 3 * second + third] = turn
+    return _product(_unit(quats), turns[order @ (9, 3, 1)]), np.take_along_axis(log_scales, order, axis=1)
+
+
+_HALF, _ROOT = 0.5, math.sqrt(0.5)
+_AXIS_TURNS = {
+    (0, 1, 2): (1.0, 0.0, 0.0, 0.0),
+    (0, 2, 1): (_ROOT, _ROOT, 0.0, 0.0),
+    (2, 1, 0): (_ROOT, 0.0, _ROOT, 0.0),
+    (1, 0, 2): (_ROOT, 0.0, 0.0, _ROOT),
+    (1, 2, 0): (_HALF, _HALF, _HALF, _HALF),
+    (2, 0, 1): (_HALF, -_HALF, -_HALF, -_HALF),
+}
+"""For each order of the axes, the rotation wxyz whose columns are the axes in this order, up to signs."""
+
+
+def _scalar_largest(quats: np.ndarray, margin: float) -> np.ndarray:
+    """Return (N, 4) unit quaternions of the same axes, scalar part positive, at most ``margin`` below the largest."""
+    unit = _unit(quats)
+    size = np.abs(unit)
+    size[:, 0] += margin
+    half_turns = np.eye(4)[size.argmax(1)]
+    turned = _product(unit, half_turns)
+    return np.where(turned[:, :1] < 0, -turned, turned)
+
+
+def _unit(quats: np.ndarray) -> np.ndarray:
+    """Return (N, 4) float64 of unit length; zero becomes the identity."""
+    wide = quats.astype(np.float64)
+    length = np.sqrt(np.square(wide).sum(1, keepdims=True))
+    return np.where(length > 0, wide / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+
+
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    return quat_product(torch.from_numpy(left), torch.from_numpy(right)).numpy()
 
 
 class Kind(str, Enum):
@@ -52,26 +153,17 @@ class Kind(str, Enum):
     ROTATION = "rotation"
 
 
-FIELD = "model.field.learned."
-"""Prefix of the learned tensors of a deformation field."""
+FIELD = "model.field.learned."  # prefix of the learned tensors of a deformation field
 GAUSSIANS = tuple(field.name for field in fields(Gaussians))
-MAX_COARSENESS = 6
-"""Most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others."""
+MAX_COARSENESS = 6  # most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
 COARSENESS = "gaussians.coarseness"
 _BY_COARSENESS = ("gaussians.sh_base", "gaussians.sh_rest")
-_KINDS = {
-    "gaussians.quats": Kind.ROTATION,
-    "gaussians.logit_opacities": Kind.OPACITY,
-    "gaussians.sh_rest": Kind.SPARSE,
-}
+_KINDS = {"gaussians.quats": Kind.ROTATION, "gaussians.logit_opacities": Kind.OPACITY, "gaussians.sh_rest": Kind.SPARSE}
 _LIMITS = {Kind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), Kind.OPACITY: OPACITY_STEPS}
-FEW = 64
-"""Number of values up to which tensors are stored as they are."""
+FEW = 64  # number of values up to which tensors are stored as they are
 LARGEST_HALF = 65504.0
-MOST_FAR = 1 / 8
-"""Largest fraction of values out of the integer range; with more, all are stored as they are."""
-RELATIVE = "model.filter_std"
-"""Stored in half precision: it spans orders of magnitude."""
+MOST_FAR = 1 / 8  # largest fraction of values out of the integer range; with more, all are stored as they are
+RELATIVE = "model.filter_std"  # stored in half precision: it spans orders of magnitude
 POSITIVE = "model.field.buffers.radii"
 """Stored as they are: a radius of influence that is rounded to 0 has no meaning, and there are few."""
 FIXED_STEPS = {
@@ -86,17 +178,11 @@ FIXED_STEPS = {
 
 @dataclass(frozen=True)
 class Coding:
-    """Kind and precision with which one tensor is stored.
+    """Kind and precision with which one tensor is stored."""
 
-    Attributes:
-        kind: of its numbers.
-        step: 0 for the kinds that have none.
-        by_coarseness: the step of row i is ``2 ** coarseness[i]`` times as large.
-    """
-
-    kind: Kind
-    step: float = 0.0
-    by_coarseness: bool = False
+    kind: Kind  # of its numbers
+    step: float = 0.0  # 0 for the kinds that have none
+    by_coarseness: bool = False  # the step of row i is ``2 ** coarseness[i]`` times as large
 
     def __post_init__(self) -> None:
         has_step = self.kind not in (Kind.EXACT, Kind.HALF)
@@ -116,24 +202,17 @@ class Coding:
 
 @dataclass(frozen=True)
 class Whole:
-    """A tensor as integers.
+    """A tensor as integers."""
 
-    Attributes:
-        numbers: int64, the shape of the tensor; (N, 3) for rotations.
-        far: (K, 2) int64, index into the flat numbers and float32 bits of the values that no whole number reaches.
-    """
-
-    numbers: np.ndarray
+    numbers: np.ndarray  # int64, the shape of the tensor; (N, 3) for rotations
+    # (K, 2) int64, index into the flat numbers and float32 bits of the values that no whole number reaches
     far: np.ndarray
 
 
 def drawable(scene: Scene) -> dict[str, Tensor]:
     """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by length.
 
-    Not those of Gaussians whose axes a field changes one by one.
-
-    Raises:
-        DyngsError: a value is not finite.
+    Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not finite.
     """
     kept = tensors_of(scene.drawing_state())
     for name, x in kept.items():
@@ -153,9 +232,7 @@ def drawable(scene: Scene) -> dict[str, Tensor]:
 def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors of a checkpoint that can be drawn, but not trained on, from stored ones.
 
-    Raises:
-        KeyError: one is missing that every scene has.
-        ValueError: the Gaussians' tensors do not fit together.
+    Raises KeyError: one is missing that every scene has. ValueError: the Gaussians' tensors do not fit together.
     """
     full = dict(tensors)
     base, rest = full.pop("gaussians.sh_base"), full.pop("gaussians.sh_rest")
@@ -167,9 +244,7 @@ def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def stored_edit(scene: Scene, means: np.ndarray) -> TopologyEdit:
     """Return the edit that puts Gaussians beside their neighbours in space, first those that a field moves.
 
-    Args:
-        scene: N Gaussians.
-        means: (N, 3) as they will be read again, which decide the order.
+    ``means``: (N, 3) as they will be read again, which decide the order.
     """
     return TopologyEdit.select(torch.from_numpy(storage_order(means, scene.offset_rows.numpy())))
 
@@ -186,12 +261,8 @@ def group_of(name: str, x: Tensor) -> str | None:
 def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness: bool = False) -> Coding:
     """Return the coding of a tensor.
 
-    Args:
-        name: of the tensor.
-        x: its values.
-        steps: group (or name, where it has none) to the largest step, 0 for none: stored as it is; a group that lacks
-            is stored in half precision.
-        by_coarseness: Gaussians have a coarseness each.
+    ``steps``: group (or name, where it has none) to the largest step, 0 for none: stored as it is; a group that lacks
+    is stored in half precision.
     """
     if name == POSITIVE or steps.get(group_of(name, x) or name) == 0:
         return Coding(Kind.EXACT)
@@ -231,8 +302,7 @@ def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) ->
 def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.ndarray | None = None) -> Tensor:
     """Return the tensor that ``to_whole`` turned into integers.
 
-    Raises:
-        ValueError, OverflowError: numbers that ``to_whole`` does not make.
+    Raises ValueError, OverflowError: numbers that ``to_whole`` does not make.
     """
     if coding.kind is Kind.ROTATION:
         return torch.from_numpy(rotations_from_grid(whole.numbers, coding.step)).to(dtype)

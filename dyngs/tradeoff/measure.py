@@ -12,7 +12,7 @@ from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.evaluate.drawing import Drawing, seconds_in_turn
+from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
 from dyngs.metrics import Lpips, psnr, ssim

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.evaluate.drawing import Drawing
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
 from dyngs.tradeoff.measure import render_options_of

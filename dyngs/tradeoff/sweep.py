@@ -22,8 +22,8 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted
-from dyngs.evaluate.drawing import Drawing
 from dyngs.evaluate.report import scene_of_split, split_views
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.metrics import load_lpips

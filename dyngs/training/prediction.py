@@ -27,9 +27,8 @@ from dyngs.models.kind import Kind, Setting
 from dyngs.models.model import Model
 from dyngs.models.renderable import Renderable, Rendering
 from dyngs.models.views import background_colour, evaluation_background
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, device_for, sent
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.ops.transfer import sent
 from dyngs.state import fields_moved_to
 from dyngs.tensor_checks import require_tensor
 from dyngs.training.events import StepReport

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.ops.transfer import ReadBack, sent
+from dyngs.ops.device import ReadBack, sent
 
 
 class StepCheck:

@@ -22,8 +22,7 @@ from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import AlphaWeight, background_colour
 from dyngs.ops.adam import Count
-from dyngs.ops.device import CPU
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import CPU, sent
 from dyngs.state import Role, prefixed, tensors_of, with_role
 from dyngs.training.corrections.camera_refinement import CameraRefinement, watched
 from dyngs.training.corrections.exposure import ViewExposures

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from pretend_gpu import GPU, pretend_gpu
+from reference import project, rasterize
 
 from dyngs.bench.rasterize import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
 from dyngs.cli import main
 from dyngs.errors import DyngsError
 from dyngs.ops.projection import ProjectionOptions
-from dyngs.ops.reference import project, rasterize
 
 
 @pytest.fixture(autouse=True)

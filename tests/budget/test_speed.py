@@ -39,7 +39,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
-from dyngs.evaluate.drawing import Drawing
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.scene import Scene
 from dyngs.kinds import assemble, restored_scene
 from dyngs.runs.checkpoint import checkpoint_paths, load_run

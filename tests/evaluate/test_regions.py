@@ -20,8 +20,6 @@ from dyngs.evaluate.regions import (
     NO_TIMES,
     TOO_SMALL,
     Regions,
-    foreground_of,
-    given_motion,
 )
 
 SIDE = 24
@@ -122,9 +120,3 @@ def test_reasons_say_why_there_is_no_score() -> None:
     scores = nothing.scores(same[0], same[0].rgb_premultiplied, same[0].rgb_premultiplied)
     assert (scores["psnr_moving"], scores["psnr_static"]) == (None, 100.0)
     assert nothing.reason("psnr_moving") == TOO_SMALL
-
-
-def test_images_without_alpha_and_mask_have_neither_region() -> None:
-    image = images_of_a_walk()[0]
-    assert foreground_of(image) is None
-    assert given_motion(image) is None

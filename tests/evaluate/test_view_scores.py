@@ -12,6 +12,7 @@ import pytest
 import torch
 from flat_wall import BLACK, cameras_before_wall, seen_from
 from moving_scene import Sliding, moving_scene, still_scene
+from moving_scene import camera as one_camera
 
 import dyngs
 from dyngs.camera import Cameras
@@ -20,7 +21,7 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import scene_of_split
-from dyngs.evaluate.view_scores import mean_of, person_box, person_scores, right_half_scores, score_views
+from dyngs.evaluate.view_scores import Drawing, mean_of, person_scores, right_half_scores, score_views
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.human.avatar import pose_fit
@@ -179,7 +180,6 @@ def of_a_square(mask: torch.Tensor | None = None) -> tuple[Image, Rendering]:
 
 def test_scores_in_the_box_and_on_black() -> None:
     image, rendering = of_a_square()
-    assert person_box(image) == (slice(3, 7), slice(8, 13))
     scores = person_scores(image, rendering, torch.ones(3), NO_LPIPS)
     assert scores["psnr_person"] == pytest.approx(20, abs=1e-4)
     larger = 10 * math.log10(12 * 20 / 20)
@@ -254,3 +254,25 @@ def test_refined_poses_stand_beside_those_as_given(
 def test_poses_that_were_trained_on_are_not_refined(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", str(run), "--split", "train", "--refine"]) == 2
     assert "--refine is for images that were not trained on; name them with --split" in capsys.readouterr().err
+
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_a_shrunk_camera_sees_the_same() -> None:
+    small = one_camera(20, 14).scaled(0.5)
+    assert (small.width, small.height) == (10, 7)
+    corner = torch.tensor([20.0, 14.0, 1.0])
+    ray, same = (torch.linalg.inv(c.intrinsics[0]) @ p for c, p in ((one_camera(20, 14), corner), (small, corner / 2)))
+    assert torch.allclose(ray[:2], (ray / same * same)[:2])
+    assert torch.allclose(small.intrinsics[0] @ ray / ray[2], torch.tensor([10.0, 7.0, 1.0]))
+    assert one_camera().scaled(1.0).width == 20
+
+
+def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
+    drawings = [Drawing(still_scene(1), RenderOptions(), torch.ones(3), scale) for scale in (1.0, 0.5)]
+    images = [1 - drawing.image(one_camera(40, 28), None).mean(2) for drawing in drawings]
+    assert [tuple(x.shape) for x in images] == [(28, 40), (28, 40)]
+    assert not torch.equal(*images)
+    across = [float((x.sum(0) * torch.arange(40)).sum() / x.sum()) for x in images]
+    assert across[0] == pytest.approx(across[1], abs=0.3)  # px; half a pixel's shift would be seen

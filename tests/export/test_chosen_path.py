@@ -22,7 +22,8 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.kinds import assemble
 from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
-from dyngs.splats.ply import write_ply
+from dyngs.splats.formats import write_splats
+from dyngs.splats.splat_file import SplatFile
 
 MODEL = HumanModel(resolution=24, sh_degree=0, fit=False)
 TRAIN = TrainConfig(steps=1)
@@ -144,7 +145,7 @@ def some_gaussians(count: int = 50) -> Gaussians:
 @pytest.mark.parametrize("path", ["orbit", "spiral"])
 @pytest.mark.parametrize("up", ["z", "-y", "x"])
 def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) -> None:
-    file = write_ply(tmp_path / "a.ply", some_gaussians(), RasterizeMode.ANTIALIASED, eps2d=0.1)
+    file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians(), RasterizeMode.ANTIALIASED, 0.1)).path
     opened = replace(open_scene(file), stated_up=up)
     cameras = choose_path(opened, PathOptions(path, num_frames=5, size=(80, 60))).cameras
     axis = np.zeros(3)
@@ -165,14 +166,14 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
 
 
 def test_an_unknown_path_is_named(tmp_path: Path) -> None:
-    file = write_ply(tmp_path / "a.ply", some_gaussians())
+    file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians())).path
     with pytest.raises(DyngsError, match="no camera path 'circle'"):
         choose_path(open_scene(file), PathOptions("circle"))
 
 
 @pytest.mark.parametrize("options", [PathOptions(times=(0.5,)), PathOptions(None), PathOptions(view="0")])
 def test_a_file_has_neither_times_nor_views(options: PathOptions, tmp_path: Path) -> None:
-    file = write_ply(tmp_path / "a.ply", some_gaussians())
+    file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians())).path
     with pytest.raises(DyngsError, match=r"a \.ply holds one time and no views"):
         choose_path(open_scene(file), options)
 

@@ -14,7 +14,7 @@ from synthetic_bodies import model, write_npz
 from dyngs.human.avatar.anchors import skinning_weights, texel_gaussians
 from dyngs.human.avatar.neighbours import nearest_neighbours
 from dyngs.human.avatar.posing import Skeleton, frame_pose, pose_blend_shapes, pose_gaussians, rest_offsets
-from dyngs.human.motion.clip import motion_clip
+from dyngs.human.motion.motion import motion_clip
 from dyngs.human.motion.placement import place_like, place_on_floor, rest_clip
 from dyngs.human.prediction.network import AtlasNetwork
 from dyngs.human.template.atlas import atlas_texels

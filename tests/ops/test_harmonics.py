@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+import reference
 import torch
 from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
-from dyngs.ops import reference
 from dyngs.ops.harmonics import evaluate_harmonics, harmonics_backward_op, harmonics_op
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +14,6 @@ from scenes import Scene, look_around, random_scene, relative_error, weights
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.ops import reference
 from dyngs.ops.projection import Projection, ProjectionOptions, project, project_backward_op, project_op
 
 pytestmark = pytest.mark.usefixtures("one_thread")

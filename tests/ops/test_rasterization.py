@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,7 +26,6 @@ from scenes import (
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops import reference
 from dyngs.ops.projection import Projection
 from dyngs.ops.rasterization import (
     MAX_CHANNELS,

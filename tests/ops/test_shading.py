@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.shading import Sight, contracted, num_inputs, reference_inputs, shading_inputs, shading_op, shortest_axes
+from dyngs.ops.shading import Sight, num_inputs, shading_inputs, shading_op
 
 
 def sight(seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype = torch.float64) -> Sight:
@@ -41,7 +42,7 @@ def test_it_is_what_torch_says(seed: int, normals: bool, timed: bool, on_body: b
     found = shading_inputs(seen, base)
     assert found.shape == (7, num_inputs(sees_time=timed, sees_normals=normals))
     # Numbers of at most 3 that come of some 30 roundings; 1e-5 is 84 units of float32, 1e-7 many of float64.
-    torch.testing.assert_close(found, reference_inputs(seen, base))
+    torch.testing.assert_close(found, reference.shading_inputs(seen, base))
 
 
 @pytest.mark.parametrize("scale", [1e-42, 1e-20, 1e-13, 1e20, 1e37])
@@ -50,12 +51,12 @@ def test_rotations_may_have_any_length(scale: float) -> None:
     rough = replace(seen, quats=seen.quats.sign())
     longer, base = replace(rough, quats=rough.quats * scale), torch.full((7, 3), 0.3)
     torch.testing.assert_close(shading_inputs(longer, base), shading_inputs(rough, base))
-    torch.testing.assert_close(reference_inputs(longer, base), shading_inputs(rough, base))
+    torch.testing.assert_close(reference.shading_inputs(longer, base), shading_inputs(rough, base))
 
 
 def test_every_isa_says_the_same(isa: str) -> None:
     seen, base = sight(3, normals=True, timed=True, on_body=True, dtype=torch.float32), torch.full((7, 3), 0.3)
-    torch.testing.assert_close(shading_inputs(seen, base), reference_inputs(seen, base), msg=isa)
+    torch.testing.assert_close(shading_inputs(seen, base), reference.shading_inputs(seen, base), msg=isa)
 
 
 def test_threads_change_nothing() -> None:
@@ -81,7 +82,7 @@ def test_what_is_degenerate_stays_finite() -> None:
     zeros = torch.zeros(1, 3)
     seen = Sight(zeros, torch.zeros(1, 4), zeros, torch.tensor([0]), zeros[0], torch.tensor([[0.0] * 3, [1.0] * 3]))
     base = torch.full((1, 3), 0.5)
-    torch.testing.assert_close(shading_inputs(seen, base), reference_inputs(seen, base))
+    torch.testing.assert_close(shading_inputs(seen, base), reference.shading_inputs(seen, base))
     assert shading_inputs(seen, base).isfinite().all()
     assert shading_inputs(replace(seen, rows=torch.zeros(0, dtype=torch.long)), base[:0]).shape == (0, 13)
 
@@ -97,9 +98,9 @@ def test_a_row_that_does_not_exist_is_refused(row: int) -> None:
 @given(st.integers(0, 2**32), st.floats(1e-3, 1e12))
 def test_far_places_stay_bounded_and_in_order(seed: int, scale: float) -> None:
     points = scale * torch.randn(20, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    lengths, inside = points.norm(dim=1), contracted(points).norm(dim=1)
+    lengths, inside = points.norm(dim=1), reference.contracted(points).norm(dim=1)
     assert (inside <= 2).all()
-    assert torch.equal(contracted(points)[lengths <= 1], points[lengths <= 1])
+    assert torch.equal(reference.contracted(points)[lengths <= 1], points[lengths <= 1])
     assert (inside[lengths.argsort()].diff() >= -1e-12).all()
 
 
@@ -107,7 +108,7 @@ def test_the_shortest_axis_is_the_normal() -> None:
     quats = torch.randn(30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     log_scales = torch.randn(30, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     expected = rotation_matrices(quats).gather(2, log_scales.argmin(1)[:, None, None].expand(30, 3, 1))[..., 0]
-    torch.testing.assert_close(shortest_axes(quats, log_scales), expected)
+    torch.testing.assert_close(reference.shortest_axes(quats, log_scales), expected)
 
 
 @pytest.mark.parametrize("on_body", [True, False])

@@ -23,9 +23,8 @@ from dyngs.export.cameras import write_cameras
 from dyngs.export.chosen_path import PathOptions, choose_path
 from dyngs.export.html.page import write_page
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
-from dyngs.export.moving_file import write_moving
 from dyngs.export.scene_file import write_scene_file
-from dyngs.export.splat_files import write_run_sequence, write_run_splats
+from dyngs.export.splat_files import write_moving, write_run_sequence, write_run_splats
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import open_run

@@ -6,20 +6,34 @@ import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as nps
 
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
+from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.state import part_of
 from dyngs.static.scene import StaticScene
-from dyngs.storage.coding import compressed, decompressed
-from dyngs.storage.file import MAGIC, MAX_HEADER, SceneInfo, decoded, encoded, read_scene, write_scene
+from dyngs.storage.file import (
+    MAGIC,
+    MAX_HEADER,
+    Packing,
+    compressed,
+    decoded,
+    decompressed,
+    encoded,
+    packed,
+    read_scene,
+    unpacked,
+    write_scene,
+)
 from dyngs.storage.tensors import COARSENESS
 
-INFO = SceneInfo(step=7, extent=2.5, world_offset=(1e6 + 0.25, 0, -3), background="white", rasterize_mode="classic")
+INFO = CheckpointInfo(7, 2.5, (1e6 + 0.25, 0.0, -3.0), "white", "classic")
 STEPS = {"means": 0.01, "quats": 0.01, "log_scales": 0.02, "logit_opacities": 0.004, "sh_base": 0.02, "sh_rest": 0.05}
 STEPS = {f"gaussians.{name}": step for name, step in STEPS.items()}
 EXTREMES = st.sampled_from((0.0, 1.0, -1e4, 1e30, -1e30, 88.0)) | st.floats(-3, 3, width=32)
@@ -47,11 +61,11 @@ def small_scene(count: int = 3) -> dict[str, torch.Tensor]:
     return {f"gaussians.{name}": torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
 
 
-def stored(tensors: dict[str, torch.Tensor], steps: Mapping[str, float] = STEPS, info: SceneInfo = INFO) -> bytes:
+def stored(tensors: dict[str, torch.Tensor], steps: Mapping[str, float] = STEPS) -> bytes:
     """The file of a static scene."""
     own = {name: x for name, x in tensors.items() if name != COARSENESS}
     scene = StaticScene(gaussians=Gaussians(**part_of(own, "gaussians")))
-    return encoded(info, scene, steps, tensors.get(COARSENESS))
+    return encoded(INFO, scene, steps, tensors.get(COARSENESS))
 
 
 def with_header(data: bytes, old: bytes, new: bytes) -> bytes:
@@ -71,12 +85,11 @@ def test_stored_again_it_is_the_same_file(tensors: dict[str, torch.Tensor]) -> N
     data = stored(tensors)
     found = decoded(data)
     assert found.info == INFO
-    assert found.num_bytes == len(data)
     for name, x in tensors.items():
         assert found.tensors[name].shape == x.shape
         assert found.tensors[name].dtype == x.dtype
         assert torch.isfinite(found.tensors[name].double()).all()
-    assert stored(found.tensors, found.steps, found.info) == data
+    assert stored(found.tensors) == data
 
 
 def test_values_come_back_within_their_steps() -> None:
@@ -155,3 +168,44 @@ def test_other_versions_and_other_files_are_told_apart() -> None:
         decoded(data[:6] + b"\x02" + data[7:])
     with pytest.raises(DyngsError, match="not a stored scene"):
         decoded(b"ply\nformat binary_little_endian 1.0\n")
+
+
+ARRAYS = nps.arrays(
+    np.int64,
+    nps.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=6),
+    elements=st.integers(-(2**63), 2**63 - 1) | st.integers(-3, 3),
+)
+
+
+@given(ARRAYS)
+@settings(deadline=None, max_examples=40)
+def test_numbers_come_back(whole: np.ndarray) -> None:
+    packing, data = packed(whole)
+    back = unpacked(packing, data, whole.shape)
+    assert back.dtype == np.int64
+    assert np.array_equal(back, whole)
+
+
+def test_smooth_numbers_are_stored_as_differences() -> None:
+    ramp = np.arange(3000, dtype=np.int64)[:, None] * 7 + np.array([0, 100])
+    packing, data = packed(ramp)
+    assert packing.axis == 0
+    assert len(data) < 100  # bytes, for 6,000 numbers
+
+
+@pytest.mark.parametrize("size", [0, 9, 11])
+def test_another_length_is_an_error(size: int) -> None:
+    with pytest.raises(DyngsError, match="not as long as it says"):
+        decompressed(compressed(b"0123456789"), size)
+
+
+@given(st.binary(max_size=64))
+def test_noise_is_an_error_and_nothing_else(data: bytes) -> None:
+    with pytest.raises(DyngsError):
+        decompressed(data, 2**40)
+
+
+@pytest.mark.parametrize("wrong", [{"axis": 2}, {"axis": -2}, {"planes": 0}, {"planes": 9}])
+def test_only_possible_packings(wrong: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="no such packing"):
+        Packing(**({"axis": -1, "by_rows": True, "signed": False, "planes": 1} | wrong))  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from moving_scene import Sliding, camera, moving_scene, still_scene
 from dyngs.config import StaticModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
-from dyngs.evaluate.drawing import Drawing
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import Lpips
 from dyngs.tradeoff.measure import measure_quality, quartiles, render_options_of, time_interleaved

@@ -24,21 +24,16 @@ from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 
-BONES = 8
-"""Bones that a Gaussian follows on the page."""
-FINE = ("means", "quats")
-"""Splines of nodes that are stored in 16 bits."""
-MOST_LOGIT = 15.0
-"""Opacities beyond that of this logit are 1 to seven digits."""
-CHUNK = 256
-"""Rows of a list that share a range for each column: neighbours in space are alike."""
+BONES = 8  # bones that a Gaussian follows on the page
+FINE = ("means", "quats")  # splines of nodes that are stored in 16 bits
+MOST_LOGIT = 15.0  # opacities beyond that of this logit are 1 to seven digits
+CHUNK = 256  # rows of a list that share a range for each column: neighbours in space are alike
 
 
 class Lists:
     """A block of bytes to which lists are added, and where they lie in it.
 
-    Attributes:
-        layout: by name what ``data.js`` needs to know.
+    ``layout``: by name what ``data.js`` needs to know.
     """
 
     def __init__(self) -> None:
@@ -92,10 +87,7 @@ class Lists:
 def add_scene(scene: Scene, lists: Lists, tolerance: float) -> dict[str, Any]:
     """Add the numbers of a scene to ``lists`` and return what the page needs to know about them.
 
-    Args:
-        scene: N Gaussians.
-        lists: to be added to.
-        tolerance: world units that a place may be off where motion is fitted.
+    ``tolerance``: world units that a place may be off where motion is fitted.
     """
     person, moved = avatar_of(scene), field_scene_of(scene)
     if person is not None:
@@ -162,7 +154,6 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
 
 
 def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
-    """Add the skeleton and the clip of a person, and what a pose changes at rest."""
     from scipy.spatial.transform import Rotation
 
     clip, skeleton = scene.moves_as, scene.learned_skeleton
@@ -179,15 +170,14 @@ def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float
     lists.quantised("clip_quats", quats, 16)
     told: dict[str, Any] = {"bones": {"parents": list(skeleton.parents)}}
     if scene.shapes is not None:
-        heads, error = fitted_curves(lambda time: _rest_offsets(scene, time), len(clip), tolerance)
+
+        def offsets(time: float) -> Offsets:
+            found = rest_offsets(scene.anchors, frame_pose(clip.at(time), 0), scene.shapes)
+            return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
+
+        heads, error = fitted_curves(offsets, len(clip), tolerance)
         told["curves"] = _add_curves(Curves(heads, error=error), order, lists)
     return told
-
-
-def _rest_offsets(scene: HumanScene, time: float) -> Offsets:
-    posing = frame_pose(scene.moves_as.at(time), 0)
-    found = rest_offsets(scene.anchors, posing, scene.shapes)
-    return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
 
 
 def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:

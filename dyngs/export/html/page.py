@@ -30,31 +30,22 @@ from dyngs.splats.rotation import AXES
 HERE = Path(__file__).parent
 SCRIPTS = ("data.js", "motion.js", "sort.js", "renderer.js", "camera.js", "player.js", "main.js")
 SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
-TOLERANCE = 0.25
-"""Pixels of the first view that a place at its target may be off where motion is fitted."""
+TOLERANCE = 0.25  # pixels of the first view that a place at its target may be off where motion is fitted
 
 
-MOST_VIEWS = 24
-"""Cameras of the capture that a page offers, evenly chosen."""
+MOST_VIEWS = 24  # cameras of the capture that a page offers, evenly chosen
 _RING, _FRONT_RING = 8, 24
 """Cameras around a scene without a capture; among how many the front of a person is looked for."""
 
 
 @dataclass(frozen=True)
 class WrittenPage:
-    """A page on disk.
+    """A page on disk."""
 
-    Attributes:
-        path: of it.
-        num_bytes: its size.
-        header: what it says except for the layout.
-        notes: lines about what was chosen or left out.
-    """
-
-    path: Path
-    num_bytes: int
-    header: dict[str, Any]
-    notes: tuple[str, ...]
+    path: Path  # of it
+    num_bytes: int  # its size
+    header: dict[str, Any]  # what it says except for the layout
+    notes: tuple[str, ...]  # lines about what was chosen or left out
 
 
 def write_page(
@@ -62,16 +53,8 @@ def write_page(
 ) -> WrittenPage:
     """Write the page of a scene, atomically: where its viewer begins, and what moves.
 
-    Args:
-        opened: a scene of any kind; one with a colour network is coloured by it in the page, too.
-        path: of the file.
-        title: shown in a corner and in the title bar, any text; None: the name of the run, or of the file.
-        time: to begin with.
-        views: cameras to begin with and to go through, each a batch of one; without any, those of the capture, or
-            around the scene.
-
-    Raises:
-        DyngsError: the file cannot be written.
+    ``title``: shown in a corner and in the title bar; None: the name of the run, or of the file. ``views``: cameras to
+    begin with and to go through, each a batch of one; without any, those of the capture, or around the scene.
     """
     inputs_of(opened).require_output(path)
     if title is None:
@@ -139,7 +122,6 @@ def _middle(opened: Opened) -> list[float]:
 
 
 def _some(capture: Capture) -> list[View]:
-    """Return training views at different positions, evenly chosen."""
     views, seen = [], set()
     for view in capture.splits["train"]:
         pose = view.cam_from_world.tobytes()

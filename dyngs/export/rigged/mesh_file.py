@@ -12,14 +12,17 @@ import torch
 
 from dyngs.config import HumanModel
 from dyngs.errors import DyngsError
-from dyngs.export.rigged.body import BodyMesh, anchor_normals, body_mesh, rest_vertices
 from dyngs.export.rigged.skeleton import (
+    BodyMesh,
     JointAnimation,
     Rig,
     add_animation,
     add_skeleton,
     add_weights,
+    anchor_normals,
     animation_of,
+    body_mesh,
+    rest_vertices,
     rig_of,
 )
 from dyngs.export.rigged.surface import fitted_surface
@@ -35,12 +38,9 @@ from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
 
 SUFFIX = ".glb"
-_FINER = 4
-"""Texels of the texture per texel of the model's atlas, along a side."""
-_LARGEST = 2048
-"""Texels along a side of the largest texture."""
-_MOST_SAMPLES = 512
-"""Texels along a side of the atlas from which the surface is moved."""
+_FINER = 4  # texels of the texture per texel of the model's atlas, along a side
+_LARGEST = 2048  # texels along a side of the largest texture
+_MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
 
 
 @dataclass(frozen=True)
@@ -53,31 +53,18 @@ class Played:
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh that was written.
+    """A mesh that was written."""
 
-    Attributes:
-        path: of the file.
-        notes: a line about each thing that was chosen, or that glTF cannot hold.
-    """
-
-    path: Path
-    notes: tuple[str, ...]
+    path: Path  # of the file
+    notes: tuple[str, ...]  # a line about each thing that was chosen, or that glTF cannot hold
 
 
 def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> MeshFile:
     """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up, facing +z.
 
-    The size is that of the capture; the soles stand at y = 0. Colours are display-referred with the light of the
-    capture in them, hence a material without light (KHR_materials_unlit).
-
-    Args:
-        run: of a person.
-        path: output file.
-        played: the motion that the run plays, which becomes an animation; None: no animation.
-
-    Raises:
-        DyngsError: the run is not that of a person, the template is missing or without texture coordinates, or the file
-            cannot be written.
+    The size is that of the capture; the soles stand at y = 0. Colours have the light of the capture in them, hence a
+    material without light. ``played`` becomes an animation. Raises DyngsError: not the run of a person, or its template
+    is missing or without texture coordinates.
     """
     scene, body = person_and_template(run, "--format mesh")
     if path.suffix.lower() != SUFFIX:
@@ -121,8 +108,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
 def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTemplate]:
     """Return the person of a run and its template.
 
-    Raises:
-        DyngsError: the run is not that of a person, or the template cannot be read.
+    Raises DyngsError: the run is not that of a person, or the template cannot be read.
     """
     scene, model = avatar_of(run.scene), run.config.model
     if scene is None or not isinstance(model, HumanModel):
@@ -140,6 +126,8 @@ def texture_size(scene: HumanScene) -> int:
 
 def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointAnimation | None) -> GlbDocument:
     """Return a mesh with its skeleton, texture and animation as a glTF document."""
+    from PIL import Image
+
     document, nodes = GlbDocument(), list[dict[str, Any]]()
     armature, first = add_skeleton(document, rig, nodes)
     nodes.append({"name": "person", "mesh": 0, "skin": 0})
@@ -151,7 +139,9 @@ def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointA
     } | add_weights(document, mesh.weights)
     kind = np.uint16 if len(mesh.vertices) < 2**16 - 1 else np.uint32
     indices = document.add_numbers(mesh.faces.flatten().numpy().astype(kind), INDICES)
-    view = document.add_bytes(_png(image))
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "PNG")
+    view = document.add_bytes(stream.getvalue())
     texture = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
     document.json |= {
         "scene": 0,
@@ -167,11 +157,3 @@ def mesh_document(mesh: BodyMesh, rig: Rig, image: np.ndarray, animation: JointA
     if animation is not None:
         add_animation(document, animation, first)
     return document
-
-
-def _png(image: np.ndarray) -> bytes:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "PNG")
-    return stream.getvalue()

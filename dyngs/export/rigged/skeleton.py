@@ -1,6 +1,6 @@
-"""The skeleton of a person in glTF: nodes, a skin, and a motion as an animation.
+"""The body of a trained person as a mesh, and its skeleton in glTF: nodes, a skin, a motion as an animation.
 
-Local letters: J joints, V vertices, F frames, K joints that a vertex or Gaussian follows.
+Local letters: M vertices and T triangles of the template, V vertices of the mesh, J joints, N Gaussians, F frames.
 """
 
 from __future__ import annotations
@@ -14,32 +14,106 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from dyngs.errors import DyngsError
 from dyngs.files.gltf import VERTICES, GlbDocument
-from dyngs.human.avatar.anchors import heaviest_joints
+from dyngs.human.avatar.anchors import Anchors, heaviest_joints
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.placement import upright
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.template.body import BodyTemplate, apply_shape
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
-_FLOOR_FRAMES = 64
-"""Frames, evenly spread, in which the lowest vertex is looked for."""
+_MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
+
+
+@dataclass(frozen=True)
+class BodyMesh:
+    """A skinned mesh at rest; m, y up, facing +z."""
+
+    vertices: Tensor  # (V, 3)
+    normals: Tensor  # (V, 3) outward unit normals
+    uv: Tensor  # (V, 2) texture coordinates, row of the image = (1 - v) * H
+    faces: Tensor  # (T, 3) int64, counter-clockwise from outside
+    source: Tensor  # (V,) int64 vertex of the template that each is a copy of; more than one where the atlas has a seam
+    weights: Tensor  # (V, J) skinning weights, rows sum to 1
+    skeleton: Skeleton  # of the person
+
+
+def body_mesh(scene: HumanScene, body: BodyTemplate, vertices: Tensor) -> BodyMesh:
+    """Return the mesh of a person: the template's triangles over ``vertices`` (M, 3) at rest, the person's joints.
+
+    Raises DyngsError: the template has no texture coordinates.
+    """
+    if body.uv is None or body.uv_faces is None:
+        raise DyngsError(
+            f"the body template '{body.name}' has no texture coordinates; train with model.uv=FILE.obj for a mesh"
+        )
+    pairs = body.faces.flatten() * len(body.uv) + body.uv_faces.flatten()
+    corners, inverse = torch.unique(pairs, return_inverse=True)
+    source = corners // len(body.uv)
+    return BodyMesh(
+        vertices=vertices[source],
+        normals=vertex_normals(vertices, body.faces)[source],
+        uv=body.uv[corners % len(body.uv)],
+        faces=inverse.reshape(-1, 3),
+        source=source,
+        weights=body.weights[source],
+        skeleton=scene.learned_skeleton,
+    )
+
+
+def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
+    """Return the template's vertices (M, 3) at rest in the shape of a trained person.
+
+    Runs hold no shape parameters, but joints and points of the surface, which are linear in these: they follow by least
+    squares, exactly. Raises DyngsError: the template is not the one that the person was trained on.
+    """
+    anchors, joints = scene.anchors, scene.skeleton.joints
+    if joints.shape != body.joints.shape or int(anchors.face.max()) >= len(body.faces):
+        raise DyngsError(f"the template '{body.name}' is not the one that this person was trained on")
+    if body.shape_dirs is None or body.joint_shape_dirs is None:
+        return body.vertices
+    rows = torch.nonzero(anchors.height == 0)[:, 0]  # on the skin
+    rows = rows[:: max(len(rows) // _MOST_ROWS, 1)]
+    around = body.faces[anchors.face[rows]]
+    corners = anchors.barycentric[rows].double()
+    mean = (corners[..., None] * body.vertices[around].double()).sum(1)
+    directions = torch.einsum("nk,nkdb->ndb", corners, body.shape_dirs[around].double())
+    left = torch.cat([directions.flatten(0, 1), body.joint_shape_dirs.double().flatten(0, 1)])
+    offsets = (anchors.points[rows].double() - mean, (joints - body.joints).double())
+    right = torch.cat([x.flatten() for x in offsets])
+    betas = torch.linalg.lstsq(left, right[:, None], driver="gelsd").solution[:, 0]
+    return apply_shape(body, betas.to(body.vertices))[0]
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return outward unit normals (M, 3) at vertices, of the triangles around each, weighted by area."""
+    a, b, c = vertices[faces].unbind(1)
+    flat = torch.linalg.cross(b - a, c - a, dim=-1)
+    total = torch.zeros_like(vertices)
+    for k in range(3):
+        total.index_add_(0, faces[:, k], flat)
+    return torch.nn.functional.normalize(total, dim=-1)
+
+
+def anchor_normals(anchors: Anchors, body: BodyTemplate, vertices: Tensor) -> Tensor:
+    """Return unit normals (N, 3) of the surface ``vertices`` (M, 3) below the Gaussians at rest."""
+    around = vertex_normals(vertices, body.faces)[body.faces[anchors.face]]
+    return torch.nn.functional.normalize((anchors.barycentric[..., None] * around).sum(1), dim=-1)
+
+
+_FLOOR_FRAMES = 64  # frames, evenly spread, in which the lowest vertex is looked for
 _STILL = 1e-6
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A skeleton at rest in the axes of the file: y up, facing +z, soles at y = 0.
+    """A skeleton at rest in the axes of the file: y up, facing +z, soles at y = 0."""
 
-    Attributes:
-        skeleton: in m, as the person was trained.
-        scale: world units of the capture per metre of the template.
-        rise: what is added to y after scaling.
-    """
-
-    skeleton: Skeleton
-    scale: float
-    rise: float
+    skeleton: Skeleton  # in m, as the person was trained
+    scale: float  # world units of the capture per metre of the template
+    rise: float  # what is added to y after scaling
 
     @property
     def joints(self) -> Tensor:
@@ -62,21 +136,13 @@ class Rig:
 
 @dataclass(frozen=True)
 class JointAnimation:
-    """Motion of a rig's joints.
+    """Motion of a rig's joints."""
 
-    Attributes:
-        name: of the animation.
-        seconds: (F,) float64.
-        quats: (F, J, 4) xyzw, relative to the parent joints.
-        root: (F, 3) place of the root joint.
-        root_scale: (F,) its scale; 1 for a person who keeps the size.
-    """
-
-    name: str
-    seconds: np.ndarray
-    quats: np.ndarray
-    root: np.ndarray
-    root_scale: np.ndarray
+    name: str  # of the animation
+    seconds: np.ndarray  # (F,) float64
+    quats: np.ndarray  # (F, J, 4) xyzw, relative to the parent joints
+    root: np.ndarray  # (F, 3) place of the root joint
+    root_scale: np.ndarray  # (F,) its scale; 1 for a person who keeps the size
 
 
 def rig_of(scene: HumanScene, vertices: Tensor) -> Rig:
@@ -90,13 +156,7 @@ def animation_of(
 ) -> JointAnimation:
     """Return the motion that a person plays: y up, on the floor y = 0, around the origin.
 
-    Args:
-        scene: plays it.
-        rig: of the person.
-        vertices: (V, 3) at rest, m, of which the lowest one stands on the floor.
-        weights: (V, J).
-        fps: frames per second.
-        name: of the animation.
+    ``vertices``: (V, 3) at rest, m, of which the lowest one stands on the floor. ``weights``: (V, J).
     """
     joints, parents = rig.skeleton.joints, rig.skeleton.parents
     clip = upright(scene.moves_as, scene.clip, joints)

@@ -13,9 +13,17 @@ import torch
 
 from dyngs.conventions import SH_C0
 from dyngs.errors import DyngsError
-from dyngs.export.rigged.body import anchor_normals, rest_vertices
 from dyngs.export.rigged.mesh_file import Played, person_and_template
-from dyngs.export.rigged.skeleton import Rig, add_animation, add_skeleton, add_weights, animation_of, rig_of
+from dyngs.export.rigged.skeleton import (
+    Rig,
+    add_animation,
+    add_skeleton,
+    add_weights,
+    anchor_normals,
+    animation_of,
+    rest_vertices,
+    rig_of,
+)
 from dyngs.export.rigged.texture import frontal_colours
 from dyngs.files.gltf import GlbDocument
 from dyngs.files.write import atomic_file
@@ -27,6 +35,7 @@ from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
 from dyngs.splats.gltf import EXTENSION, add_gaussians
 from dyngs.splats.ply import write_ply
+from dyngs.splats.splat_file import SplatFile, require_writable
 
 SUFFIXES = (".ply", ".glb")
 
@@ -43,17 +52,9 @@ class RiggedSplats:
 def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None) -> RiggedSplats:
     """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing +z, soles at y = 0.
 
-    ``.ply``: the columns ``joint_0`` to ``joint_7`` (indices as float32, heaviest first) and ``weight_0`` to
-    ``weight_7`` after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
-    Gaussians of KHR_gaussian_splatting with JOINTS_n, WEIGHTS_n and a skin.
-
-    Args:
-        run: of a person.
-        path: output file.
-        played: the motion that the run plays, as an animation in a ``.glb``; None: no animation.
-
-    Raises:
-        DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
+    ``.ply``: columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7`` after those of 3DGS,
+    and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``: KHR_gaussian_splatting with a skin, and
+    ``played`` as an animation. Raises DyngsError: not the run of a person, or its template is missing.
     """
     scene, body = person_and_template(run, "--joints")
     suffix = path.suffix.lower()
@@ -76,6 +77,7 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
     gaussians = gaussians.replace(
         means=rig.placed(gaussians.means), log_scales=gaussians.log_scales + float(np.log(rig.scale))
     )
+    require_writable(path, gaussians)
     if suffix == ".ply":
         _write_columns(path, run, scene, rig, gaussians)
         return RiggedSplats(path, notes)
@@ -99,7 +101,9 @@ def _write_columns(path: Path, run: LoadedRun, scene: HumanScene, rig: Rig, gaus
         for i, (name, parent, place) in enumerate(zip(rig.names, rig.skeleton.parents, places, strict=True))
     ]
     model = run.config.model
-    write_ply(path, gaussians, model.rasterize_mode, ["up: y", *lines], eps2d=model.eps2d, columns=columns)
+    splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, comments=tuple(lines), up="y")
+    with atomic_file(path) as temporary:
+        write_ply(temporary, splat, columns)
 
 
 def _document(scene: HumanScene, rig: Rig, gaussians: Gaussians) -> GlbDocument:

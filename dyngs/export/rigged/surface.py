@@ -25,12 +25,9 @@ from dyngs.human.template.mesh import rasterize
 
 MARGINS = (0.0, 0.004, 0.008, 0.012, 0.016)
 """Distances, m, from the uppermost Gaussians to the surface that are tried: Gaussians reach beyond their centres."""
-_BOUNDS = (-0.02, 0.06)
-"""Least and greatest displacement, m."""
-_SMOOTH = 0.01
-"""Standard deviation, m, of the weights by which displacements are averaged."""
-_NEAR = 64
-"""Samples that displace a vertex."""
+_BOUNDS = (-0.02, 0.06)  # least and greatest displacement, m
+_SMOOTH = 0.01  # standard deviation, m, of the weights by which displacements are averaged
+_NEAR = 64  # samples that displace a vertex
 _FOLDS = (0.01, 0.02, 0.03)
 """Distances, m, above a sample at which the body must not be for the sample to count: mouth, eye sockets."""
 _SIZE = 256
@@ -40,19 +37,12 @@ _ANGLES = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
 
 @dataclass(frozen=True)
 class FittedSurface:
-    """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians.
+    """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians."""
 
-    Attributes:
-        vertices: (M, 3).
-        margin: the distance of ``MARGINS`` that was taken; None: the template as it is agrees better.
-        agreement: intersection over union of the silhouettes.
-        plain: the same for the template as it is.
-    """
-
-    vertices: Tensor
-    margin: float | None
-    agreement: float
-    plain: float
+    vertices: Tensor  # (M, 3)
+    margin: float | None  # the distance of ``MARGINS`` that was taken; None: the template as it is agrees better
+    agreement: float  # intersection over union of the silhouettes
+    plain: float  # the same for the template as it is
 
 
 def fitted_surface(
@@ -61,14 +51,7 @@ def fitted_surface(
     """Return the surface whose silhouettes agree best with the Gaussians', of the template's and some moved ones.
 
     A vertex is displaced by the mean displacement of the samples around it in space, along their normals, up to what is
-    seen there. So fingers, whose sides cancel, swell less, and lids and lips move with the skin around them.
-
-    Args:
-        gaussians: N at rest.
-        body: the template.
-        vertices: (M, 3) at rest in the person's shape.
-        samples: P texels of that surface.
-        baked: what is seen there.
+    seen there. ``vertices`` (M, 3) are at rest in the person's shape.
     """
     cameras = _cameras(vertices)
     shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5

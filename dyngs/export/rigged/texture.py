@@ -19,52 +19,36 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.placement import rest_clip
 from dyngs.human.pose.skinning import blend_transforms, joint_transforms
 from dyngs.human.template.atlas import Texels
+from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.reference import harmonics_basis
 
-_NEAR = 20
-"""Gaussians that are looked for at each height above a texel."""
+_NEAR = 20  # Gaussians that are looked for at each height above a texel
 _HEIGHTS = (-0.015, 0.005, 0.025, 0.05)
 """Heights, m, where they are looked for: below the skin, on it, in clothes and hair."""
-_REACH = (-0.04, 0.07)
-"""Heights, m, between which Gaussians belong to a texel."""
+_REACH = (-0.04, 0.07)  # heights, m, between which Gaussians belong to a texel
 _FACING = 0.3
 """Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not colour the trunk."""
-_TOP = 0.1
-"""Fraction of what is seen from which a texel counts as covered."""
+_TOP = 0.1  # fraction of what is seen from which a texel counts as covered
 _CHUNK = 8192
-SEEN = 0.1
-"""Opacity from which a texel has a colour of its own."""
-_MIRROR = 0.02
-"""Distance, m, within which the mirror image of a texel is looked for."""
-_GAP = 0.015
-"""Distance, m, to what is seen, up to which a texel lies in a small gap."""
-_AROUND = 16
-"""Texels that colour one in a gap, or one that is not seen on either side."""
+SEEN = 0.1  # opacity from which a texel has a colour of its own
+_MIRROR = 0.02  # distance, m, within which the mirror image of a texel is looked for
+_GAP = 0.015  # distance, m, to what is seen, up to which a texel lies in a small gap
+_AROUND = 16  # texels that colour one in a gap, or one that is not seen on either side
 
 
 @dataclass(frozen=True)
 class BakedTexels:
-    """What is seen straight above P texels.
+    """What is seen straight above P texels."""
 
-    Attributes:
-        rgb: (P, 3) in [0, 1], display-referred as the images were.
-        alpha: (P,) opacity.
-        top: (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is reached.
-    """
-
-    rgb: Tensor
-    alpha: Tensor
-    top: Tensor
+    rgb: Tensor  # (P, 3) in [0, 1], display-referred as the images were
+    alpha: Tensor  # (P,) opacity
+    top: Tensor  # (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is reached
 
 
 def bake_texels(scene: HumanScene, texels: Texels, normals: Tensor) -> BakedTexels:
     """Return what the Gaussians at rest show along the normal of each texel, blended from the outside in.
 
-    Args:
-        scene: a person.
-        texels: P of the template in the person's shape.
-        normals: (N, 3) of the surface below each Gaussian at rest.
+    ``texels``: P of the template in the person's shape. ``normals``: (N, 3) of the surface below each Gaussian at rest.
     """
     colours = frontal_colours(scene, normals)
     gaussians = scene.gaussians
@@ -101,7 +85,8 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
         posing = frame_pose(upright.moves_as, 0)
         skeleton = scene.learned_skeleton
         joints = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
-        seen_along = _turned(blend_transforms(scene.weights, joints)[..., :3], seen_along)
+        linear = blend_transforms(scene.weights, joints)[..., :3]
+        seen_along = torch.nn.functional.normalize((linear @ seen_along[..., None])[..., 0], dim=1)
     basis = harmonics_basis(seen_along, gaussians.sh_degree)
     return ((basis[..., None] * gaussians.sh).sum(1) + 0.5).clamp(0, 1)
 
@@ -124,11 +109,6 @@ def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Te
     fraction = weight / total.clamp_min(1e-8)[:, None]
     first = (fraction.cumsum(1) < _TOP).sum(1, keepdim=True).clamp_max(fraction.shape[1] - 1)
     return (fraction[..., None] * colours).sum(1), total, height.gather(1, first)[:, 0]
-
-
-def _turned(linear: Tensor, directions: Tensor) -> Tensor:
-    """Return unit directions (N, 3) under linear maps (N, 3, 3)."""
-    return torch.nn.functional.normalize((linear @ directions[..., None])[..., 0], dim=1)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import Shader
-from dyngs.ops.reference import harmonics_basis
+from dyngs.ops.harmonics import harmonics_basis
 
 DIRECTIONS = 96
 """Number of directions from which colours are sampled; degree 3 has 16 terms."""

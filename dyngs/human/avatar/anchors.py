@@ -15,19 +15,17 @@ from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.human.motion.clip import MotionClip
-from dyngs.human.pose.nearest_rotation import quats_of
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.ops.quaternions import quats_of
 from dyngs.state import fields_moved_to
 
-MAX_JOINTS = 8
-"""Limit on the joints that one Gaussian follows; vertices of the free template follow no more."""
+MAX_JOINTS = 8  # limit on the joints that one Gaussian follows; vertices of the free template follow no more
 _WIDTH, _THICKNESS = 0.5, 0.25
 """Standard deviations of an initial Gaussian in the tangent plane and along the normal, in sides of its texel."""
-_LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1
-"""Initial opacities: on the lowest scaffold, and on those above it."""
+_LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1  # initial opacities: on the lowest scaffold, and on those above it
 
 
 @dataclass(frozen=True)
@@ -117,10 +115,8 @@ def skinning_weights(anchors: Anchors, num_joints: int, corrections: Tensor | No
     return dense.scatter_add(1, anchors.joints, weights)
 
 
-FINER = 2
-"""Texels of the finer atlas along a side of one."""
-PIXELS = 2.0
-"""Pixels along the side of a texel from which it is replaced by smaller ones."""
+FINER = 2  # texels of the finer atlas along a side of one
+PIXELS = 2.0  # pixels along the side of a texel from which it is replaced by smaller ones
 _LIMBS = ("wrist", "ankle", "foot", "index", "middle", "pinky", "ring", "thumb")
 
 

@@ -15,10 +15,10 @@ from torch import Tensor
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.joints import mirrored_joints
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import sent
 from dyngs.state import Role, fields_moved_to
 
 LR = {
@@ -32,14 +32,11 @@ LR = {
     "normals": 1e-3,
 }
 """Learning rates."""
-OF_FRAMES = ("poses", "trans")
-"""What is learned of single frames."""
-LR_DECAY = 0.1
-"""Last over first learning rate."""
+OF_FRAMES = ("poses", "trans")  # what is learned of single frames
+LR_DECAY = 0.1  # last over first learning rate
 POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
 """Of the squared corrections of poses and joints, of skinning weights, and of the light, in the loss."""
-POSE_CM = 0.05
-"""Rotation of a joint, rad, that is penalized as much as a centimetre."""
+POSE_CM = 0.05  # rotation of a joint, rad, that is penalized as much as a centimetre
 
 
 @dataclass(frozen=True)
@@ -57,13 +54,10 @@ class SharedCorrection:
 def new_corrections(
     clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
 ) -> Parameters:
-    """Return the corrections to learn, all zero, of a clip of F frames, a skeleton and skinning weights.
+    """Return the corrections to learn, all zero; with ``normals`` (N, 3) also the light that falls on them (``Light``).
 
-    With ``normals`` (N, 3), also the light that falls on them.
-
-    Tensors: ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before the given ones; ``trans`` (F, 3);
-    ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K);
-    optionally ``light`` (8, 3) and ``normals`` (N, 3), see ``dyngs.human.avatar.posing.Light``.
+    ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before those of the clip; ``trans`` (F, 3);
+    ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K).
     """
     unit = float(clip.scale.mean())
     zeros = {

@@ -17,21 +17,19 @@ from dyngs.human.avatar.observations import Subject, in_colours_of
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.clip import captured_motion
+from dyngs.human.motion.motion import captured_motion
 from dyngs.human.template.body_reader import load_template, rest_shape
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Kind, Setting
 from dyngs.models.views import training_cameras
 
-FIRST_VIEWS = 50
-"""Number of images from which a person's first colours are taken."""
+FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
 
 
 def start(setting: Setting) -> GaussianModel:
     """Return the model of a person before the first step.
 
-    Raises:
-        DyngsError: a capture without body parameters, or a template that cannot be read.
+    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     config, model = setting.config, setting.config.model
     if not isinstance(model, HumanModel):
@@ -59,8 +57,7 @@ KIND = Kind(HumanModel, start, restore)
 def human_start(config: Config, model: HumanModel, capture: Capture, images: ImageLoader) -> tuple[Gaussians, Subject]:
     """Return the first Gaussians of a person, and the person.
 
-    Raises:
-        DyngsError: a capture without body parameters, or a template that cannot be read.
+    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     sh_degree = config.stored_sh_degree
     if capture.body is None:

@@ -14,10 +14,8 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions
 from dyngs.human.avatar.anchors import Anchors
 
-_SAME_JOINTS = 0.5
-"""Least cosine between the skinning weights of points that belong to the same part of the body."""
-_LOOKED_AT = 4
-"""Points that are looked at, over the number of requested neighbours."""
+_SAME_JOINTS = 0.5  # least cosine between the skinning weights of points that belong to the same part of the body
+_LOOKED_AT = 4  # points that are looked at, over the number of requested neighbours
 
 
 def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
@@ -44,9 +42,8 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
 def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
     """Return the rows (Q, count) int64 of the nearest other points that follow the same joints, nearest first.
 
-    They do where the cosine between their skinning weights (Q, J) is above a half: arm and trunk do not, nor do two
-    fingers, however near they are at rest. Looks at four times ``count`` points around each; where fewer than ``count``
-    of these do, the point itself is in their place. At most Q - 1 columns.
+    They do where the cosine between their skinning weights (Q, J) is above a half, among four times ``count`` points
+    around each; where fewer do, the point itself is in their place. At most Q - 1 columns.
     """
     near = nearest_neighbours(points, _LOOKED_AT * count)
     unit = torch.nn.functional.normalize(weights, dim=1)
@@ -59,19 +56,14 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
     return torch.where(others, own, near).gather(1, order)
 
 
-ENOUGH = 1.0
-"""Sightings (see ``sightings``) at which a Gaussian's own values count as much as what is around it."""
-MIRRORED = 0.9
-"""Trust in the other side of the body, where that was seen."""
-HARDLY = 0.5
-"""Trust in a Gaussian's own values below which it is counted as unseen in the line for people."""
+ENOUGH = 1.0  # sightings (see sightings) at which a Gaussian's own values count as much as what is around it
+MIRRORED = 0.9  # trust in the other side of the body, where that was seen
+HARDLY = 0.5  # trust in a Gaussian's own values below which it is counted as unseen in the line for people
 _NEIGHBOURS = 8
 _SAME_PLACE = 1.5
 """Distance from the mirrored anchor, in sides of its texel, within which a Gaussian is its mirror image."""
-_OWN = 1e-6
-"""Least weight of own values, which decides where nothing around is seen either."""
-_SURE = 1e-3
-"""Least doubt in own values, so that the numbers stay in range."""
+_OWN = 1e-6  # least weight of own values, which decides where nothing around is seen either
+_SURE = 1e-3  # least doubt in own values, so that the numbers stay in range
 _RESIDUAL, _MAX_ROUNDS = 1e-5, 1000
 """Largest residual of the linear system at which its solution is good enough, and bound on the rounds it takes."""
 
@@ -82,9 +74,7 @@ def sightings(
 ) -> Tensor:
     """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen there.
 
-    A view counts as 1 where the texel is in full view, and hardly at all where little of it shines through others: a
-    hundred views that see a hundredth of it tell less than one that sees all. Independent of the size of the images.
-    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the N Gaussians in the pose of
+    Gaussians too faint to be drawn have infinity: the images made them so. ``drawn`` are the Gaussians in the pose of
     each view, and its camera; ``sizes`` (N,) sides of the texels, m; ``scale`` world units per metre.
     """
     total = torch.zeros_like(sizes)
@@ -106,10 +96,9 @@ def trust_in(seen: Tensor) -> Tensor:
 def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: float, trust: Tensor) -> dict[str, Tensor]:
     """Return new ``sh``, ``means`` and ``logit_opacities`` of N Gaussians at rest; the same where trust is 1.
 
-    Offsets from the scaffold, opacities and colours are mixed with those of the mirror image. Base colours are also
-    made like those of the neighbours that follow the same joints: harmonic where there is no trust. ``weights`` (N, J)
-    are those of the template; ``middle`` is x of the plane of symmetry at rest, m; ``trust`` (N,) in what was learned
-    is in [0, 1].
+    Offsets, opacities and colours are mixed with those of the mirror image; base colours are made like those of linked
+    neighbours. ``weights`` (N, J) are the template's; ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) in
+    [0, 1].
     """
     other, is_image = mirror_images(anchors, middle)
     borrowed = (1 - trust) * trust[other] * is_image * MIRRORED

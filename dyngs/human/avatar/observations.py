@@ -1,7 +1,4 @@
-"""The captured person, and the first Gaussians on its template, in the colours of images.
-
-Local letter: N points.
-"""
+"""The captured person, and the first Gaussians on its template, in the colours of images. Local letter: N points."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
-from dyngs.human.motion.clip import CapturedMotion
+from dyngs.human.motion.motion import CapturedMotion
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
 
 FACING_EXPONENT = 4
@@ -28,11 +25,10 @@ FACING_EXPONENT = 4
 def observed_colours(
     normals: Tensor, weights: Tensor, skeleton: Skeleton, shown: Iterable[tuple[Image, BodyPose, Tensor]]
 ) -> Tensor:
-    """Return the mean colours (N, 3) of points of a body in images, weighted towards frontal views.
+    """Return the mean colours (N, 3) of points of a body in images, weighted to frontal views; grey if none faces it.
 
-    Grey for points that no image faces; occlusion is ignored. Without alpha the full frame is silhouette. ``normals``
-    (N, 3) are at rest, ``weights`` (N, J) skin; ``shown`` are images, body poses, and the points (N, 3) at rest for
-    each pose.
+    Occlusion is ignored. ``normals`` (N, 3) are at rest, ``weights`` (N, J) skin; ``shown`` are images, body poses, and
+    the points (N, 3) at rest for each pose.
     """
     count, device = len(normals), normals.device
     colour, weight = torch.zeros(count, 3, device=device), torch.zeros(count, device=device)

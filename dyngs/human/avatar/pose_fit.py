@@ -1,8 +1,6 @@
-"""Body poses fitted to images: the poses in which an avatar, which stays as it is, looks most like them.
+"""Body poses in which an avatar, which stays as it is, looks most like images, or has their silhouettes.
 
-Either the full images count, or their silhouettes alone (``dyngs.human.avatar.pose_fit``). GART (Lei et al.
-2024), Anim-NeRF (Chen et al. 2021) and others fit the poses of test images like this before they score new poses.
-Local letters: F moments, V images of a moment.
+So do GART (Lei et al. 2024) and Anim-NeRF (Chen et al. 2021) before they score new poses. F moments, V images of one.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import adam_step_
@@ -79,12 +77,10 @@ def shrunk(image: Tensor, factor: int) -> Tensor:
     return area_downscale(image, width, height)
 
 
-COARSE_PX = 40
-"""Height of the person, px, in the coarsest of the three rounds."""
+COARSE_PX = 40  # height of the person, px, in the coarsest of the three rounds
 FIRST_RATES, LAST_RATES = (5e-3, 5e-3, 3e-3), (2.5e-3, 1.2e-3, 5e-4)
 """Learning rates of rotations, rad, in the three rounds."""
-SHIFT_RATE = 0.5
-"""Learning rate of the translation, m, over that of rotations, rad."""
+SHIFT_RATE = 0.5  # learning rate of the translation, m, over that of rotations, rad
 BETAS = (0.9, 0.99)
 WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
 """After so many updates (at least one for each image) the rate is halved unless the mean loss fell by that share; a
@@ -116,15 +112,17 @@ def fitted_to_images(
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
-    All images of a moment decide its pose, and no others do. The fit begins with the pose that is played, or with that
-    corrected as the moment before was, whichever looks more alike. Skeleton, size and appearance stay as they are. No
-    random numbers are drawn. ``scene`` plays the clip to correct; ``background`` (3,) is behind both.
+    All images of a moment decide its pose. The fit begins with the pose that is played, or with that corrected as the
+    moment before was, whichever looks more alike. ``scene`` plays the clip to correct; ``background`` (3,) is behind
+    both.
     """
     groups: dict[float, list[int]] = {}
     for index, time in enumerate(images.times):
         groups.setdefault(0.0 if time is None else time, []).append(index)
     times = sorted(groups)
-    starts = _moments(scene.moves_as, times)
+    parts = [scene.moves_as.at(time) for time in times]
+    poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
+    starts = MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
     found: list[Correction] = []
     counts: list[int] = []
     for row, time in enumerate(times):
@@ -133,22 +131,11 @@ def fitted_to_images(
         correction, count = fit.fitted(found[-1] if found else None)
         found.append(correction)
         counts.append(count)
-    none = SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
+    fit, none = scene.fit, SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
     turns, shifts = torch.stack([x.turns for x in found]), torch.stack([x.shift for x in found])
     clip = corrected_clip(none, starts, turns, shifts * starts.scale[:, None])
-    return FittedPoses(_playing_exactly(scene, clip), tuple(counts))
-
-
-def _moments(clip: MotionClip, times: Sequence[float]) -> MotionClip:
-    parts = [clip.at(time) for time in times]
-    poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
-    return MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
-
-
-def _playing_exactly(scene: HumanScene, clip: MotionClip) -> HumanScene:
-    """Return the person in ``clip`` as it is: what ``playing`` applies to all poses is taken off first."""
-    fit = scene.fit
-    return scene.playing(corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip))
+    exactly = corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip)  # ``playing`` applies both again
+    return FittedPoses(scene.playing(exactly), tuple(counts))
 
 
 @dataclass(frozen=True)
@@ -170,7 +157,9 @@ class _Fit:
         """
         joints = self.scene.skeleton.joints
         none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))
-        shrinks = _shrinks(self.images)
+        heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in self.images]
+        coarse = max(1, round(max(heights) / COARSE_PX))
+        shrinks = coarse, round(math.sqrt(coarse)), 1
         found = none if guess is None else self._better(none, guess, shrinks[0])
         count = 0
         for shrink, first, last in zip(shrinks, FIRST_RATES, LAST_RATES, strict=True):
@@ -224,10 +213,3 @@ class _Fit:
             losses.append(how.difference(drawn, image, self.background, shrink))
         size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
         return torch.stack(losses).mean() + size
-
-
-def _shrinks(images: Sequence[Image]) -> tuple[int, int, int]:
-    """Return the factors by which images are shrunk in the three rounds."""
-    heights = [int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height for x in images]
-    coarse = max(1, round(max(heights) / COARSE_PX))
-    return coarse, round(math.sqrt(coarse)), 1

@@ -14,18 +14,15 @@ from torch import Tensor
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
-from dyngs.human.motion.clip import MotionClip
-from dyngs.human.pose.nearest_rotation import nearest_rotations
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 from dyngs.ops.posing import pose_by_joints
-from dyngs.ops.quaternions import rotation_matrices
+from dyngs.ops.quaternions import quats_of, rotation_matrices
 from dyngs.state import fields_moved_to
 
-LEFT_OUT = "the learned light is left out: colours are those in even light"
-"""Message of files that cannot hold it."""
-TERMS = 8
-"""Number of harmonics of degree 1 and 2; degree 0 is the colour itself."""
+LEFT_OUT = "the learned light is left out: colours are those in even light"  # message of files that cannot hold it
+TERMS = 8  # number of harmonics of degree 1 and 2; degree 0 is the colour itself
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,8 @@ class PoseBlendShapes:
 
         ``rotations`` (J, 3, 3) are relative to the parent joints.
         """
-        at_vertices = (_pose_features(rotations)[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
+        features = rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
+        at_vertices = (features[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
         around = self.faces.index_select(0, anchors.face)
         parts = at_vertices.index_select(0, around.flatten()).unflatten(0, (-1, 3))
         return (anchors.barycentric[..., None] * parts).sum(1)
@@ -127,15 +125,16 @@ def pose_gaussians(
     """Return the N Gaussians in a pose, in the world; differentiable in all arguments.
 
     x' = s T x + t with T = sum_j w_j A_j (Loper et al. 2015); covariances under the same linear map, exactly. Harmonics
-    of degree 1 are rotated by the nearest rotation of T, so that colours turn with the body. Gaussians are at rest, m,
-    of SH degree 0 or 1; ``weights`` (N, J) skin them; ``offsets`` (N, 3), m, are added to the means at rest.
+    of degree 1 are rotated as their joints are (``blended_rotations``), so that colours turn with the body. Gaussians
+    are at rest, m, of SH degree 0 or 1; ``weights`` (N, J) skin them; ``offsets`` (N, 3), m, are added to the means at
+    rest.
     """
     moves = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
     world = torch.cat([posing.scale * moves[..., :3], posing.scale * moves[..., 3:] + posing.trans[:, None]], dim=-1)
     means = gaussians.means if offsets is None else gaussians.means + offsets
     moved = pose_by_joints(means, gaussians.quats, gaussians.log_scales, weights, world)
     linear = moved.transforms[..., :3]
-    sh = gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, nearest_rotations(linear))
+    sh = gaussians.sh if gaussians.sh.shape[1] == 1 else rotate_sh(gaussians.sh, blended_rotations(weights, moves))
     return Gaussians(
         means=moved.means,
         quats=moved.quats,
@@ -145,14 +144,19 @@ def pose_gaussians(
     )
 
 
+def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
+    """Return the rotations (N, 3, 3) of joints (J, 3, 4) blended by ``weights`` (N, J), as quaternions; differentiable.
+
+    Each has the sign in which it is nearer to that of the heaviest joint: their sum never vanishes.
+    """
+    quats = quats_of(transforms[..., :3])
+    signs = torch.where(quats @ quats.T < 0, -1.0, 1.0).to(weights)
+    return rotation_matrices((weights * signs[weights.argmax(1)]) @ quats)
+
+
 def rest_offsets(anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None) -> Tensor | None:
     """Return the pose-dependent offsets (N, 3) at rest, m; None where the template has none."""
     return None if shapes is None else shapes.offsets(anchors, posing.rotations)
-
-
-def _pose_features(rotations: Tensor) -> Tensor:
-    """Return rotations (J, 3, 3) minus the identity."""
-    return rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
 
 
 def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:

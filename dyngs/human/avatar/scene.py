@@ -31,7 +31,7 @@ from dyngs.human.avatar.posing import (
     pose_gaussians,
     rest_offsets,
 )
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import check_tree
 from dyngs.human.template.joints import SMPLX_ROWS
 from dyngs.models.renderable import Renderable, clamped_time
@@ -62,7 +62,10 @@ class HumanScene(Scene):
         anchors = Anchors(**{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)})
         clip = MotionClip(*(tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
-        own = part_of(tensors, "learned")
+        own, shapes = part_of(tensors, "learned"), None
+        if "shapes.directions" in tensors:
+            require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
+            shapes = PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
         learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
@@ -70,7 +73,7 @@ class HumanScene(Scene):
             skeleton=skeleton,
             clip=clip,
             learned=learned,
-            shapes=stored_shapes(tensors),
+            shapes=shapes,
         )
 
     @property
@@ -221,14 +224,6 @@ def avatar_of(scene: Renderable) -> HumanScene | None:
     return scene if isinstance(scene, HumanScene) else None
 
 
-def stored_shapes(tensors: Mapping[str, Tensor]) -> PoseBlendShapes | None:
-    """Return the pose blend shapes of a state, if there are any."""
-    if "shapes.directions" not in tensors:
-        return None
-    require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
-    return PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
-
-
 _MOST_FACES = 2**31
 
 
@@ -246,8 +241,12 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     require_positive("clip.scale", state["clip.scale"])
     if not f:
         raise ValueError("the clip has no frame")
-    prefix = "anchors."
-    require_anchors({name.removeprefix(prefix): x for name, x in state.items() if name.startswith(prefix)}, n, j)
+    k = state["anchors.weights"].shape[-1]
+    shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
+    for name, shape in shapes.items():
+        require_tensor(f"anchors.{name}", state[f"anchors.{name}"], shape)
+    require_indices("anchors.joints", state["anchors.joints"], (n, k), j)
+    require_indices("anchors.face", state["anchors.face"], (n,), _MOST_FACES)
     if bool((state["anchors.weights"] < 0).any()) or not bool((state["anchors.weights"].sum(1) > 0).all()):
         raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
     require_tensor("learned.weights", state["learned.weights"], tuple(state["anchors.weights"].shape))
@@ -267,16 +266,6 @@ def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: in
     if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
         raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
     check_tree(tuple(parents.tolist()))
-
-
-def require_anchors(anchors: Mapping[str, Tensor], num_gaussians: int, num_joints: int) -> None:
-    """Check the anchors of N Gaussians on J joints. Raises KeyError or ValueError."""
-    n, k = num_gaussians, anchors["weights"].shape[-1]
-    shapes = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
-    for name, shape in shapes.items():
-        require_tensor(f"anchors.{name}", anchors[name], shape)
-    require_indices("anchors.joints", anchors["joints"], (n, k), num_joints)
-    require_indices("anchors.face", anchors["face"], (n,), _MOST_FACES)
 
 
 def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:

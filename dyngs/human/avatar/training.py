@@ -30,12 +30,9 @@ NEIGHBOURS = 5
 FRAMES_FROM = 0.25
 """Fraction of the run after which poses of single frames are learned: what all frames share comes first."""
 CENTIMETRE = 0.01
-SIDES_WEIGHT = 0.1
-"""Of the squared difference between colours of both sides, where light is learned, in the loss."""
-LOOKS = 100
-"""Number of training views, at most, in which it is counted how much they show of each Gaussian."""
-WORTH_TELLING = 0.01
-"""Least fraction of Gaussians that are hardly seen at which a line says so."""
+SIDES_WEIGHT = 0.1  # of the squared difference between colours of both sides, where light is learned, in the loss
+LOOKS = 100  # number of training views, at most, in which it is counted how much they show of each Gaussian
+WORTH_TELLING = 0.01  # least fraction of Gaussians that are hardly seen at which a line says so
 
 
 class HumanTraining(SceneTraining[HumanScene]):

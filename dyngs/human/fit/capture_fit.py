@@ -11,34 +11,38 @@ from torch import Tensor
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.body_frames import numbered
-from dyngs.data.capture import Capture, View
+from dyngs.data.capture import Capture, Split, View
 from dyngs.data.loader import ImageLoader
 from dyngs.errors import DyngsError
 from dyngs.gaussians.parameters import Parameters
-from dyngs.human.fit.joints3d import Joints3D
-from dyngs.human.fit.keypoints import Keypoints
-from dyngs.human.fit.lens_fit import LensFit, fit_lens
-from dyngs.human.fit.lens_fit import num_ticks as num_lens_ticks
+from dyngs.human.fit.keypoints import Joints3D, Keypoints
 from dyngs.human.fit.silhouettes import ObservedFrame, longest_box_side, observed_frame, surface_of
-from dyngs.human.fit.solve import FRAMES, BodyFit, Fitting, body_fit, drawn_frame, near_given, new_fit, usual
+from dyngs.human.fit.solve import (
+    FRAMES,
+    BodyFit,
+    Fitting,
+    LensFit,
+    body_fit,
+    drawn_frame,
+    fit_lens,
+    near_given,
+    new_fit,
+    usual,
+)
 from dyngs.human.fit.start import first_poses, num_ticks
-from dyngs.human.motion.clip import CapturedMotion, MotionClip, captured_motion
+from dyngs.human.motion.motion import CapturedMotion, MotionClip, captured_motion
 from dyngs.human.template.body import BodyTemplate
 
-IMAGE_SIDE = 512
-"""Longest side of the images that are read, px."""
-RESOLUTION = 48
-"""Texels per side of the atlas whose discs are drawn."""
-MOST_VIEWS = 8
-"""Views of one frame that are looked at."""
+IMAGE_SIDE = 512  # longest side of the images that are read, px
+RESOLUTION = 48  # texels per side of the atlas whose discs are drawn
+MOST_VIEWS = 8  # views of one frame that are looked at
 GAIN, GAIN_OF_SHAPE = 0.01, 0.03
 """Gain of IoU for which more is learned, and for which given poses are touched at all.
 
 Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another shape explains thick
 clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
-SHAPE = ("log_scale", "betas", "padding", "offset", "shift")
-"""What is the same in all frames."""
+SHAPE = ("log_scale", "betas", "padding", "offset", "shift")  # what is the same in all frames
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ class FitEffort:
 class Known:
     """What is known beside images and given poses."""
 
-    joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.joints3d``; None without
+    joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.keypoints``; None without
     # the capture is one camera that stands at the origin, with a guessed focal length to be refined
     guessed_lens: bool = False
     shape: bool = False  # the body has the shape of the person already
@@ -68,9 +72,6 @@ class Known:
         """Names of what is learned for all frames; one camera does not tell a small person from a distant one."""
         fixed = ("log_scale",) * self.guessed_lens + ("betas",) * self.shape
         return tuple(name for name in SHAPE if name not in fixed)
-
-
-NOTHING_KNOWN = Known()
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def fit_capture(
     report: ReportProgress,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
-    known: Known = NOTHING_KNOWN,
+    known: Known = Known(),
 ) -> CaptureFit:
     """Return the fit of ``body`` to the silhouettes of a capture's training views.
 
@@ -144,9 +145,8 @@ def fit_capture(
     )
     seen, surface = look_at(capture, motion, options, effort, keypoints or {}), surface_of(body, RESOLUTION)
     joints = known.joints
-    seen = (
-        seen if joints is None else seen.with_positions({motion.rows[x]: joints[x] for x in motion.rows if x in joints})
-    )
+    if joints is not None:
+        seen = seen.with_positions({row: joints[frame] for frame, row in motion.rows.items() if frame in joints})
     if given:
         fitting = Fitting(motion.clip, surface, near_given(motion.clip))
         tried = _from_given(fitting, seen, known.learned, report, effort)
@@ -159,7 +159,7 @@ def fit_capture(
     lens = None
     if known.guessed_lens:
         fitting, steps = replace(fitting, expected=usual(motion.clip)), effort.steps_for(motion.clip)
-        tick = ticker("focal length", report, num_lens_ticks(steps))
+        tick = ticker("focal length", report, 5 * steps)
         refined, lens = fit_lens(fitting, tried[-1].learned, known.learned, seen.used.__getitem__, steps, tick)
         if lens.taken:
             tried = (*tried, measured("the focal length refined", refined, fitting, seen))
@@ -249,7 +249,6 @@ def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], po
 def _from_given(
     fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[TriedFit, ...]:
-    """Return the poses as given, with a fitted shape, and with fitted poses."""
     start = new_fit(fitting.clip, fitting.surface)
     tick, full = ticker("shape", report, 4 * effort.steps), seen.used.__getitem__
     # Clothes and hair are no sign of wrong poses.
@@ -270,7 +269,6 @@ def _from_given(
 def _from_silhouettes(
     fitting: Fitting, seen: Seen, shape: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[TriedFit, ...]:
-    """Return the poses as they were found first, and shape and poses fitted together."""
     start, steps = new_fit(fitting.clip, fitting.surface), effort.steps_for(fitting.clip)
     tick, found = ticker("shape", report, 2 * steps), start
     first = measured("poses found frame by frame", start, fitting, seen)
@@ -296,17 +294,106 @@ def measured(name: str, learned: Parameters, fitting: Fitting, seen: Seen) -> Tr
     """Return the candidate with its IoU in the frames that judge."""
     found = []
     for row, frame in seen.judged.items():
+        found.append(torch.zeros(0, device="cpu"))
         if frame is not None:
             drawn = drawn_frame(learned, fitting.clip, fitting.surface, row, frame.cameras)
-            found.append(_iou(drawn, frame))
-        else:
-            found.append(torch.zeros(0, device="cpu"))
+            ours, theirs, known = drawn > 0.5, frame.alpha > 0.5, frame.known > 0
+            both, either = (ours & theirs & known), ((ours | theirs) & known)
+            found[-1] = both.sum((1, 2)) / either.sum((1, 2)).clamp_min(1)
     per_frame = tuple(float(x.mean()) if len(x) else float("nan") for x in found)
     return TriedFit(name, learned, float(torch.cat(found).mean()), per_frame)
 
 
-def _iou(drawn: Tensor, seen: ObservedFrame) -> Tensor:
-    """Return the IoU (V,) of coverages above a half, where images are known."""
-    known = seen.known > 0
-    ours, theirs = (drawn > 0.5) & known, (seen.alpha > 0.5) & known
-    return (ours & theirs).sum((1, 2)) / (ours | theirs).sum((1, 2)).clamp_min(1)
+_CLEARLY = 0.001  # gain of IoU for which the clip is moved
+
+
+@dataclass(frozen=True)
+class NewClip:
+    """Another clip of a fitted person."""
+
+    motion: CapturedMotion  # its poses as given
+    shift: Tensor  # (3,) to add to its translations, in the unit of the world, in place of that of the fit
+    iou: float  # with the shift of the fit
+    iou_moved: float | None  # with that of the clip itself; None where that was not taken
+
+    def summary(self) -> str:
+        """Return a line for people."""
+        if self.iou_moved is None:
+            return f"new poses: at the place of the fit; overlap of silhouettes {self.iou:.3f}"
+        return f"new poses: moved to their silhouettes; overlap {self.iou:.3f} -> {self.iou_moved:.3f}"
+
+
+def placed_clip(
+    capture: Capture,
+    options: DataConfig,
+    body: BodyTemplate,
+    found: CaptureFit,
+    report: ReportProgress,
+    effort: FitEffort = FitEffort(),
+) -> NewClip | None:
+    """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without such a clip.
+
+    All views of ``capture`` have frame numbers; ``found`` is the fit of those of training.
+    """
+    views = capture.splits.get("pose", ())
+    if not views or capture.body is None:
+        return None
+    motion = captured_motion(capture.root, capture.body["pose"], views, body.joints)
+    surface = surface_of(body, RESOLUTION)
+    seen = look_at(capture.replace(splits={"train": views}), motion, options, effort, {})
+    start = new_fit(motion.clip, surface)
+    with torch.no_grad():
+        for name, value in found.chosen.learned.values().items():
+            if name not in ("poses", "trans"):
+                start[name].copy_(value)
+    name = "place of new poses"
+    tick = ticker(name, report, effort.steps)
+    fitting = Fitting(motion.clip, surface, near_given(motion.clip))
+    moved = fitting.run(start, ("shift",), effort.steps, seen.used.__getitem__, tick)
+    before, after = (measured(name, x, fitting, seen) for x in (start, moved))
+    better = after.iou > before.iou + _CLEARLY
+    shift = (moved if better else start)["shift"].detach()
+    return NewClip(motion, shift, before.iou, after.iou if better else None)
+
+
+def fitted_clips(
+    capture: Capture, body: BodyTemplate, found: CaptureFit, new_poses: NewClip | None
+) -> dict[Split, CapturedMotion]:
+    """Return the clip of training, with the frames of val and test, and that of ``pose``, if the capture has one.
+
+    Frames that were not fitted have what holds for all frames applied to their given poses; without given poses they
+    lie between their neighbours. All views of ``capture`` have frame numbers; ``new_poses`` is the clip of ``pose``.
+    """
+    clips: dict[Split, CapturedMotion] = {"train": _of_training(capture, body, found)}
+    if new_poses is not None:
+        fit = replace(found.fit, shift=new_poses.shift)
+        clips["pose"] = CapturedMotion(fit.applied(_expanded(new_poses.motion)), new_poses.motion.frames)
+    return clips
+
+
+def _of_training(capture: Capture, body: BodyTemplate, found: CaptureFit) -> CapturedMotion:
+    fitted = replace(found.motion, clip=found.fit.fitted(found.motion.clip))
+    known, rows = _expanded(fitted), fitted.rows
+    views = [view for split in ("train", "val", "test") for view in capture.splits.get(split, ())]
+    times = {-1 if view.frame is None else view.frame: view.time for view in views}
+    frames = tuple(sorted(times))
+    if capture.body is not None:
+        motion = captured_motion(capture.root, capture.body["train"], views, body.joints)
+        others, at = found.fit.applied(motion.clip), motion.rows
+        parts = [known.select(_row(rows[f])) if f in rows else others.select(_row(at[f])) for f in frames]
+    else:
+        parts = [known.select(_row(rows[f])) if f in rows else fitted.clip.at(times[f]) for f in frames]
+    tensors = {
+        name: torch.cat([getattr(part, name) for part in parts]) for name in ("times", "poses", "trans", "scale")
+    }
+    return CapturedMotion(MotionClip(**tensors), frames)
+
+
+def _expanded(motion: CapturedMotion) -> MotionClip:
+    """Return a clip with a row for every frame, also of who never moves."""
+    rows = motion.rows
+    return motion.clip.select(torch.tensor([rows[frame] for frame in motion.frames], device="cpu"))
+
+
+def _row(row: int) -> torch.Tensor:
+    return torch.tensor([row], device="cpu")

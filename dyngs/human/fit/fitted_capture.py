@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.capture.background import with_background_masks
+from dyngs.capture.fixed_camera import FORMAT, is_plain_clip, read_fixed_camera, silhouettes_of, zoomed
 from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
@@ -22,27 +24,98 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import read_capture
+from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted, reading
 from dyngs.files.outputs import require_new_folder
 from dyngs.files.temporary import cache_folder, temporary_folder_beside
 from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
-from dyngs.human.fit.capture_fit import CaptureFit, Known, fit_capture
-from dyngs.human.fit.clips import NewClip, fitted_clips, placed_clip
-from dyngs.human.fit.inputs import NOTHING_ELSE, FitInputs, has_guessed_lens, read_person, with_lens
-from dyngs.human.fit.joints3d import read_joints
-from dyngs.human.fit.keypoints import read_keypoints
-from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.fit.capture_fit import CaptureFit, Known, NewClip, fit_capture, fitted_clips, placed_clip
+from dyngs.human.fit.keypoints import read_joints, read_keypoints
+from dyngs.human.fit.known_person import AvatarPoses, KnownAvatar, known_shape, posed_by_avatar, shape_of, with_shape
 from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
-from dyngs.human.motion.clip import CapturedMotion
+from dyngs.human.fit.solve import LensFit
+from dyngs.human.motion.motion import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
 
-FRAME_RATE = 30.0
-"""Frames per second of a clip whose capture does not say."""
+_LOOKED_AT, _PRESENT = 128, 0.2
+"""Longest side of the images in which somebody is looked for, and the least fraction of the usual area that counts."""
+
+
+@dataclass(frozen=True)
+class FitInputs:
+    """What is given beside the capture; everything may be None."""
+
+    keypoints: Path | None = None  # folder or file of 2D key points
+    masks: Path | None = None  # folder of masks, white = the person
+    background: Path | None = None  # image of the place without the person, or a folder of one for each camera
+    joints: Path | None = None  # file or folder of 3D joints or posed vertices, see ``read_joints``
+    body: Path | None = None  # body file whose vertices these are; None: the free template
+    person: Path | None = None  # capture or run of the same person, whose shape is kept
+    # of the same person, if that run has one: its silhouette decides the poses in the end
+    avatar: KnownAvatar | None = None
+
+
+def has_guessed_lens(capture: Capture) -> bool:
+    """Whether the camera of a capture was guessed."""
+    return capture.format == FORMAT
+
+
+def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = print) -> Capture:
+    """Return a capture with silhouettes: of a capture, or a video or a folder of images of one fixed camera.
+
+    Masks of ``given`` take the place of those of the capture; without any they are made from the background, in the
+    folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and none that can be made.
+    """
+    source = options.root
+    if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
+        capture = read_fixed_camera(options, given.masks)
+        for line in capture.warnings:
+            say(line)
+    else:
+        capture = read_capture(options)
+        if given.masks is not None:
+            splits: dict[Split, tuple[View, ...]] = {}
+            for split, views in capture.splits.items():
+                found = silhouettes_of(given.masks, [f"{view.name}{view.image_path.suffix}" for view in views])
+                splits[split] = tuple(replace(view, silhouette=own) for view, own in zip(views, found, strict=True))
+            capture = capture.replace(splits=splits, has_alpha=True)
+    if given.background is not None or not capture.has_alpha:
+        if capture.format == "neuman":
+            raise DyngsError(f"{source}: no silhouettes, and the camera moves; add masks of the person")
+        capture = with_background_masks(capture, work, given.background, say)
+    return _without_empty_frames(capture, options, say) if has_guessed_lens(capture) else capture
+
+
+def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
+    """Return the capture with the focal length that was found."""
+    if lens is None or not lens.taken:
+        return capture
+    splits = {
+        name: tuple(zoomed(view, lens.factor, lens.distance) for view in views)
+        for name, views in capture.splits.items()
+    }
+    return capture.replace(splits=splits)
+
+
+def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[str], None]) -> Capture:
+    views = capture.splits["train"]
+    small = ImageLoader(views, options.model_copy(update={"longest_side": _LOOKED_AT, "downscale": 1}))
+    areas = [0.0 if (alpha := small[i].alpha) is None else float(alpha.mean()) for i in range(len(views))]
+    usual = sorted(areas)[len(areas) * 3 // 4]
+    kept = tuple(view for view, area in zip(views, areas, strict=True) if area > _PRESENT * usual)
+    if not kept:
+        raise DyngsError(f"{capture.root}: nobody is seen in the masks; white is the person")
+    if len(kept) < len(views):
+        gone = [view.name for view in views if view not in kept]
+        say(f"{len(gone)} frames in which hardly anybody is seen are left out, first {gone[0]}")
+    return capture.replace(splits={"train": kept})
+
+
+FRAME_RATE = 30.0  # frames per second of a clip whose capture does not say
 
 
 def write_body(
@@ -79,7 +152,8 @@ def write_split(
     for view, image in shown:
         row = rows[-1 if view.frame is None else view.frame]
         name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
-        write_image(out / name, _straight(image))
+        parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
+        write_image(out / name, straight_uint8(torch.cat(parts, dim=-1)).numpy())
         camera = image.cameras
         intrinsics = camera.intrinsics[0].double().numpy()
         pose = opengl_from_cam(view.cam_from_world).copy()
@@ -91,13 +165,7 @@ def write_split(
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
 
 
-def _straight(image: Image) -> np.ndarray:
-    parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
-    return straight_uint8(torch.cat(parts, dim=-1)).numpy()
-
-
-GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)
-"""Colours of the outlines: red and green."""
+GIVEN, FITTED = (0.9, 0.1, 0.1), (0.0, 0.7, 0.1)  # colours of the outlines: red and green
 
 
 @torch.no_grad()
@@ -111,7 +179,9 @@ def overlay(
     sheet = image.composite(torch.ones_like(image.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
     for betas, pose, colour in bodies:
         discs = surface.in_pose(betas, torch.zeros_like(surface.weights[:, 0]), pose)
-        sheet[_outline(drawn_silhouettes(discs, image.cameras)[0] > 0.5)] = sheet.new_tensor(colour)
+        inside = drawn_silhouettes(discs, image.cameras)[0] > 0.5
+        grown = torch.nn.functional.max_pool2d((~inside).float()[None, None], 3, 1, 1)[0, 0] > 0
+        sheet[inside & grown] = sheet.new_tensor(colour)
     return sheet.cpu().numpy()
 
 
@@ -124,12 +194,6 @@ def side_by_side(sheets: Sequence[np.ndarray], columns: int) -> np.ndarray:
         top, left = i // columns * height, i % columns * width
         whole[top : top + sheet.shape[0], left : left + sheet.shape[1]] = sheet
     return whole
-
-
-def _outline(inside: Tensor) -> Tensor:
-    """Return the pixels (H, W) inside whose neighbour is outside."""
-    grown = torch.nn.functional.max_pool2d((~inside).float()[None, None], 3, 1, 1)[0, 0] > 0
-    return inside & grown
 
 
 REPORT_NAME, OVERLAYS_NAME = "fit_report.json", "fit_overlays.png"
@@ -164,14 +228,13 @@ class FittedCapture:
 
 
 def write_fitted_capture(
-    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = NOTHING_ELSE, *, with_images: bool = True
+    options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = FitInputs(), *, with_images: bool = True
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
     Files: ``transforms_SPLIT.json`` and ``images/`` (without both it is for ``data.body``), ``body_train.npz``,
-    ``body_pose.npz`` for another clip whose poses were given by the same means, ``fit_report.json``, and
-    ``fit_overlays.png`` to look at. ``given`` is what is known beside the capture, see ``read_person``. Raises
-    DyngsError: see ``fit_capture``; ``out`` is not empty.
+    ``body_pose.npz`` for another clip, ``fit_report.json``, and ``fit_overlays.png`` to look at. Raises DyngsError: see
+    ``fit_capture``; ``out`` is not empty.
     """
     require_new_folder(out)
     person = None if given.person is None else known_shape(given.person)
@@ -197,9 +260,14 @@ def write_fitted_capture(
             by_avatar = {x: posed_by_avatar(given.avatar, capture.splits[x], options, clips[x]) for x in clips}
         clips |= {split: found_by.clip for split, found_by in by_avatar.items()}
         if with_images:
-            _write_images(folder, capture, options, clips)
-            for split, clip in clips.items():
-                clips[split] = replace(clip, frames=tuple(range(len(clip.frames))))
+            full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
+            for split, views in capture.splits.items():
+                if not views:
+                    continue
+                images, rows = ImageLoader(views, full), clips.get(split, clips["train"]).rows
+                shown = ((view, images[i]) for i, view in enumerate(views))
+                write_split(folder, split, shown, rows, capture.world_offset)
+            clips = {split: replace(clip, frames=tuple(range(len(clip.frames)))) for split, clip in clips.items()}
         for split, clip in clips.items():
             write_body(folder / f"body_{split}.npz", clip, found.fit.betas.numpy(), capture.world_offset, capture.fps)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
@@ -213,17 +281,7 @@ def write_fitted_capture(
     return FittedCapture(out, found, new_poses, tuple(by_avatar.values()))
 
 
-def _write_images(out: Path, capture: Capture, options: DataConfig, clips: Mapping[Split, CapturedMotion]) -> None:
-    full = options.model_copy(update={"longest_side": None, "downscale": 1, "body": None})
-    for split, views in capture.splits.items():
-        if views:
-            images, found = ImageLoader(views, full), clips["pose" if split == "pose" else "train"]
-            shown = ((view, images[i]) for i, view in enumerate(views))
-            write_split(out, split, shown, found.rows, capture.world_offset)
-
-
 def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:
-    """Return images of the training views with the body's outline as given (red) and as fitted (green)."""
     views = capture.splits["train"]
     images = ImageLoader(views, options.model_copy(update={"longest_side": _SHOWN_SIDE, "downscale": 1}))
     given, fitted, rows = found.motion.clip, found.fit.fitted(found.motion.clip), found.motion.rows
@@ -260,8 +318,7 @@ def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[Av
     }
 
 
-KEYPOINTS = "keypoints"
-"""Folder of a capture with key points of its images, as OpenPose writes them."""
+KEYPOINTS = "keypoints"  # folder of a capture with key points of its images, as OpenPose writes them
 _LARGEST = 100_000_000
 """Files of a capture larger than this many bytes, such as videos, are not what it says about bodies and cameras."""
 
@@ -275,9 +332,8 @@ def with_fitted_body(
 ) -> DataConfig:
     """Return the options with a fit of the free template to the capture; the same capture is fitted once.
 
-    Nothing is fitted where ``data.body`` names a fit, where the capture itself holds one, or without silhouettes.
-    ``only_if_needed``: nothing is fitted where the capture has body parameters. Raises DyngsError: neither body
-    parameters nor silhouettes.
+    Nothing is fitted where ``data.body`` names a fit, where the capture holds one, or without silhouettes; with
+    ``only_if_needed`` where it has body parameters. Raises DyngsError: neither body parameters nor silhouettes.
     """
     if data.body is not None:
         return data

@@ -19,8 +19,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted, reading
 from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.inputs import KnownAvatar
-from dyngs.human.motion.clip import CapturedMotion, MotionClip
+from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import rest_shape
 
@@ -63,10 +62,16 @@ def shape_of(body: BodyTemplate, known: BodyFrames) -> torch.Tensor:
 LONGEST_SIDE = 320
 """Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
 size, since its edges are those of its images."""
-CHECKED = 3
-"""Moments, at most, at which a view is left out to see what the fit is worth."""
-_FEWEST_VIEWS = 3
-"""Of a moment, so that one of them can be left out."""
+CHECKED = 3  # moments, at most, at which a view is left out to see what the fit is worth
+_FEWEST_VIEWS = 3  # of a moment, so that one of them can be left out
+
+
+@dataclass(frozen=True)
+class KnownAvatar:
+    """The avatar of a person, and the longest side of the images it was trained on, px; None: as they are."""
+
+    scene: HumanScene
+    longest_side: int | None
 
 
 @dataclass(frozen=True)
@@ -108,20 +113,16 @@ def posed_by_avatar(
     left_out, others = _left_out(shown)
     tested, images = ImageLoader(left_out or others, small), ImageLoader(others, small)
     scene = avatar.scene
-    players = [scene.playing(start.clip), scene.playing(_in_size(scene, start.clip))]
+    clip, size = start.clip, torch.full_like(start.clip.scale, float(scene.clip.scale.mean()))
+    pelvis = scene.skeleton.joints[0]  # stays where it is
+    in_size = replace(clip, scale=size, trans=clip.trans + (clip.scale - size)[:, None] * pelvis)
+    players = [scene.playing(clip), scene.playing(in_size)]
     tried = [(_overlap(_fitted(player, images), tested), player) for player in players]
     before, (after, best) = _overlap(players[0], tested), max(tried, key=lambda x: x[0])
-    clip = start.clip
     if after > before:
         found = _fitted(best, ImageLoader(shown, small)).played
         clip = clip if found is None else _with_rows(best.played or clip, found)
     return AvatarPoses(replace(start, clip=clip), before, after, len(left_out))
-
-
-def _in_size(avatar: HumanScene, clip: MotionClip) -> MotionClip:
-    """Return the clip of a person as large as in the clip of training, with the pelvis where it was."""
-    scale = torch.full_like(clip.scale, float(avatar.clip.scale.mean()))
-    return replace(clip, scale=scale, trans=clip.trans + (clip.scale - scale)[:, None] * avatar.skeleton.joints[0])
 
 
 def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:

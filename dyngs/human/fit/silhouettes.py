@@ -89,8 +89,7 @@ def drawn_silhouettes(discs: Gaussians, cameras: Cameras) -> Tensor:
     return render(discs, cameras, _OPTIONS).alpha
 
 
-_MARGIN = 1.25
-"""Side of the square over the longest side of the person's box."""
+_MARGIN = 1.25  # side of the square over the longest side of the person's box
 
 
 @dataclass(frozen=True)

@@ -18,19 +18,16 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, drawn_silhouettes
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import NUM_BONE_SHAPES
 from dyngs.human.template.joints import JOINT_NAMES
 
 NUM_TURNED = 22
 """Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
-_GIVEN = 0.05
-"""Expected error of given poses, rad."""
-_LIMIT = 3.0
-"""Standard deviations of usual poses beyond which joints would be dislocated."""
-_LEAST = 8.0
-"""Least spread, degrees: a few clips do not show how far a joint can go."""
+_GIVEN = 0.05  # expected error of given poses, rad
+_LIMIT = 3.0  # standard deviations of usual poses beyond which joints would be dislocated
+_LEAST = 8.0  # least spread, degrees: a few clips do not show how far a joint can go
 _DEGREES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "hip": ((-11, 1, -6), (23, 14, 7)),
     "knee": ((26, 0, 1), (22, 1, 0)),
@@ -96,15 +93,13 @@ LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e
 }
 """Learning rates at the first step; those of positions per metre of the person's unit."""
 LR_DECAY = 0.1
-BETAS_WEIGHT = BONES_WEIGHT = 1e-3
-"""Of the mean squared shape parameter, whose unit is the spread among adults."""
+BETAS_WEIGHT = BONES_WEIGHT = 1e-3  # of the mean squared shape parameter, whose unit is the spread among adults
 TURN, STEP = 0.25, 0.1
 """Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the next."""
 TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
 """Of their mean squares. What silhouettes do not show, such as a limb turned about itself, follows the noise of Adam's
 steps where these are much smaller: renders of new poses then lose 1 to 3 dB, while the silhouettes look as good."""
-LIMIT_WEIGHT = 2e-2
-"""Of the mean square of what lies beyond the limit of a joint, in standard deviations."""
+LIMIT_WEIGHT = 2e-2  # of the mean square of what lies beyond the limit of a joint, in standard deviations
 KEYPOINT, KEYPOINT_WEIGHT = 0.02, 0.1
 """Expected error of a key point, as a fraction of the square's side, and the weight of their robust mean."""
 PLACE, PLACE_WEIGHT = 0.03, 0.1
@@ -113,24 +108,21 @@ FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
 """Expected error of a guessed focal length, as a logarithm, and the weight of its square."""
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
-FRAMES = 3
-"""Frames drawn in each step."""
-Observations = Callable[[int], ObservedFrame | None]
-"""Returns what is seen in a row of the clip."""
+FRAMES = 3  # frames drawn in each step
+Observations = Callable[[int], ObservedFrame | None]  # returns what is seen in a row of the clip
 
 
 def new_fit(clip: MotionClip, surface: Surface) -> Parameters:
     """Return what is learned, all zero.
 
-    Tensors: ``betas`` (B,) shape parameters; ``log_scale`` (1,) natural logarithm of the factor on the given scale;
-    ``turns`` (22, 3) axis-angle, rad, rotations of the joints applied before those of the given poses, in all frames;
-    ``poses`` (F, 22, 3) the same per frame, added to ``turns``; ``shift`` (3,) added to the given translations, and
-    ``offset`` (3,) m in the frame of the pelvis; ``trans`` (F, 3) the same as ``shift`` per frame;
-    ``padding`` (P,) m between skin and silhouette: clothes and hair.
+    ``betas`` (B,) shape; ``log_scale`` (1,) of the factor on the scale; ``turns`` (22, 3) axis-angle, rad, applied
+    before the given rotations, in all frames; ``poses`` (F, 22, 3) the same per frame; ``shift`` (3,) added to the
+    translations, ``offset`` (3,) m in the frame of the pelvis; ``trans`` (F, 3) per frame; ``padding`` (P,) m between
+    skin and silhouette.
     """
     joints = surface.body.joints
     zeros = {
-        "log_scale": joints.new_zeros(()).reshape(1),
+        "log_scale": joints.new_zeros(1),
         "betas": joints.new_zeros(surface.shape_dirs.shape[-1]),
         "turns": joints.new_zeros(NUM_TURNED, 3),
         "poses": joints.new_zeros(len(clip), NUM_TURNED, 3),
@@ -334,3 +326,65 @@ def body_fit(learned: Parameters, joints: int) -> BodyFit:
     shared = SharedCorrection(padded(values["turns"]), float(values["log_scale"][0]))
     positions = (values["offset"], values["shift"])
     return BodyFit(values["betas"], shared, *positions, padded(values["poses"]), values["trans"])
+
+
+EVERY = 4  # each so many-th frame is left out: of those only poses are fitted
+GAIN = 0.01  # fraction by which the error on frames left out must fall for a refined focal length to be taken
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """A focal length that was tried."""
+
+    factor: float  # on the guessed focal length
+    distance: float  # from the camera at which the size in the images is kept, in units of the world
+    error: tuple[float, float]  # on the frames left out, with the focal length as guessed and as refined
+    taken: bool  # the refined one is better
+
+    def summary(self) -> str:
+        """Return a line for people."""
+        guessed, refined = self.error
+        return (
+            f"focal length: {self.factor:.2f} times the guess, error on frames left out {guessed:.4f} -> {refined:.4f}"
+            + (", taken" if self.taken else ": the guess stays, as the images do not tell")
+        )
+
+
+def fit_lens(
+    fitting: Fitting,
+    start: Parameters,
+    shape: Sequence[str],
+    observed: Observations,
+    steps: int,
+    tick: Callable[[], None] = lambda: None,
+) -> tuple[Parameters, LensFit]:
+    """Return the fit of shape, poses and focal length to the frames of one camera at the origin; ``start`` if it stays.
+
+    Both lenses are fitted to three of four frames; then poses of the other frames: where these agree better, the
+    refined one is taken. ``start`` was found with the guessed focal length; ``shape`` names what is the same in all
+    frames.
+    """
+    rows = list(range(len(fitting.clip)))
+    apart = rows[EVERY // 2 :: EVERY] or rows
+    rest = [row for row in rows if row not in apart] or rows
+    own = ("poses", "trans")
+
+    def run(start: Parameters, learned: Sequence[str], seen: Sequence[int]) -> Parameters:
+        return fitting.run(start, learned, steps, lambda row: observed(row) if row in seen else None, tick)
+
+    distance = float(-fitting.clip.trans[:, 2].mean())
+    guessed = run(start, (*shape, *own), rest)
+    refined = run(with_lens(start, distance), (*shape, *own, "log_focal"), rest)
+    both = [run(found, own, apart) for found in (guessed, refined)]
+    errors = (_mean_error(fitting, both[0], observed, apart), _mean_error(fitting, both[1], observed, apart))
+    taken = errors[1] < (1 - GAIN) * errors[0]
+    found = run(both[1], (*shape, *own, "log_focal"), rows) if taken else start
+    last = found if taken else refined
+    return found, LensFit(float(last["log_focal"].detach().exp()), distance, errors, taken)
+
+
+@torch.no_grad()
+def _mean_error(fitting: Fitting, learned: Parameters, observed: Observations, rows: Sequence[int]) -> float:
+    shown = [(row, seen) for row in rows if (seen := observed(row)) is not None]
+    errors = [float(frame_error(learned, fitting.clip, fitting.surface, row, seen)) for row, seen in shown]
+    return sum(errors) / max(len(errors), 1)

@@ -15,23 +15,12 @@ from dyngs.camera import Cameras
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.times import evenly_spaced
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface
-from dyngs.human.fit.solve import (
-    NUM_TURNED,
-    Fitting,
-    Observations,
-    frame_error,
-    new_fit,
-    prior,
-    usual,
-    usual_pose,
-)
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.fit.solve import NUM_TURNED, Fitting, Observations, frame_error, new_fit, prior, usual, usual_pose
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 
-NUM_HEADINGS = 8
-"""Directions that a person may face, all of which are tried in every anchor."""
-MOST_ANCHORS = 20
-"""Frames in which headings are tried."""
+NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor
+MOST_ANCHORS = 20  # frames in which headings are tried
 CHANGE_WEIGHT = 0.01
 """Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the square."""
 
@@ -84,14 +73,11 @@ OFF_COURSE = math.radians(30)
 """Rotation of the root away from the path of headings from which a frame is begun on that path instead."""
 ARMS = (((0, 0, -75), (0, 0, 0)), ((0, 0, 0), (0, 0, 0)), ((0, -30, -60), (0, -90, 0)))
 """Rotations of the left shoulder and elbow, degrees, that are tried: hanging, spread, bent forward."""
-_WITHOUT_PATH = 2
-"""Headings of the first frame from which clips without key points are followed without the path, too."""
+_WITHOUT_PATH = 2  # headings of the first frame from which clips without key points are followed without the path, too
 MOMENTUM = 0.8
 """Fraction of the last rotation that is expected again, so that legs which pass each other are not exchanged."""
-STATURE = 1.70
-"""Height of a person in a usual pose, m, where a single camera leaves it open."""
-PELVIS_FRACTION = 0.53
-"""Height of the pelvis, of that of the person."""
+STATURE = 1.70  # height of a person in a usual pose, m, where a single camera leaves it open
+PELVIS_FRACTION = 0.53  # height of the pelvis, of that of the person
 
 
 def first_poses(
@@ -99,11 +85,9 @@ def first_poses(
 ) -> MotionClip:
     """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row) alone.
 
-    In some frames, the anchors, every heading is tried; the likely path through them says which way the person faces
-    (``dyngs.human.fit.start``). Each frame starts from the pose of the one before, and where that has left the path
-    from the heading of the path: single frames would rather be explained by a twisted body. Without key points the path
-    may be that of somebody who faces the other way: clips that start with the best headings of the first frame and
-    never look at the path are compared with it. Raises ValueError: nobody is seen in the first frame.
+    In some frames, the anchors, every heading is tried; a likely path through them says which way the person faces.
+    Each frame starts from the pose of the one before, and where that has left the path from the path's heading. Without
+    key points clips that never look at the path are compared with it. Raises ValueError: nobody in the first frame.
     """
     seen = observed(0)
     if seen is None:
@@ -145,7 +129,6 @@ def _all_headings(
 
 
 def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
-    """Return the clip with another pose (J, 3) and translation (3,) in a frame."""
     poses, positions = clip.poses.clone(), clip.trans.clone()
     poses[row], positions[row] = pose, trans
     return replace(clip, poses=poses, trans=positions)

@@ -23,12 +23,13 @@ from dyngs.human.template.joints import SMPLX_ROWS
 _MODELS = {72: "smpl", 156: "smplh", 165: "smplx"}
 _PARTS = {"root_orient": 3, "pose_body": 63, "pose_jaw": 3, "pose_eye": 6, "pose_hand": 90}
 """Keys and widths of the parts of 165 numbers, in order; all after the second may be missing."""
-_NAMED = ("global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose", "left_hand_pose", "right_hand_pose")
-"""Keys of the same 165 numbers as the package smplx names its arguments."""
-_NAMED_WIDTHS = (3, 63, 3, 3, 3, 45, 45)
+_NAMED = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3} | {
+    "left_hand_pose": 45,
+    "right_hand_pose": 45,
+}
+"""The same as the package smplx names its arguments."""
 _RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate")
-_ANY_AXES = "any axes"
-"""Marks arrays of a file with the names of smplx: nobody says which way is up."""
+_ANY_AXES = "any axes"  # marks arrays of a file with the names of smplx: nobody says which way is up
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
@@ -36,20 +37,14 @@ def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
     """Read a motion of 55 joints, y up, in float32; joints that the file lacks do not rotate.
 
     Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
-    ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,) if known; ``scale`` (one or F) and ``up_axis`` ("y" or
-    "z") in files that dyngs or a fit wrote. The last two of SMPL's 24 joints, the hands, are left out. Or the names of
-    the package smplx, which most fits to videos have: ``global_orient``, ``body_pose`` and the like, ``transl``,
-    ``fps``.
+    ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,); ``scale`` (one or F) and ``up_axis`` in files of dyngs
+    or a fit. Or the names of the package smplx: ``global_orient``, ``body_pose`` and the like, ``transl``, ``fps``.
 
-    AMASS files are z up: unless ``up`` or the key ``up_axis`` says otherwise, a file is z up if it has no ``scale``.
-    Fits with the names of smplx have any axes: there, the one nearest to the mean up direction of the pelvis is up.
-    The rotation T from z up to y up moves every vertex v to T v: the root rotates about the pelvis J_0 of the shaped
-    body, hence R_0' = T R_0 and trans' = T (trans + s J_0) - s J_0.
-
-    A file without ``scale`` and ``up_axis`` was made for SMPL, SMPL-H or SMPL-X (told by its width). Shape parameters
-    that ``body`` lacks are left out. If ``body`` is of another family, all are set to zero and the lowest vertex of the
-    motion to y = 0, as the pelvis of the file's body is not known. Raises DyngsError: names the file and what is
-    missing or wrong.
+    AMASS files are z up: unless ``up`` or ``up_axis`` says otherwise, a file is z up if it has no ``scale``; with the
+    names of smplx the axis nearest to the mean up direction of the pelvis is up. The rotation T to y up moves every
+    vertex v to T v: R_0' = T R_0 about the pelvis J_0 of the shaped body, trans' = T (trans + s J_0) - s J_0. If
+    ``body`` is of another family than a file without ``scale`` and ``up_axis``, shape parameters are set to zero and
+    the lowest vertex to y = 0. Raises DyngsError: names the file and what is missing or wrong.
     """
     with reading(path):
         return _motion(path, _arrays(path), body, up)
@@ -98,9 +93,8 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: U
         pelvis = scale[:, None] * _pelvis(body, betas)
         poses[:, 0] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
         trans = (trans + pelvis) @ turn.T - pelvis
-    values = (torch.from_numpy(x).float() for x in (poses, trans, betas, scale))
-    poses, trans, betas, scale = values
-    motion = Motion(poses, trans, betas, _fps(path, arrays), scale)
+    tensors = [torch.from_numpy(x).float() for x in (poses, trans, betas, scale)]
+    motion = Motion(tensors[0], tensors[1], tensors[2], _fps(path, arrays), tensors[3])
     return place_on_floor(motion, body) if is_other_model else motion
 
 
@@ -117,24 +111,14 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 def _renamed(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the arrays of a file with the names of the package smplx under those of AMASS, with poses of 165."""
-    frames = len(np.atleast_1d(arrays["global_orient"]))
-    parts = []
-    for key, width in zip(_NAMED, _NAMED_WIDTHS, strict=True):
-        part = _numbers(path, arrays, key) if key in arrays or key == "body_pose" else np.zeros((frames, width))
-        part = part.reshape(len(part), -1) if part.ndim else part
-        if key == "body_pose" and part.shape == (frames, 69):
-            part = part[:, :63]  # SMPL's, whose last two joints are the hands
-        if part.shape != (frames, width):
-            advice = "; save axis-angles, hands with use_pca=False" if part.ndim == 2 else ""
-            raise DyngsError(f"{path}: '{key}' must be {frames} x {width} numbers, {_got(part)}{advice}")
-        parts.append(part)
-    rest = {key: x for key, x in arrays.items() if key not in _NAMED}
+    rest = {key: x for key, x in arrays.items() if key not in _NAMED} | {_ANY_AXES: np.ones(1)}
+    rest["poses"] = _joined(path, arrays, _NAMED)
     betas = rest.get("betas")
-    if betas is not None and betas.ndim == 2 and len(betas) == frames:
+    if betas is not None and betas.ndim == 2 and len(betas) == len(rest["poses"]):
         rest["betas"] = _numbers(path, arrays, "betas").mean(axis=0)  # of one person, fitted to each frame anew
     if "transl" in rest:
         rest["trans"] = rest.pop("transl")
-    return {**rest, "poses": np.concatenate(parts, axis=1), _ANY_AXES: np.ones(1)}
+    return rest
 
 
 def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
@@ -144,7 +128,7 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
         if flat.ndim != 2 or flat.shape[1] not in _MODELS:
             raise DyngsError(f"{path}: 'poses' must have 72, 156 or 165 numbers per frame, {_got(flat)}")
     else:
-        flat = _joined_parts(path, arrays)
+        flat = _joined(path, arrays, _PARTS)
     if not len(flat):
         raise DyngsError(f"{path}: has no frames")
     require_frame_count(path, len(flat), 55)
@@ -154,24 +138,29 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, int]:
     return poses, flat.shape[1]
 
 
-def _joined_parts(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
-    if missing:
+def _joined(path: Path, arrays: dict[str, np.ndarray], widths: dict[str, int]) -> np.ndarray:
+    """Return poses (F, 165) of parts by their widths; zero for those that lack, but for root and body."""
+    root, body = list(widths)[:2]
+    missing = [key for key in (root, body) if key not in arrays]
+    if missing and widths is _PARTS:
         raise DyngsError(
             f"{path}: has neither 'poses' nor '{missing[0]}' nor 'global_orient'; give an AMASS file of a motion"
         )
-    frames = len(np.atleast_1d(arrays["root_orient"]))
+    frames = len(np.atleast_1d(arrays[root]))
     parts = []
-    for key, width in _PARTS.items():
-        part = _numbers(path, arrays, key) if key in arrays else np.zeros((frames, width))
+    for key, width in widths.items():
+        part = _numbers(path, arrays, key) if key in arrays or key == body else np.zeros((frames, width))
+        if widths is _NAMED and part.ndim:
+            part = part.reshape(len(part), -1)
+            part = part[:, :63] if key == body and part.shape[1] == 69 else part  # SMPL's last two joints: the hands
         if part.shape != (frames, width):
-            raise DyngsError(f"{path}: '{key}' must be {frames} x {width} numbers, {_got(part)}")
+            advice = "; save axis-angles, hands with use_pca=False" if widths is _NAMED and part.ndim == 2 else ""
+            raise DyngsError(f"{path}: '{key}' must be {frames} x {width} numbers, {_got(part)}{advice}")
         parts.append(part)
     return np.concatenate(parts, axis=1)
 
 
 def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
-    """Return the finite float64 numbers at ``key``."""
     if key not in arrays:
         raise DyngsError(f"{path}: the key '{key}' is missing; give an AMASS file of a motion")
     value = arrays[key]
@@ -203,34 +192,22 @@ def _scale(path: Path, arrays: dict[str, np.ndarray], frames: int) -> np.ndarray
 def _y_up_from_file(path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray) -> np.ndarray | None:
     """Return the rotation (3, 3) to y up, None if there is nothing to turn.
 
-    By ``up``, the key ``up_axis``, as AMASS files are, or by rotations (F, 3) of the root.
+    By ``up``, the key ``up_axis``, as AMASS files are, or by rotations (F, 3) of the root: the signed axis nearest to
+    the mean up direction becomes y, by half a turn about x for -y.
     """
-    if up == "auto" and "up_axis" not in arrays and _ANY_AXES in arrays:
+    if up == "auto" and "up_axis" in arrays:
+        up = "z" if str(arrays["up_axis"]) == "z" else "y"
+        if str(arrays["up_axis"]) not in ("y", "z"):
+            raise DyngsError(f"{path}: 'up_axis' must be 'y' or 'z', not {str(arrays['up_axis'])!r:.20}")
+    elif up == "auto" and _ANY_AXES in arrays:
         mean = Rotation.from_rotvec(roots).as_matrix()[:, :, 1].mean(axis=0)
         axis = int(np.abs(mean).argmax())
-        found = np.eye(3)[axis] * (1.0 if mean[axis] >= 0 else -1.0)
-        return None if found[1] > 0 else _turn_to_y(found)
-    return _Y_UP_FROM_Z_UP if _is_z_up(path, arrays, up) else None
-
-
-def _turn_to_y(up: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) that takes a signed axis other than y to y; half a turn about x for -y."""
-    if up[1] < 0:
-        return np.diag([1.0, -1.0, -1.0])
-    across = np.cross(up, [0.0, 1.0, 0.0])
-    return Rotation.from_rotvec(np.pi / 2 * across).as_matrix()
-
-
-def _is_z_up(path: Path, arrays: dict[str, np.ndarray], up: UpAxis) -> bool:
-    """Return whether the file is z up: by ``up``, its key ``up_axis``, or as AMASS files are."""
-    if up != "auto":
-        return up == "z"
-    if "up_axis" not in arrays:
-        return "scale" not in arrays
-    said = str(arrays["up_axis"])
-    if said not in ("y", "z"):
-        raise DyngsError(f"{path}: 'up_axis' must be 'y' or 'z', not {said!r:.20}")
-    return said == "z"
+        if axis == 1:
+            return None if mean[1] >= 0 else np.diag([1.0, -1.0, -1.0])
+        across = np.cross(np.eye(3)[axis] * (1.0 if mean[axis] >= 0 else -1.0), [0.0, 1.0, 0.0])
+        return Rotation.from_rotvec(np.pi / 2 * across).as_matrix()
+    is_z_up = up == "z" or (up == "auto" and "scale" not in arrays)
+    return _Y_UP_FROM_Z_UP if is_z_up else None
 
 
 def _pelvis(body: BodyTemplate, betas: np.ndarray) -> np.ndarray:

@@ -21,8 +21,7 @@ from dyngs.human.motion.motion import SkeletonMotion, frame_chunks, require_fram
 _END_SITE = -1
 _MOST_JOINTS = 4096
 _LONGEST_NAME = 200
-_CHARACTERS = 1 << 16
-"""Characters of MOTION that are parsed at once."""
+_CHARACTERS = 1 << 16  # characters of MOTION that are parsed at once
 _GAP = re.compile(r"\s")
 _CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
 
@@ -91,7 +90,6 @@ def _halves(path: Path) -> tuple[str, str]:
 
 
 def _joints(path: Path, hierarchy: str) -> list[_Joint]:
-    """Return the joints, parents first."""
     joints: list[_Joint] = []
     without_offset: set[int] = set()
     blocks: list[int] = []  # joints with open braces, _END_SITE among them
@@ -120,10 +118,18 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
         elif word == "OFFSET" and inside == _END_SITE:
             continue
         elif word == "OFFSET" and inside is not None:
-            joints[inside].offset = _offset(path, joints[inside].name, words[1:])
+            offset = _numbers(path, words[1:])
+            if len(offset) != 3:
+                raise DyngsError(
+                    f"{path}: the OFFSET of '{joints[inside].name}' must be three numbers; export it again"
+                )
+            joints[inside].offset = offset
             without_offset.discard(inside)
         elif word == "CHANNELS" and inside is not None and inside >= 0:
-            joints[inside].channels = _channels(path, joints[inside].name, words[1:])
+            joints[inside].channels = channels = [word.lower() for word in words[2:]]
+            if words[1:2] != [str(len(channels))] or not set(channels) <= set(_CHANNELS):
+                what = "a count and so many of Xposition ... Zrotation"
+                raise DyngsError(f"{path}: the CHANNELS of '{joints[inside].name}' must be {what}")
         else:
             raise DyngsError(f"{path}: HIERARCHY: did not expect '{line.strip():.60}'; export it again")
     if not joints or blocks or announced is not None:
@@ -133,23 +139,7 @@ def _joints(path: Path, hierarchy: str) -> list[_Joint]:
     return joints
 
 
-def _offset(path: Path, name: str, words: list[str]) -> np.ndarray:
-    offset = _numbers(path, words)
-    if len(offset) != 3:
-        raise DyngsError(f"{path}: the OFFSET of '{name}' must be three numbers; export it again")
-    return offset
-
-
-def _channels(path: Path, name: str, words: list[str]) -> list[str]:
-    """Return the channels of a joint in lower case, in the order of the file."""
-    channels = [word.lower() for word in words[1:]]
-    if words[:1] != [str(len(channels))] or not set(channels) <= set(_CHANNELS):
-        raise DyngsError(f"{path}: the CHANNELS of '{name}' must be a count and so many of Xposition ... Zrotation")
-    return channels
-
-
 def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray, float]:
-    """Return the channels (F, C) of the frames, and frames per second."""
     header = re.match(r"\s*Frames\s*:\s*(\d{1,9})\s+Frame\s+Time\s*:\s*(\S+)", rows, re.IGNORECASE)
     if header is None:
         raise DyngsError(f"{path}: MOTION must begin with 'Frames: ' and 'Frame Time: '; export it again")
@@ -176,14 +166,12 @@ def _values(path: Path, rows: str, joints: Sequence[_Joint]) -> tuple[np.ndarray
 
 
 def _cut_off(path: Path, frames: int, channels: int, count: int) -> DyngsError:
-    """Return the error to raise for a file with another count of numbers than it says."""
     return DyngsError(
         f"{path}: says {frames} frames of {channels} numbers but holds {count} numbers; it may be cut off"
     )
 
 
 def _numbers(path: Path, words: list[str]) -> np.ndarray:
-    """Return the words as finite float64 numbers."""
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:

@@ -53,14 +53,12 @@ class _Rig:
 
 
 def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
-    """Read the motion of a file's joints at ``fps`` frames per second, from first to last key.
+    """Read the motion of a file's joints at ``fps`` frames per second, from first to last key; the world is y up.
 
-    The joints are those of the largest skin, and the rest pose is the bind pose, inverse(inverseBindMatrices), or
-    without these the nodes without animation. A file without a skin, as Mixamo exports "without skin", has the nodes
-    that are animated for joints, and must show a T-pose or an A-pose without animation. The world is that of the scene,
-    y up. The rotation of a joint is the product of those of its nodes: scale is left out. ``clip`` names the animation,
-    where several move the joints. Raises DyngsError: no such animation, anything broken or not supported (sparse
-    accessors, meshopt compression, mirrored nodes); names the file.
+    The joints are those of the largest skin, at rest in the bind pose, or without inverse bind matrices as the nodes
+    stand. Without a skin all animated nodes are joints, and must show a T-pose or an A-pose without animation. ``clip``
+    names the animation, where several move the joints. Raises DyngsError: no such animation, anything broken or not
+    supported (sparse accessors, meshopt compression, mirrored nodes); names the file.
     """
     with reading(path):
         file = GltfFile(path)
@@ -90,7 +88,6 @@ def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -
 
 
 def _skin(file: GltfFile) -> _Rig | None:
-    """Return the joints of the largest skin; None without skins."""
     if not file.document.skins:
         return None
     largest = max(file.document.skins, key=lambda skin: len(skin.joints))
@@ -118,7 +115,6 @@ def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
 
 
 def _motion(file: GltfFile, rig: _Rig, fps: float, animation: Animation) -> SkeletonMotion:
-    """Return the motion of the joints, in world rotations relative to the rest pose."""
     joints = rig.joints
     chain = _with_ancestors(file, joints)
     curves = _curves(file, animation, chain)
@@ -274,7 +270,6 @@ def _sampled(file: GltfFile, curve: _Curve, times: np.ndarray) -> np.ndarray:
 
 
 def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
-    """Return the rotations of quaternions (F, 4) xyzw of any length."""
     largest = np.abs(quats).max(axis=1, keepdims=True)
     if (largest == 0).any():
         raise file.error("a rotation is a quaternion of zeros; export it again")

@@ -9,13 +9,11 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from dyngs.human.motion.clip import MotionClip
-from dyngs.human.motion.motion import Motion, frame_chunks
+from dyngs.human.motion.motion import Motion, MotionClip, frame_chunks
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 
-_ALONG_AXIS = 0.87
-"""Cosine of 30 degrees: how near to the up direction a world axis must be to replace it."""
+_ALONG_AXIS = 0.87  # cosine of 30 degrees: how near to the up direction a world axis must be to replace it
 
 
 def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> MotionClip:
@@ -31,7 +29,7 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
     poses = torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1)
     pelvis = clip.scale[:, None] * joints[0]
     moved = MotionClip(clip.times, poses, unit * ((clip.trans + pelvis) @ rotation.T - pelvis), unit * clip.scale)
-    ours, theirs = (_joint_places(x, joints, parents) for x in (moved, like))
+    ours, theirs = (_joints_of(x, joints, parents) for x in (moved, like))
     shift = theirs[:, 0].mean(0) - ours[:, 0].mean(0)
     rise = (theirs @ up).amin() - (ours @ up).amin()
     return replace(moved, trans=moved.trans + shift + (rise - shift @ up) * up)
@@ -88,8 +86,7 @@ def _axis_angle(rotations: Tensor) -> Tensor:
     return torch.from_numpy(Rotation.from_matrix(rotations.double().cpu().numpy()).as_rotvec()).to(rotations)
 
 
-def _joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
-    """Return the joints (F, J, 3) in the world."""
+def _joints_of(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
     moved = apply_transforms(joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses)), joints)
     return clip.scale[:, None, None] * moved + clip.trans[:, None]
 

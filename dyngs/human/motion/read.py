@@ -15,8 +15,7 @@ from dyngs.human.template.body_reader import default_template
 
 _KINDS = {".npz": "an AMASS or SMPL-X .npz", ".bvh": "a .bvh", ".glb": "a .glb", ".gltf": "a .gltf", ".vrma": "a .vrma"}
 """Names of the formats by suffix."""
-_GLTF_FPS = 30.0
-"""Frames per second at which glTF's curves are sampled unless another rate is requested."""
+_GLTF_FPS = 30.0  # frames per second at which glTF's curves are sampled unless another rate is requested
 
 
 def read_motion(
@@ -24,10 +23,9 @@ def read_motion(
 ) -> Motion:
     """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``, ``.gltf`` or ``.vrma``.
 
-    The motion of another skeleton is retargeted to ``body`` (None: the default template), with the lowest vertex at
-    y = 0. Without ``fps`` it has the frame rate of the file, 30 for glTF. ``up`` is the up axis of an ``.npz``, see
-    ``read_amass``; ``clip`` names the animation of a glTF file, where there are several. Raises DyngsError: names the
-    file and what is wrong with it.
+    Other skeletons are retargeted to ``body`` (None: the default template), with the lowest vertex at y = 0. Without
+    ``fps`` it has the frame rate of the file, 30 for glTF. ``up``: see ``read_amass``; ``clip`` names the animation of
+    a glTF file. Raises DyngsError: names the file and what is wrong with it.
     """
     path, suffix = Path(path), Path(path).suffix.lower()
     if suffix not in _KINDS:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,97 +27,63 @@ _OURS = (
 """Names of SMPL-X; ``*`` stands for left and right, ``#`` for 1, 2 and 3."""
 
 
-@dataclass(frozen=True)
-class RigNames:
-    """The joint names of one kind of skeleton, in lower case and without punctuation."""
+_SMPL = "pelvis spine1 spine2 spine3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle"
+_MIXAMO = "*shoulder *arm *forearm *hand *upleg *leg *foot *toebase|*toe"
+_RIGS = f"""
+SMPL-X | left right | 1 2 3
+    {_SMPL} *foot *index# *middle# *pinky# *ring# *thumb# jaw *eye|*eyesmplhf
+SMPL | l r | 1 2 3
+    {_SMPL} *foot|*toe
+Mixamo | left right | 1 2 3
+    hips spine spine1 spine4|spine3|spine2 neck head {_MIXAMO}
+    *handindex# *handmiddle# *handpinky# *handring# *handthumb#
+VRM | left right | proximal intermediate distal
+    hips spine chest upperchest neck head *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot *toes
+    *index# *middle# *little# *ring# *thumb# jaw *eye
+VRoid | l r | 1 2 3
+    chips cspine cchest cupperchest cneck chead *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot *toebase
+    *index# *middle# *little# *ring# *thumb#
+CMU | left right | 1 2 3
+    hips lowerback spine spine1 neck head {_MIXAMO}
+Poser | left right | 1 2 3
+    hips chest chest2 chest4|chest3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle *toe
+DAZ | l r | 1 2 3
+    hip abdomen chest - neck head *collar *shldr *forearm *hand *thigh *shin *foot *toe
+    *index# *mid# *pinky# *ring# *thumb#
+Biped | l r | _ 1 2
+    pelvis spine spine1 spine2 neck head *clavicle *upperarm *forearm *hand *thigh *calf *foot *toe0
+    *finger1# *finger2# *finger4# *finger3# *finger0#
+Unreal | l r | 01 02 03
+    pelvis spine01 spine02 spine05|spine04|spine03 neck01 head clavicle* upperarm* lowerarm* hand* thigh* calf* foot*
+    ball* index#* middle#* pinky#* ring#* thumb#*
+MakeHuman | l r | 1 2 3
+    hips spine1 spine2 spine3 neck head clavicle* uparm* loarm* hand* upleg* loleg* foot* toe*
+    index#* middle#* pinky#* ring#* thumb#*
+Anny | l r | 1 2 3
+    root spine04 spine03 spine02 neck01 head clavicle* upperarm01* lowerarm01* wrist* upperleg01* lowerleg01* foot*
+    toe11* finger2#* finger3#* finger5#* finger4#* finger1#*
+"""
+"""Joint names of each kind of skeleton, in lower case and without punctuation: the program or data set, what stands for
+``*`` (left and right) and for ``#`` (``_``: nothing), and a name for each word of ``_OURS``: ``a|b`` is a or b, ``-``
+none; words at the end may be missing. Rocketbox avatars use Biped, VALID avatars Mixamo, the cgspeed conversions of CMU
+either CMU or DAZ."""
 
-    name: str  # of the program or data set
-    sides: tuple[str, str]  # text for ``*``: left and right
-    words: str  # a name for each word of ``_OURS``; ``a|b`` is a or b, ``-`` none. Words at the end may be missing.
-    segments: tuple[str, str, str] = ("1", "2", "3")  # text for ``#``
 
-    def joints(self) -> Iterator[tuple[str, tuple[str, ...]]]:
-        """Yield each joint of SMPL-X with the names that it may have here."""
-        for ours, theirs in zip(_OURS.split(), self.words.split(), strict=False):
-            for our_side, side in zip(("left", "right"), self.sides, strict=True) if "*" in ours else [("", "")]:
-                for i, segment in enumerate(self.segments, 1) if "#" in ours else [("", "")]:
-                    names = theirs.replace("*", side).replace("#", segment).split("|")
-                    yield ours.replace("*", our_side).replace("#", str(i)), tuple(names)
+def _joints_of_rig(sides: str, segments: str, words: str) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield each joint of SMPL-X with the names that it may have in a row of ``_RIGS``."""
+    marks = segments.replace("_", "").split(" ")
+    for ours, theirs in zip(_OURS.split(), words.split(), strict=False):
+        for our_side, side in zip(("left", "right"), sides.split(), strict=True) if "*" in ours else [("", "")]:
+            for i, segment in enumerate(marks, 1) if "#" in ours else [("", "")]:
+                names = theirs.replace("*", side).replace("#", segment).split("|")
+                yield ours.replace("*", our_side).replace("#", str(i)), tuple(names)
 
 
-_MIXAMO_LIMBS = "*shoulder *arm *forearm *hand *upleg *leg *foot *toebase|*toe"
-RIGS = (
-    RigNames(
-        "SMPL-X",
-        ("left", "right"),
-        "pelvis spine1 spine2 spine3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle *foot "
-        "*index# *middle# *pinky# *ring# *thumb# jaw *eye|*eyesmplhf",
-    ),
-    RigNames(
-        "SMPL",
-        ("l", "r"),
-        "pelvis spine1 spine2 spine3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle *foot|*toe",
-    ),
-    RigNames(
-        "Mixamo",
-        ("left", "right"),
-        f"hips spine spine1 spine4|spine3|spine2 neck head {_MIXAMO_LIMBS} "
-        "*handindex# *handmiddle# *handpinky# *handring# *handthumb#",
-    ),
-    RigNames(
-        "VRM",
-        ("left", "right"),
-        "hips spine chest upperchest neck head *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot *toes "
-        "*index# *middle# *little# *ring# *thumb# jaw *eye",
-        ("proximal", "intermediate", "distal"),
-    ),
-    RigNames(
-        "VRoid",
-        ("l", "r"),
-        "chips cspine cchest cupperchest cneck chead *shoulder *upperarm *lowerarm *hand *upperleg *lowerleg *foot "
-        "*toebase *index# *middle# *little# *ring# *thumb#",
-    ),
-    RigNames("CMU", ("left", "right"), f"hips lowerback spine spine1 neck head {_MIXAMO_LIMBS}"),
-    RigNames(
-        "Poser",
-        ("left", "right"),
-        "hips chest chest2 chest4|chest3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle *toe",
-    ),
-    RigNames(
-        "DAZ",
-        ("l", "r"),
-        "hip abdomen chest - neck head *collar *shldr *forearm *hand *thigh *shin *foot *toe "
-        "*index# *mid# *pinky# *ring# *thumb#",
-    ),
-    RigNames(
-        "Biped",
-        ("l", "r"),
-        "pelvis spine spine1 spine2 neck head *clavicle *upperarm *forearm *hand *thigh *calf *foot *toe0 "
-        "*finger1# *finger2# *finger4# *finger3# *finger0#",
-        ("", "1", "2"),
-    ),
-    RigNames(
-        "Unreal",
-        ("l", "r"),
-        "pelvis spine01 spine02 spine05|spine04|spine03 neck01 head "
-        "clavicle* upperarm* lowerarm* hand* thigh* calf* foot* ball* index#* middle#* pinky#* ring#* thumb#*",
-        ("01", "02", "03"),
-    ),
-    RigNames(
-        "MakeHuman",
-        ("l", "r"),
-        "hips spine1 spine2 spine3 neck head clavicle* uparm* loarm* hand* upleg* loleg* foot* toe* "
-        "index#* middle#* pinky#* ring#* thumb#*",
-    ),
-    RigNames(
-        "Anny",
-        ("l", "r"),
-        "root spine04 spine03 spine02 neck01 head "
-        "clavicle* upperarm01* lowerarm01* wrist* upperleg01* lowerleg01* foot* toe11* "
-        "finger2#* finger3#* finger5#* finger4#* finger1#*",
-    ),
-)
-"""Rocketbox avatars use Biped, VALID avatars Mixamo, the cgspeed conversions of CMU either CMU or DAZ."""
+RIGS = {
+    name: dict(_joints_of_rig(sides, segments, words))
+    for name, sides, segments, words in re.findall(r"^(\S+) \| (.+) \| (.+)\n((?: .*\n)+)", _RIGS, re.MULTILINE)
+}
+"""The joints of SMPL-X, with the names that they may have, by the name of the rig."""
 _NEEDED = (
     "pelvis",
     *(f"{side}_{x}" for x in ("hip", "knee", "ankle", "shoulder", "elbow") for side in ("left", "right")),
@@ -134,20 +99,19 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
     """
     plain = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     best: dict[str, int] = {}
-    best_rig, best_rank = RIGS[0], (-1, -1)
-    for rig in RIGS:
-        wanted = dict(rig.joints())
+    best_rig, best_rank = "", (-1, -1)
+    for rig, wanted in RIGS.items():
         for prefix in _prefixes(plain, wanted["pelvis"]):
             found = _found(wanted, {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])})
             rank = (sum(name in found for name in _NEEDED), sum(name in found for name in JOINT_NAMES[:22]))
             if rank > best_rank:
                 best, best_rig, best_rank = found, rig, rank
-    wanted = dict(best_rig.joints())
+    wanted = RIGS[best_rig]
     missing = [" or ".join(wanted[name]) for name in _NEEDED if name not in best]
     if missing:
-        known = ", ".join(rig.name for rig in RIGS)
+        known = ", ".join(RIGS)
         raise DyngsError(
-            f"{path}: unknown joint names; compared with {best_rig.name}, the most similar rig, it lacks "
+            f"{path}: unknown joint names; compared with {best_rig}, the most similar rig, it lacks "
             f"{', '.join(missing)}; rename its joints (known rigs: {known})"
         )
     return best
@@ -181,22 +145,17 @@ _FOLLOWS = {f"{finger}{i}": f"{finger}{i - 1}" if i > 1 else "wrist" for finger 
     "wrist": "elbow",
 }
 """The joint whose alignment a joint of a limb takes if the end of its own bone is unknown."""
-_SNAP_COS = np.cos(np.radians(15.0))
-"""How near to an axis the left direction of a rest pose must be to be that axis."""
+_SNAP_COS = np.cos(np.radians(15.0))  # how near to an axis the left direction of a rest pose must be to be that axis
 
 
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     """Return the motion of ``source`` on ``body``: 55 joints, y up, float32, the rest pose facing +z.
 
-    The world rotation of joint b that corresponds to joint s of the source: G_b = N G_s M^T align(d_b, M d_s). Here d
-    are bone directions at rest, ``align`` is the smallest rotation from one to the other (limbs only; the identity for
-    spine, neck, head and collars), M maps the axes of the source's rest pose to ours (found from its hips, shoulders
-    and ankles) and N those of its world: the identity if that is y up, else M. Joints without a counterpart follow
-    their parents.
-
-    The pelvis follows the source's path times the ratio of leg lengths, so units of length do not matter; the motion is
-    then moved vertically so that its lowest vertex has y = 0. Raises DyngsError: unknown joint names, or a rest pose
-    that does not stand upright.
+    World rotations of joint b and of joint s of the source: G_b = N G_s M^T align(d_b, M d_s). ``align`` is the
+    smallest rotation between bone directions d at rest (of limbs; else the identity), M maps the axes of the source's
+    rest pose to ours (by hips, shoulders and ankles) and N those of its world: the identity if that is y up, else M.
+    The pelvis follows the source's path times the ratio of leg lengths; the lowest vertex is put to y = 0. Raises
+    DyngsError: unknown joint names, or a rest pose that does not stand upright.
     """
     found = match_joints(source.path, source.names)
     target_from_rest = _target_from_rest(source, found)
@@ -273,7 +232,6 @@ def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarr
 
 
 def _nearest_axis(direction: np.ndarray) -> np.ndarray:
-    """Return the signed unit axis (3,) nearest to a direction."""
     axis = np.zeros(3)
     i = int(np.abs(direction).argmax())
     axis[i] = 1.0 if direction[i] >= 0 else -1.0
@@ -308,7 +266,6 @@ def least_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def _leg_length(at: dict[str, np.ndarray]) -> float:
-    """Return the length of both thighs and shins together."""
     bones = (("hip", "knee"), ("knee", "ankle"))
     return sum(
         float(np.linalg.norm(at[f"{side}_{a}"] - at[f"{side}_{b}"])) for side in ("left", "right") for a, b in bones

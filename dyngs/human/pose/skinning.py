@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.ops.transfer import sent
+from dyngs.ops.device import sent
 
 
 def axis_angle_to_matrix(poses: Tensor) -> Tensor:
@@ -31,11 +31,9 @@ def axis_angle_to_matrix(poses: Tensor) -> Tensor:
 def joint_transforms(joints: Tensor, parents: tuple[int, ...], rotations: Tensor) -> Tensor:
     """Return the transforms ``posed_from_rest`` (..., J, 3, 4) of the joints; the identity in the rest pose.
 
-    A joint rotates its descendants about its rest position: A_j = A_parent(j) [R_j | J_j - R_j J_j], which is [G_R |
-    G_t - G_R J_j] of SMPL (Loper et al. 2015). Every round doubles the number of ancestors included (pointer jumping),
-    so that a chain of n joints takes log2(n) rounds instead of n. ``joints`` (..., J, 3) are at rest; ``rotations``
-    (..., J, 3, 3) relative to the parents, which come before their children, -1 for a root. Raises ValueError: a parent
-    that does not come before its child.
+    A_j = A_parent(j) [R_j | J_j - R_j J_j], which is [G_R | G_t - G_R J_j] of SMPL (Loper et al. 2015); every round
+    doubles the number of ancestors included. ``joints`` (..., J, 3) are at rest; ``rotations`` (..., J, 3, 3) relative
+    to the parents, -1 for a root. Raises ValueError: a parent that does not come before its child.
     """
     check_tree(parents)
     shifts = joints[..., None] - rotations @ joints[..., None]

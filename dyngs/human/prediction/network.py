@@ -91,14 +91,10 @@ def _upsampled(features: Tensor) -> Tensor:
     return nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
 
 
-_MAX_LOG_SCALE = 1.5
-"""Limit on the difference of log scales from those of the initial Gaussian."""
-_IMAGE_LOGIT = 4.0
-"""Logit of the weight of the images' colours in an untrained network, against predicted colours."""
-_GUESS_LOGITS = (0.0, 2.0, 0.0)
-"""Logits of the fractions of the three ``guessed_colours`` in an untrained network."""
-_MAX_HEIGHT = 0.01
-"""Limit on the offset along the normal with a single scaffold, m; with several: half their distance."""
+_MAX_LOG_SCALE = 1.5  # limit on the difference of log scales from those of the initial Gaussian
+_IMAGE_LOGIT = 4.0  # logit of the weight of the images' colours in an untrained network, against predicted colours
+_GUESS_LOGITS = (0.0, 2.0, 0.0)  # logits of the fractions of the three guessed_colours in an untrained network
+_MAX_HEIGHT = 0.01  # limit on the offset along the normal with a single scaffold, m; with several: half their distance
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import BodyPose, Skeleton, frame_pose, pose_blend_shapes
-from dyngs.human.motion.clip import captured_motion
+from dyngs.human.motion.motion import captured_motion
 from dyngs.human.template.atlas import Texels, atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import rest_shape
@@ -147,12 +147,9 @@ def _direction(person: CapturedPerson, view: View) -> Tensor:
     return torch.nn.functional.normalize(pose.rotations[0].T @ (center - pelvis), dim=0)
 
 
-_NEAREST = 16
-"""Seen texels that an unseen one takes its colour from."""
-_TURN = 0.1
-"""Metres that count as much as a turn of the normal by 60 degrees."""
-_SOFT = 0.01
-"""Distance added, m, so that the very nearest texel does not decide alone."""
+_NEAREST = 16  # seen texels that an unseen one takes its colour from
+_TURN = 0.1  # metres that count as much as a turn of the normal by 60 degrees
+_SOFT = 0.01  # distance added, m, so that the very nearest texel does not decide alone
 _UNKNOWN = 0.5
 
 

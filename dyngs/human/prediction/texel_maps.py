@@ -25,12 +25,9 @@ from dyngs.human.prediction.person import CapturedPerson, colours_nearby
 from dyngs.human.template.atlas import Texels
 from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
 
-_GRAZING = 0.15
-"""Cosine below which a texel does not count as seen."""
-HULL_LIMIT = 0.06
-"""Largest distance from the edge of a silhouette that is told apart, m."""
-_TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
-"""Depth tolerance of the visibility test: in m, and in pixels along the surface."""
+_GRAZING = 0.15  # cosine below which a texel does not count as seen
+HULL_LIMIT = 0.06  # largest distance from the edge of a silhouette that is told apart, m
+_TOLERANCE, _TOLERANCE_PX = 0.01, 1.5  # depth tolerance of the visibility test: in m, and in pixels along the surface
 
 
 @dataclass(frozen=True)

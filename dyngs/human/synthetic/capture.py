@@ -1,8 +1,7 @@
 """A synthetic capture of a person: the dressed template in motion, from many cameras, with exact body parameters.
 
-Images are rasterized with a depth buffer in numpy, independently of the rasterizer of Gaussians, as ground truth.
-
-Local letters: T triangles, U vertices of the atlas, H fragments, S texels per side.
+Rasterized in numpy, independently of the rasterizer of Gaussians. T triangles, U vertices of the atlas, H fragments, S
+texels per side.
 """
 
 from __future__ import annotations
@@ -34,10 +33,8 @@ from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 
-_RADIUS = 3.5
-"""Radius of the ring of cameras, m."""
-_TARGET = np.array([0.0, 0.95, 0.0])
-"""The point that all cameras look at, m."""
+_RADIUS = 3.5  # radius of the ring of cameras, m
+_TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
 
 
 @dataclass(frozen=True)
@@ -89,11 +86,9 @@ class PosedMesh:
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
     """Write images of a walking person in the layout that ``dyngs.data.readers.blender`` reads; returns ``out``.
 
-    Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha, sRGB), ``transforms_SPLIT.json`` (OpenGL poses, m, y up,
-    floor at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``. Clothes
-    are offset from the template's surface; the person's size is the ``scale`` of the parameters. The split test shows
-    the frames of train from other cameras, ``pose`` another motion from these other cameras. Raises DyngsError: options
-    out of range, or ``out`` is not empty or cannot be written.
+    Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha), ``transforms_SPLIT.json`` (OpenGL poses, m, y up, floor
+    at y = 0), and the exact parameters of the default template, ``body_train.npz`` and ``body_pose.npz``. The split
+    test shows the frames of train from other cameras, ``pose`` another motion. Raises DyngsError: options out of range.
     """
     if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic person needs size, num_frames, num_cameras and samples of at least 1")
@@ -104,9 +99,13 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
     train = dict(enumerate(_ring(options.num_cameras)))
     test = {len(train) + i: pose for i, pose in enumerate(_ring_between(options.num_test, options.num_cameras))}
-    clips = {"train": _clip(body, options.num_frames, options.clip_seed, 0)}
+    seed, lengths = options.clip_seed, {"train": options.num_frames}
     if options.num_new and test:
-        clips["pose"] = _clip(body, options.num_new, options.clip_seed, 1)
+        lengths["pose"] = options.num_new
+    if seed is None:
+        clips = {name: (walk if name == "train" else squat)(body, count) for name, count in lengths.items()}
+    else:
+        clips = {name: random_clip(body, n, 2 * seed + (name == "pose")) for name, n in lengths.items()}
     with new_capture(out) as started:
         for name, clip in clips.items():
             motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
@@ -142,22 +141,14 @@ def random_light(seed: int | None) -> Lamp:
     return Lamp((float(np.sin(azimuth)), float(height), float(np.cos(azimuth))), (float(ambient),), (red, green, blue))
 
 
-def _clip(body: BodyTemplate, num_frames: int, seed: int | None, which: int) -> Motion:
-    """Return the clip of the split train (``which`` 0) or of ``pose`` (1)."""
-    if seed is not None:
-        return random_clip(body, num_frames, 2 * seed + which)
-    return squat(body, num_frames) if which else walk(body, num_frames)
-
-
 def render_mesh(
     mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Lamp = Lamp()
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples`` per pixel.
 
-    Lambertian: the texture's value times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1; no shadows.
-    Alpha is the fraction of samples that hit the mesh, whose colours are averaged. ``world_from_cam`` (4, 4) is an
-    OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X`` across. Raises ValueError: the mesh reaches behind the
-    camera.
+    Lambertian: the texture times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1. ``world_from_cam``
+    (4, 4) is an OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X`` across. Raises ValueError: the mesh reaches
+    behind it.
     """
     rotation, center = world_from_cam[:3, :3], world_from_cam[:3, 3]
     x, up, back = ((mesh.vertices - center) @ rotation).T
@@ -179,7 +170,6 @@ def render_mesh(
 def _write_split(
     out: Path, split: str, meshes: list[PosedMesh], cameras: dict[int, np.ndarray], options: HumanOptions
 ) -> None:
-    """Write the images of one split and its JSON; nothing without cameras."""
     if not cameras:
         return
     frames, light = [], random_light(options.light_seed)
@@ -195,7 +185,6 @@ def _write_split(
 
 
 def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
-    """Yield the mesh of each frame, posed in float64."""
     uv, uv_faces = texture_coordinates(body)
     exact, faces = body.to(dtype=torch.float64), body.faces.cpu().numpy()
     for pose, trans, scale in zip(*(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True):

@@ -12,11 +12,9 @@ from dyngs.human.template.body import BodyTemplate, posed_vertices
 from dyngs.human.template.joints import JOINT_NAMES
 
 FPS = 12.0
-_Rotations = dict[str, np.ndarray]
-"""Axis-angle vectors (F, 3) or (1, 3) by joint, rad."""
+_Rotations = dict[str, np.ndarray]  # axis-angle vectors (F, 3) or (1, 3) by joint, rad
 _SIDES = (("left", 1.0), ("right", -1.0))
-_KEY_POSES = 4
-"""Poses that a random clip passes through."""
+_KEY_POSES = 4  # poses that a random clip passes through
 
 
 def walk(body: BodyTemplate, num_frames: int) -> Motion:

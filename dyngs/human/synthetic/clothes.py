@@ -28,8 +28,7 @@ _PARTS = {
     "shoe": ("ankle", "foot"),
 }
 """The joints of each part of the body, without side and number."""
-_BELOW_KNEE = -0.36
-"""Height at which shorts end in T-pose, m."""
+_BELOW_KNEE = -0.36  # height at which shorts end in T-pose, m
 
 
 @dataclass(frozen=True)

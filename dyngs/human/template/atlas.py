@@ -14,8 +14,7 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.human.template.body import BodyTemplate
 
-_THINNEST = 1e-9
-"""Twice the area over the square of the longest edge at which a triangle counts as degenerate."""
+_THINNEST = 1e-9  # twice the area over the square of the longest edge at which a triangle counts as degenerate
 
 
 @dataclass(frozen=True)

@@ -116,10 +116,9 @@ def posed_vertices(
 ) -> Tensor:
     """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et al. 2015).
 
-    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. The root rotates about the pelvis joint.
-    ``poses`` (F, J, 3) are axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m, added last; ``betas`` (B,)
-    or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,) of the template. Raises DyngsError: poses for another
-    number of joints, or parameters that the template does not have.
+    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. ``poses`` (F, J, 3) are axis-angle relative to
+    the parent joint, rad; ``trans`` (F, 3) m; ``betas`` (B,) or (F, B); ``expression`` (E,) or (F, E); ``scale`` (F,).
+    Raises DyngsError: poses for another number of joints, or parameters that the template does not have.
     """
     if poses.ndim != 3 or tuple(poses.shape[1:]) != tuple(body.joints.shape):
         raise DyngsError(
@@ -146,14 +145,11 @@ def _blend_shape_offsets(directions: Tensor, parameters: Tensor) -> Tensor:
 
 BONE_UNIT = 0.015
 """Change of a bone vector by one unit of a direction, m: about the spread among adults of the same height."""
-SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
-"""Joints that exist on both sides."""
-MIDDLE = ("spine1", "spine2", "spine3", "neck", "head")
-"""Joints in the plane of symmetry."""
+SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")  # joints that exist on both sides
+MIDDLE = ("spine1", "spine2", "spine3", "neck", "head")  # joints in the plane of symmetry
 NUM_BONE_SHAPES = 3 * len(SIDED) + 2 * len(MIDDLE)
 """B: a bone vector has three coordinates, in the plane of symmetry two."""
-_NEAREST = 0.02
-"""Distance added to all distances when a vertex lies between several joints, m."""
+_NEAREST = 0.02  # distance added to all distances when a vertex lies between several joints, m
 
 
 def bone_shapes(
@@ -161,9 +157,8 @@ def bone_shapes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return directions of the vertices (M, 3, B) and of the joints (J, 3, B), m per unit of a shape parameter.
 
-    Each moves one joint, or the same joint of both sides, in the frame of the rest pose, together with everything below
-    it. Vertices between two joints are stretched evenly; those beyond the last joint of a chain keep their shape.
-    ``vertices`` (M, 3) and the 55 ``joints`` (J, 3) of SMPL-X are at rest, +x to the left; ``weights`` are (M, J).
+    Each moves one joint, or the same joint of both sides, together with everything below it; vertices between two
+    joints are stretched evenly. ``joints`` (J, 3) are the 55 of SMPL-X at rest, +x to the left; ``weights`` are (M, J).
     """
     joint_dirs = _joint_directions(parents)
     follow = _following(vertices, joints, parents, weights)
@@ -193,8 +188,9 @@ def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...
         rows = np.flatnonzero(weights[:, joint])
         ends = [joint, *(child for child, parent in enumerate(parents) if parent == joint)]
         bones = [child for child in ends[1:] if np.linalg.norm(joints[child] - joints[joint]) > 1e-6]
-        fraction = _along_bone(vertices[rows], joints[joint], joints[bones[0]]) if len(bones) == 1 else None
-        if fraction is not None:
+        if len(bones) == 1:  # the position along the bone: 0 at its start or before, 1 at its end or beyond
+            bone = joints[bones[0]] - joints[joint]
+            fraction = np.clip((vertices[rows] - joints[joint]) @ bone / (bone @ bone), 0.0, 1.0)
             follow[rows, joint] += weights[rows, joint] * (1 - fraction)
             follow[rows, bones[0]] += weights[rows, joint] * fraction
         elif len(bones) > 1 and len(bones) <= 3:  # pelvis, chest; the wrist has five fingers and moves as a whole
@@ -205,9 +201,3 @@ def _following(vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...
         else:
             follow[rows, joint] += weights[rows, joint]
     return follow
-
-
-def _along_bone(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the place (P,) of points (P, 3) along a bone: 0 at its start or before, 1 at its end or beyond."""
-    bone = end - start
-    return np.clip((points - start) @ bone / (bone @ bone), 0.0, 1.0)

@@ -22,13 +22,8 @@ from dyngs.files.numpy_files import read_arrays
 from dyngs.files.pickles import read_pickle
 from dyngs.human.template.body import BodyTemplate, apply_shape, bone_shapes
 
-
-@dataclass(frozen=True)
-class TextureCoordinates:
-    """Texture coordinates (U, 2) in [0, 1] and the triangles (T, 3) that index them."""
-
-    uv: np.ndarray
-    faces: np.ndarray
+_Coordinates = tuple[np.ndarray, np.ndarray]
+"""Texture coordinates (U, 2) in [0, 1] and the triangles (T, 3) that index them."""
 
 
 def require_unit_square(path: Path, uv: np.ndarray) -> np.ndarray:
@@ -42,7 +37,7 @@ def require_unit_square(path: Path, uv: np.ndarray) -> np.ndarray:
     return uv.clip(0, 1)
 
 
-def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> TextureCoordinates:
+def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> _Coordinates:
     """Read the texture coordinates of an ``.obj``, indexed by the corners of the triangles ``faces`` (T, 3).
 
     Its triangles may come in any order, as ``f v/vt v/vt v/vt``; ``faces`` (T, 3) are those of the body with
@@ -66,7 +61,8 @@ def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> TextureCoordin
                 uv.append([float(words[0]), float(words[1])])
             elif kind == "f":
                 one, two, three = words
-                corners.append([_parsed_corner(word, count, len(uv)) for word in (one, two, three)])
+                numbers = [[int(number) for number in word.split("/")[:2]] for word in (one, two, three)]
+                corners.append([(v - 1 if v > 0 else count + v, t - 1 if t > 0 else len(uv) + t) for v, t in numbers])
         except (ValueError, IndexError):
             raise DyngsError(
                 f"{path}, line {number}: {line.strip()[:60]!r} is not understood; texture coordinates are written "
@@ -80,18 +76,7 @@ def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> TextureCoordin
     found = np.array(corners)
     if found.min() < 0 or (found.max((0, 1)) >= (count, len(uv))).any():
         raise DyngsError(f"{path}: a face names a vertex or texture coordinate that does not exist")
-    return TextureCoordinates(
-        require_unit_square(path, np.array(uv)), _matched(path, faces, found[..., 0], found[..., 1])
-    )
-
-
-def _parsed_corner(word: str, vertices: int, coordinates: int) -> tuple[int, int]:
-    """Return vertex and texture coordinate, from 0, of ``v/vt`` or ``v/vt/vn``; negative numbers count from the end."""
-    vertex, coordinate = (int(number) for number in word.split("/")[:2])
-    return (
-        vertex - 1 if vertex > 0 else vertices + vertex,
-        coordinate - 1 if coordinate > 0 else coordinates + coordinate,
-    )
+    return require_unit_square(path, np.array(uv)), _matched(path, faces, found[..., 0], found[..., 1])
 
 
 def _matched(path: Path, faces: np.ndarray, others: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -103,8 +88,7 @@ def _matched(path: Path, faces: np.ndarray, others: np.ndarray, values: np.ndarr
     if differ.any():
         odd = " ".join(str(v + 1) for v in others[other_rows[np.argmax(differ)]])
         raise DyngsError(f"{path}: the body has no triangle of the vertices {odd}; give the .obj made for this body")
-    matched = np.empty_like(values)
-    ordered = np.empty_like(values)
+    matched, ordered = np.empty_like(values), np.empty_like(values)
     ordered[rows] = np.take_along_axis(values, there, 1)[other_rows]
     np.put_along_axis(matched, here, ordered, 1)
     return matched
@@ -115,21 +99,17 @@ _TEMPLATE = ("v_template", "f", "weights_idx", "weights_val", "kintree_table", "
 _UV = ("vt", "ft")
 _TEMPLATE_SHAPES = ("shapedirs", "J_shapedirs")
 _NAMES = {24: "smpl", 52: "smplh", 55: "smplx"}
-_NO_PARENT = 2**32 - 1
-"""-1 as an unsigned 32-bit number: the parent of the root in SMPL files."""
-_MOST_VERTICES = 250_000
-"""SMPL-X has 10,475. Four times as many triangles are allowed."""
-_LARGEST = 1e10
-"""A larger number in a body file, in whatever unit, means that the file is damaged."""
+_NO_PARENT = 2**32 - 1  # -1 as an unsigned 32-bit number: the parent of the root in SMPL files
+_MOST_VERTICES = 250_000  # SMPL-X has 10,475; four times as many triangles are allowed
+_LARGEST = 1e10  # a larger number in a body file, in whatever unit, means that the file is damaged
 
 
 def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
-    """Read the body template of a ``.npz`` or ``.pkl`` file, with the texture coordinates of ``uv``, if given.
+    """Read the body template of a ``.npz`` or ``.pkl`` file, with the texture coordinates of an ``.obj`` ``uv``.
 
     The number of joints (24, 52 or 55) tells SMPL, SMPL-H and SMPL-X apart. SMPL-X keeps shape and expression in one
-    array: 300 and the rest, or 10 and 10. Only the keys that are needed are read. A file cannot run code: arrays of
-    Python objects are refused, and only numbers, text and arrays are read from a pickle. ``uv`` is an ``.obj`` with the
-    triangles of the body. Raises DyngsError: names the file and what is missing or wrong.
+    array: 300 and the rest, or 10 and 10. A file cannot run code: only numbers, text and arrays are read from a pickle.
+    Raises DyngsError: names the file and what is missing or wrong.
     """
     path = Path(path)
     if path.is_dir():
@@ -151,13 +131,13 @@ def _body(arrays: _Arrays, uv: Path | None) -> BodyTemplate:
     require_at_most(arrays.path, len(faces), 4 * _MOST_VERTICES, "triangles")
     corners = _own_uv(arrays, len(faces)) if uv is None else read_obj(uv, faces, len(vertices))
     is_template = "weights_idx" in arrays.values
-    weights, joints = (_template_skin if is_template else _smpl_skin)(arrays, vertices, len(parents))
+    weights, joints = _skin(arrays, vertices, len(parents), is_template)
     body = BodyTemplate(
         name="anny" if is_template else _NAMES[len(parents)],
         vertices=_float(vertices),
         faces=torch.from_numpy(faces),
-        uv=None if corners is None else _float(corners.uv),
-        uv_faces=None if corners is None else torch.from_numpy(corners.faces),
+        uv=None if corners is None else _float(corners[0]),
+        uv_faces=None if corners is None else torch.from_numpy(corners[1]),
         weights=_float(weights),
         parents=parents,
         joints=_float(joints),
@@ -200,20 +180,17 @@ class _Arrays:
         return value.astype(np.int64)
 
 
-def _template_skin(arrays: _Arrays, vertices: np.ndarray, joints: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (M, J) and joints (J, 3) of the free template, whose file holds the non-zero weights only."""
-    joint_indices = arrays.indices("weights_idx", (len(vertices), None), joints, "joints")
-    values = _normalized_weights(arrays.path, "weights_val", arrays.floats("weights_val", joint_indices.shape))
-    weights = np.zeros((len(vertices), joints))
-    np.add.at(weights, (np.arange(len(vertices))[:, None], joint_indices), values)
+def _skin(arrays: _Arrays, vertices: np.ndarray, joints: int, is_template: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (M, J) and joints (J, 3): the free template's file holds both, SMPL regresses joints."""
+    count, path = len(vertices), arrays.path
+    if not is_template:
+        weights = arrays.floats("weights", (count, joints))
+        return _normalized(path, "weights", weights), arrays.floats("J_regressor", (joints, count)) @ vertices
+    followed = arrays.indices("weights_idx", (count, None), joints, "joints")
+    values = _normalized(path, "weights_val", arrays.floats("weights_val", followed.shape))
+    weights = np.zeros((count, joints))
+    np.add.at(weights, (np.arange(count)[:, None], followed), values)
     return weights, arrays.floats("J", (joints, 3))
-
-
-def _smpl_skin(arrays: _Arrays, vertices: np.ndarray, joints: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (M, J) and joints (J, 3), which SMPL computes from the vertices."""
-    weights = arrays.floats("weights", (len(vertices), joints))
-    regressor = arrays.floats("J_regressor", (joints, len(vertices)))
-    return _normalized_weights(arrays.path, "weights", weights), regressor @ vertices
 
 
 def _with_blend_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
@@ -221,7 +198,9 @@ def _with_blend_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
     directions = arrays.floats("shapedirs", (m, 3, None))
     pose_dirs = arrays.floats("posedirs", (m, 3, 9 * (j - 1)))
     joint_directions = np.einsum("jm,mkb->jkb", arrays.floats("J_regressor", (j, m)), directions, optimize=True)
-    shapes, count = _num_shapes(j, directions.shape[2]), directions.shape[2]
+    shapes = count = directions.shape[2]
+    if j == 55:  # only SMPL-X has expressions, after the shapes
+        shapes = 10 if count == 20 else min(count, 300)
     return replace(
         body,
         shape_dirs=_float(directions[..., :shapes]),
@@ -245,18 +224,11 @@ def _with_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
     return replace(body, shape_dirs=_float(directions), joint_shape_dirs=_float(joint_directions))
 
 
-def _num_shapes(joints: int, directions: int) -> int:
-    """Return how many blend shapes are shape parameters; the rest are expressions, which only SMPL-X has."""
-    if joints != 55:
-        return directions
-    return 10 if directions == 20 else min(directions, 300)
-
-
 def _float(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def _normalized_weights(path: Path, key: str, weights: np.ndarray) -> np.ndarray:
+def _normalized(path: Path, key: str, weights: np.ndarray) -> np.ndarray:
     """Return the weights with rows that sum to 1 exactly; a file may miss it by half precision."""
     sums = weights.sum(1)
     bad = (np.abs(sums - 1) > 1e-3) | (weights.min(1) < -1e-6)
@@ -269,7 +241,6 @@ def _normalized_weights(path: Path, key: str, weights: np.ndarray) -> np.ndarray
 
 
 def _parents(arrays: _Arrays) -> tuple[int, ...]:
-    """Return the parents (J,) of a tree whose root is joint 0 and where parents come before their children."""
     path, where = arrays.path, "'kintree_table'"
     table = arrays.floats("kintree_table", (2, None))
     count = table.shape[1]
@@ -284,21 +255,16 @@ def _parents(arrays: _Arrays) -> tuple[int, ...]:
         raise DyngsError(f"{path}: {where} gives joint {joint} the parent {table[0][joint]:g}, which does not exist")
     tree = [int(parent) for parent in parents]
     for joint, parent in enumerate(tree):
-        above = joint
-        for _ in range(count):
-            above = tree[above] if above >= 0 else -1
-        if above >= 0:
-            raise DyngsError(f"{path}: {where} is not a tree: joint {above} is its own ancestor")
         if parent == -1 and joint > 0:
             raise DyngsError(f"{path}: {where} is not a tree: joint {joint} has no parent; only joint 0 may have none")
-        if parent > joint:
+        if parent >= joint:
             raise DyngsError(
                 f"{path}: {where} must list parents before their children, but joint {joint} has the parent {parent}"
             )
     return tuple(tree)
 
 
-def _own_uv(arrays: _Arrays, triangles: int) -> TextureCoordinates | None:
+def _own_uv(arrays: _Arrays, triangles: int) -> _Coordinates | None:
     given = [key for key in _UV if key in arrays.values]
     if not given:
         return None
@@ -306,7 +272,7 @@ def _own_uv(arrays: _Arrays, triangles: int) -> TextureCoordinates | None:
         other = _UV[1 - _UV.index(given[0])]
         raise DyngsError(f"{arrays.path}: has '{given[0]}' but not '{other}'; texture coordinates need both")
     uv = require_unit_square(arrays.path, arrays.floats("vt", (None, 2)))
-    return TextureCoordinates(uv, arrays.indices("ft", (triangles, 3), len(uv), "texture coordinates"))
+    return uv, arrays.indices("ft", (triangles, 3), len(uv), "texture coordinates")
 
 
 def _wanted(path: Path, present: Collection[object]) -> list[str]:

@@ -14,8 +14,8 @@ from gltf_skins import SkinnedGlb
 from moving_scene import write_moving_run
 
 from dyngs.errors import DyngsError
-from dyngs.export.rigged.body import body_mesh
 from dyngs.export.rigged.mesh_file import Played, write_mesh
+from dyngs.export.rigged.skeleton import body_mesh
 from dyngs.human.avatar.posing import PoseBlendShapes
 from dyngs.runs.checkpoint import load_run
 

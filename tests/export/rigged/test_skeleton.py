@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from bare_person import bare_run, playing, random_clip, template
+from bare_person import bare_run, bare_scene, playing, random_clip, template
 from gltf_skins import SkinnedGlb
+from synthetic_bodies import model, write_npz
 
-from dyngs.export.rigged.body import body_mesh
+from dyngs.errors import DyngsError
 from dyngs.export.rigged.mesh_file import mesh_document
-from dyngs.export.rigged.skeleton import Rig, add_weights, animation_of, rig_of
+from dyngs.export.rigged.skeleton import (
+    Rig,
+    add_weights,
+    anchor_normals,
+    animation_of,
+    body_mesh,
+    rest_vertices,
+    rig_of,
+)
 from dyngs.files.gltf import GlbDocument
+from dyngs.human.avatar.anchors import texel_gaussians
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.gltf import read_gltf
 from dyngs.human.motion.placement import upright
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.body import apply_shape
+from dyngs.human.template.body_reader import read_body
 from dyngs.human.template.joints import JOINT_NAMES
 
 GREY = np.full((4, 4, 3), 128, np.uint8)
@@ -108,3 +122,40 @@ def test_weights_are_complete_and_unused_joints_are_the_first(tmp_path: Path) ->
     np.testing.assert_allclose(dense, given.numpy(), atol=1e-6)
     assert (np.diff(weights, axis=1) <= 0).all()
     assert list(add_weights(GlbDocument(), given[[0, 2]])) == ["JOINTS_0", "WEIGHTS_0"]
+
+
+def test_vertices_are_doubled_at_seams_only() -> None:
+    """Each corner keeps its place and its texture coordinate; copies share weights and normals."""
+    body, scene = template(), bare_scene()
+    mesh = body_mesh(scene, body, body.vertices)
+    assert body.uv is not None
+    assert body.uv_faces is not None
+    assert len(mesh.vertices) == len(torch.unique(torch.stack([body.faces, body.uv_faces], -1).reshape(-1, 2), dim=0))
+    assert torch.equal(mesh.vertices[mesh.faces], body.vertices[body.faces])
+    assert torch.equal(mesh.uv[mesh.faces], body.uv[body.uv_faces])
+    assert torch.equal(mesh.weights, body.weights[mesh.source])
+    outward = ((mesh.vertices - torch.tensor([0.0, 0.2, 0.0])) * mesh.normals).sum(1)
+    trunk = mesh.weights[:, [3, 6, 9]].sum(1) > 0.9
+    assert float((outward[trunk] > 0).float().mean()) > 0.95
+    torch.testing.assert_close(mesh.normals.norm(dim=1), torch.ones(len(mesh.normals)), atol=1e-5, rtol=0)
+
+
+def test_the_shape_follows_from_what_a_run_holds(tmp_path: Path) -> None:
+    """Ten shape parameters from joints and anchors, to a tenth of a millimetre."""
+    body = read_body(write_npz(tmp_path / "body.npz", model("smplx")))
+    betas = torch.linspace(-2, 2, 10)
+    vertices, joints = apply_shape(body, betas)
+    texels = atlas_texels(body, 32, vertices)
+    gaussians, anchors = texel_gaussians(texels, [0.0, 0.02], 0)
+    scene = replace(bare_scene(), gaussians=gaussians, anchors=anchors, skeleton=Skeleton(joints, body.parents))
+    torch.testing.assert_close(rest_vertices(scene, body), vertices, atol=1e-4, rtol=0)
+    np.testing.assert_allclose(anchor_normals(anchors, body, vertices).norm(dim=1).numpy(), 1, atol=1e-5)
+
+
+def test_templates_that_do_not_fit() -> None:
+    scene, body = bare_scene(), template()
+    torch.testing.assert_close(rest_vertices(scene, body), body.vertices, atol=1e-4, rtol=0)
+    with pytest.raises(DyngsError, match="is not the one that this person was trained on"):
+        rest_vertices(scene, replace(body, faces=body.faces[:100], uv_faces=None, uv=None))
+    with pytest.raises(DyngsError, match=r"has no texture coordinates; train with model\.uv=FILE\.obj"):
+        body_mesh(scene, replace(body, uv=None, uv_faces=None), body.vertices)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from bare_person import RESOLUTION, atlas, bare_scene, template
 
-from dyngs.export.rigged.body import anchor_normals
+from dyngs.export.rigged.skeleton import anchor_normals
 from dyngs.export.rigged.surface import MARGINS, FittedSurface, fitted_surface
 from dyngs.export.rigged.texture import bake_texels
 from dyngs.gaussians import Gaussians

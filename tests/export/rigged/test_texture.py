@@ -9,7 +9,7 @@ import torch
 from bare_person import atlas, bands, bare_scene, template
 
 from dyngs.conventions import SH_C0
-from dyngs.export.rigged.body import anchor_normals
+from dyngs.export.rigged.skeleton import anchor_normals
 from dyngs.export.rigged.texture import (
     BakedTexels,
     bake_texels,

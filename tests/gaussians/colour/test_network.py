@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import reference
 import torch
 from scenes import random_scene
 from torch import Tensor
@@ -20,7 +21,7 @@ from dyngs.gaussians.colour.network import (
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.perceptron import Layer, reference_perceptron
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.shading import Sight, num_inputs, reference_inputs
+from dyngs.ops.shading import Sight, num_inputs
 
 
 def network(*, sees_time: bool = True, sees_normals: bool = True, last: float = 0.3, seed: int = 0) -> ColourNetwork:
@@ -62,7 +63,7 @@ def test_each_gaussian_has_the_colour_of_its_own_inputs() -> None:
         one = gaussians.select(torch.tensor([i]))
         geometry = (one.means, one.quats, one.log_scales, torch.tensor([0]))
         sight = Sight(*geometry, scene.cameras.centers[v], net.box, time=0.7)
-        added = reference_perceptron(reference_inputs(sight, one.base_rgb), net.layers)
+        added = reference_perceptron(reference.shading_inputs(sight, one.base_rgb), net.layers)
         torch.testing.assert_close(colors[v, i], (one.base_rgb + added)[0].clamp_min(0))
 
 

@@ -25,7 +25,7 @@ from dyngs.human.avatar.anchors import (
     surface_texels,
     texel_gaussians,
 )
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template

@@ -26,7 +26,7 @@ from dyngs.human.avatar.pose_fit import (
 )
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, joint_transforms
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.kinds import assemble

@@ -23,6 +23,7 @@ from dyngs.human.avatar.posing import (
     BodyPose,
     Light,
     Skeleton,
+    blended_rotations,
     difference_of_sides,
     harmonics,
     pose_blend_shapes,
@@ -227,6 +228,37 @@ def test_colours_turn_with_what_they_are_on() -> None:
     after = evaluate_harmonics(turned, eye, rotate_sh(sh, turns), radii, 1)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
     assert float((evaluate_harmonics(turned, eye, sh, radii, 1) - before).abs().max()) > 0.05
+
+
+def test_blended_rotations_are_those_of_single_joints_and_never_vanish() -> None:
+    """Between two joints they lie on the shorter way, wherever both turn together; opposite turns blend, too."""
+    generator = torch.Generator().manual_seed(4)
+    turns = axis_angle_to_matrix(2 * torch.randn(5, 3, dtype=torch.float64, generator=generator))
+    moves = torch.cat([turns, torch.randn(5, 3, 1, dtype=torch.float64, generator=generator)], dim=-1)
+    torch.testing.assert_close(blended_rotations(torch.eye(5, dtype=torch.float64), moves), turns)
+    weights = torch.rand(40, 5, dtype=torch.float64, generator=generator)
+    blended = blended_rotations(weights, moves)
+    torch.testing.assert_close(blended @ blended.mT, torch.eye(3, dtype=torch.float64).expand(40, 3, 3))
+    assert bool((torch.linalg.det(blended) > 0).all())
+    both = torch.cat([turns[0] @ moves[..., :3], moves[..., 3:]], dim=-1)
+    torch.testing.assert_close(blended_rotations(weights, both), turns[0] @ blended)
+    eye, about = torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    half = torch.tensor([[0.5, 0.5]], dtype=torch.float64)
+    for angle in (0.1, 3.0, torch.pi):
+        pair = torch.stack([eye, axis_angle_to_matrix(angle * about)])
+        found = blended_rotations(half, torch.cat([pair, torch.zeros(2, 3, 1, dtype=torch.float64)], dim=-1))[0]
+        way = (found - axis_angle_to_matrix(angle / 2 * about), found - axis_angle_to_matrix(-angle / 2 * about))
+        assert min(float(x.abs().max()) for x in way) < 1e-9
+
+
+def test_blended_rotations_have_the_gradients_of_differences() -> None:
+    generator = torch.Generator().manual_seed(5)
+    weights = torch.rand(6, 3, dtype=torch.float64, generator=generator).requires_grad_()
+    poses = torch.randn(3, 3, dtype=torch.float64, generator=generator).requires_grad_()
+    rest = torch.zeros(3, 3, 1, dtype=torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda w, p: blended_rotations(w, torch.cat([axis_angle_to_matrix(p), rest], dim=-1)), (weights, poses)
+    )
 
 
 @cache

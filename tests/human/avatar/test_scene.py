@@ -20,7 +20,7 @@ from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
-from dyngs.human.motion.clip import CapturedMotion, MotionClip
+from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body_reader import default_template

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.data.capture import Lens, View
+from dyngs.data.capture import Capture, Lens, View
 from dyngs.data.images.lens import distort
 from dyngs.errors import DyngsError
-from dyngs.human.fit.keypoints import JOINTS, read_keypoints
+from dyngs.human.fit.keypoints import INNER, JOINTS, ORDERS, read_joints, read_keypoints
+from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.template.body import BodyTemplate, posed_vertices
+from dyngs.human.template.body_reader import default_template
+from dyngs.human.template.joints import JOINT_NAMES
 
 
 def view(name: str) -> View:
@@ -104,3 +109,111 @@ def test_no_key_points_at_all_are_refused(tmp_path: Path) -> None:
         read_keypoints(tmp_path, [view("a")])
     with pytest.raises(DyngsError, match="no such file or folder"):
         read_keypoints(tmp_path / "k.json", [view("a")])
+
+
+KNEE, SPINE = JOINT_NAMES.index("left_knee"), JOINT_NAMES.index("spine2")
+
+
+def capture(count: int = 3) -> Capture:
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 4.0
+    intrinsics = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
+    view = View("", Path(), pose, intrinsics, 100, 80)
+    views = [replace(view, name=f"p{i}", image_path=Path(f"/x/p{i}.png"), frame=i) for i in range(count)]
+    return Capture(Path("/x"), "c", {"train": tuple(views)}, world_offset=np.array([0.5, 0.0, 0.0]))
+
+
+def joints(order: str, frames: int = 3) -> np.ndarray:
+    """(F, K, 3): frame, joint, and their sum."""
+    frame, joint = np.mgrid[:frames, : len(ORDERS[order])].astype(np.float64)
+    return np.stack([frame, joint, frame + joint], axis=-1)
+
+
+@pytest.mark.parametrize("order", list(ORDERS))
+def test_all_orders_have_the_knee(tmp_path: Path, order: str) -> None:
+    np.savez(tmp_path / "a.npz", joints=joints(order), order=order)
+    found = read_joints(tmp_path / "a.npz", capture(), default_template())
+    row = ORDERS[order].index("left_knee")
+    assert found[2][KNEE].tolist() == [1.5, row, 2.0 + row, 1.0]  # less the offset of the recentred world
+
+
+def test_joints_of_the_trunk_count_less(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", joints=joints("smpl"))
+    found = read_joints(tmp_path / "a.npz", capture(), default_template())
+    assert found[0][SPINE, 3] == pytest.approx(INNER)
+
+
+def test_json_names_images_or_frames(tmp_path: Path) -> None:
+    rows = joints("coco17")
+    rows[0, 13, 0] = np.nan
+    fields = {"joints": {"p1": rows[1].tolist(), "2": rows[2].tolist(), "other": rows[0].tolist()}}
+    (tmp_path / "a.json").write_text(json.dumps(fields))
+    found = read_joints(tmp_path / "a.json", capture(), default_template())
+    assert sorted(found) == [1, 2]
+    assert found[1][KNEE].tolist() == [0.5, 13.0, 14.0, 1.0]
+
+
+def test_sam_3d_body_is_in_the_axes_of_the_camera(tmp_path: Path) -> None:
+    points = np.zeros((70, 3))
+    points[11] = [0.1, 0.2, 0.3]
+    np.savez(tmp_path / "p1.npz", pred_keypoints_3d=points, pred_cam_t=np.array([0.0, 0.0, 5.0]), focal_length=500.0)
+    found = read_joints(tmp_path, capture(), default_template())
+    assert list(found) == [1]
+    assert found[1][KNEE].tolist() == pytest.approx([0.1, -0.2, -1.3, 1.0])
+
+
+def posed(body: BodyTemplate) -> tuple[torch.Tensor, torch.Tensor]:
+    """Vertices (1, N, 3) and joints (22, 3) in a pose."""
+    poses = torch.zeros(1, len(body.joints), 3)
+    poses[0, KNEE, 0], poses[0, 0, 1], poses[0, 16, 2] = 0.8, 0.5, -0.6
+    trans = torch.tensor([[0.3, 0.0, 1.0]])
+    moves = joint_transforms(body.joints, body.parents, axis_angle_to_matrix(poses))[0]
+    positions = (moves[..., :3] @ body.joints[..., None])[..., 0] + moves[..., 3] + trans
+    return posed_vertices(body, poses, trans, None, None), positions[:22]
+
+
+def test_joints_of_posed_vertices(tmp_path: Path) -> None:
+    body = default_template()
+    vertices, true = posed(body)
+    np.savez(tmp_path / "a.npz", vertices=vertices.numpy())
+    found = read_joints(tmp_path / "a.npz", capture(1).replace(world_offset=np.zeros(3)), body)
+    error = (found[0][:22, :3] - true).norm(dim=1)[found[0][:22, 3] > 0]
+    assert len(error) == 22
+    assert float(error.mean()) < 0.006
+    assert float(error.max()) < 0.02
+
+
+def test_frame_data_of_semantic_human_texture_stitching(tmp_path: Path) -> None:
+    body = default_template()
+    vertices, true = posed(body)
+    with (tmp_path / "frame_data.pkl").open("wb") as file:
+        pickle.dump({"vertices": vertices.numpy(), "camera_f": np.array([100.0, 100.0])}, file, protocol=2)
+    found = read_joints(tmp_path / "frame_data.pkl", capture(1), body)
+    local = true * torch.tensor([1.0, -1.0, -1.0]) - torch.tensor([0.0, 0.0, 4.0])
+    wanted = local * torch.tensor([1.0, -1.0, -1.0])
+    assert float((found[0][KNEE, :3] - wanted[KNEE]).norm()) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"joints": np.zeros((3, 19, 3))}, "the order of 19 joints is not known"),
+        ({"joints": np.zeros((3, 17, 2))}, "3 or 4 numbers"),
+        ({"joints": np.zeros((3, 17, 3)), "frames": np.arange(3) + 7}, "no joints for any frame"),
+        ({"joints": np.zeros((3, 17, 3)), "order": "smpl"}, "frame 0 has 17 joints, smpl has 24"),
+        ({"joints": np.zeros((3, 17, 3)), "space": "moon"}, "must be world or camera"),
+        ({"vertices": np.zeros((3, 6890, 3))}, "--body"),
+        ({"other": np.zeros(3)}, "'joints' is missing"),
+    ],
+)
+def test_what_is_refused(tmp_path: Path, fields: dict[str, np.ndarray], said: str) -> None:
+    np.savez(tmp_path / "a.npz", **fields)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(DyngsError, match=said):
+        read_joints(tmp_path / "a.npz", capture(), default_template())
+
+
+def test_no_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="no such file"):
+        read_joints(tmp_path / "a.npz", capture(), default_template())
+    with pytest.raises(DyngsError, match="files of SAM 3D Body there"):
+        read_joints(tmp_path, capture(), default_template())

@@ -16,9 +16,8 @@ from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.inputs import KnownAvatar
-from dyngs.human.fit.known_person import AvatarPoses, known_shape, posed_by_avatar, shape_of, with_shape
-from dyngs.human.motion.clip import CapturedMotion, MotionClip
+from dyngs.human.fit.known_person import AvatarPoses, KnownAvatar, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.kinds import assemble

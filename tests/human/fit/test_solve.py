@@ -18,6 +18,7 @@ from dyngs.human.fit.solve import (
     Fitting,
     PosePrior,
     drawn_frame,
+    fit_lens,
     keypoint_error,
     near_given,
     new_fit,
@@ -30,7 +31,7 @@ from dyngs.human.fit.solve import (
     usual,
     with_lens,
 )
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
 
@@ -153,3 +154,49 @@ def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> Non
     assert cost(2.9, expected) == pytest.approx(cost(2.9, unlimited), abs=1e-8)
     assert cost(5.0, expected) - cost(5.0, unlimited) == pytest.approx(LIMIT_WEIGHT * 2.0**2 * fraction, rel=1e-4)
     assert near_given(clip).limit == math.inf, "given poses may be as they like"
+
+
+SIZE, FRAMES, STEPS, DISTANCE = 32, 4, 12, 2.2
+
+
+def filmed(log_focal: float) -> tuple[Surface, MotionClip, list[ObservedFrame]]:
+    """Who turns before a camera whose focal length is not the guessed one, by that logarithm."""
+    surface = surface_of(default_template(), 16)
+    intrinsics = torch.tensor([[0.9 * SIZE, 0, SIZE / 2], [0, 0.9 * SIZE, SIZE / 2], [0, 0, 1]])
+    camera = Cameras(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))[None], intrinsics[None], SIZE, SIZE)
+    poses = torch.zeros(FRAMES, 55, 3)
+    poses[:, 0, 1] = torch.arange(FRAMES) * 0.7
+    poses[:, JOINT_NAMES.index("left_shoulder"), 1] = -1.2
+    trans = torch.tensor([0.0, 0.0, -DISTANCE]).repeat(FRAMES, 1)
+    times = torch.linspace(0, 1, FRAMES, dtype=torch.float64)
+    clip = MotionClip(times, poses, trans, torch.ones(FRAMES))
+    true = with_lens(new_fit(clip, surface), DISTANCE)
+    with torch.no_grad():
+        true["log_focal"].add_(log_focal)
+        known = torch.ones(1, SIZE, SIZE)
+        seen = [ObservedFrame(camera, drawn_frame(true, clip, surface, row, camera), known) for row in range(FRAMES)]
+    return surface, clip, seen
+
+
+def test_a_wrong_guess_is_corrected() -> None:
+    surface, clip, seen = filmed(-0.3)
+    ticks: list[int] = []
+    start = new_fit(clip, surface)
+    fitting = Fitting(clip, surface, near_given(clip))
+    found, lens = fit_lens(fitting, start, (), seen.__getitem__, STEPS, lambda: ticks.append(1))
+    assert lens.taken
+    assert lens.error[1] < 0.8 * lens.error[0]
+    assert 0.6 < lens.factor < 0.93
+    assert float(found["log_focal"].detach().exp()) == lens.factor
+    assert len(ticks) == 5 * STEPS
+    assert "taken" in lens.summary()
+    assert float(start["poses"].detach().abs().max()) == 0
+
+
+def test_where_the_guess_stays_nothing_is_fitted_again() -> None:
+    surface, clip, seen = filmed(0.0)
+    start = new_fit(clip, surface)
+    found, lens = fit_lens(Fitting(clip, surface, near_given(clip)), start, (), seen.__getitem__, STEPS)
+    assert not lens.taken
+    assert found is start
+    assert "the guess stays" in lens.summary()

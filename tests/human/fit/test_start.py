@@ -30,7 +30,7 @@ from dyngs.human.fit.start import (
     standing_clip,
     up_of,
 )
-from dyngs.human.motion.clip import MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.body_reader import default_template
 
 

@@ -16,7 +16,7 @@ from motion_files import (
 )
 from torch import Tensor
 
-from dyngs.human.motion.clip import MotionClip, motion_clip
+from dyngs.human.motion.motion import MotionClip, motion_clip
 from dyngs.human.motion.placement import place_like, place_on_floor, rest_clip, up_direction, upright
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 

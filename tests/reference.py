@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.rasterization import Blended, BlendOptions
+from dyngs.ops.shading import Sight
 
 
 def covariances2d(means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
@@ -74,42 +76,6 @@ def project(
         compensations=torch.where(visible, compensation, 0.0),
         radii=torch.where(keep, extents, 0.0).int(),
     )
-
-
-def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
-    """Return (..., K) real spherical harmonics of unit directions (..., 3), from the associated Legendre recursion.
-
-    Independent of the polynomials in csrc/math/harmonics.hpp; signs as in 3DGS (Condon-Shortley phase included).
-    """
-    x, y, z = directions.unbind(-1)
-    azimuth = torch.complex(x, y)
-    terms: list[Tensor] = []
-    for order in range(degree + 1):
-        for m in range(-order, order + 1):
-            norm = ((2 * order + 1) / (4 * torch.pi) * _factorial_ratio(order, abs(m))) ** 0.5
-            polynomial = norm * _legendre_without_sine(order, abs(m), z)
-            power = azimuth ** abs(m)
-            part = power.imag if m < 0 else power.real
-            terms.append(polynomial * part * (1.0 if m == 0 else 2**0.5))
-    return torch.stack(terms, -1)
-
-
-def _factorial_ratio(order: int, m: int) -> float:
-    ratio = 1.0
-    for k in range(order - m + 1, order + m + 1):
-        ratio /= k
-    return ratio
-
-
-def _legendre_without_sine(order: int, m: int, z: Tensor) -> Tensor:
-    """Return the associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley phase (-1)^m."""
-    current = torch.ones_like(z)
-    for k in range(1, m + 1):
-        current = current * -(2 * k - 1)
-    previous = torch.zeros_like(z)
-    for k in range(m + 1, order + 1):
-        current, previous = ((2 * k - 1) * z * current - (k + m - 1) * previous) / (k - m), current
-    return current
 
 
 def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
@@ -186,3 +152,43 @@ def _rasterize(
         images.append(image)
         remains.append(transmittance)
     return Blended(torch.stack(images), torch.stack(remains))
+
+
+def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
+    """As ``dyngs.ops.shading.shading_inputs``.
+
+    Place in the box (contracted), direction from the eye, |cosine| between the shortest axis and the direction, the
+    direction mirrored at that axis, base colour less 1/2, time in [-1, 1]. A body at rest knows places, directions and
+    normals as they are there.
+    """
+    means = sight.means[sight.rows]
+    directions = torch.nn.functional.normalize(means - sight.eye, dim=1)
+    normals = shortest_axes(sight.quats[sight.rows], sight.log_scales[sight.rows])
+    places = means
+    if sight.rest is not None:
+        at_rest, turn = sight.rest
+        places, directions, normals = at_rest[sight.rows], directions @ turn, normals @ turn
+    center, half_size = sight.box
+    inputs = [contracted((places - center) / half_size), directions]
+    if sight.normals:
+        cosine = (normals * directions).sum(1, keepdim=True)
+        inputs += [cosine.abs(), directions - 2 * cosine * normals]
+    inputs.append(base - 0.5)
+    if sight.time is not None:
+        inputs.append(torch.full_like(base[:, :1], 2 * sight.time - 1))
+    return torch.cat(inputs, dim=1)
+
+
+def contracted(points: Tensor) -> Tensor:
+    """Return ``points`` (M, 3) with all of space contracted into a ball of radius 2; the unit ball stays as it is.
+
+    (2 - 1 / |x|) x / |x|, the contraction of Barron et al. 2022 (mip-NeRF 360): far things stay bounded inputs.
+    """
+    length = points.norm(dim=1, keepdim=True).clamp_min(1)
+    return points * (2 - 1 / length) / length
+
+
+def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
+    """Return (M, 3) unit vectors along the shortest axis of each Gaussian: the normal of a flat one, up to its sign."""
+    shortest = log_scales.argmin(dim=1)
+    return rotation_matrices(quats).gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]

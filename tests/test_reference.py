@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import pytest
+import reference
 import torch
 from scenes import EXACT, REFERENCE, Limits, Scene, draw, loss, random_scene
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.ops import reference
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.rasterization import BlendOptions
 
