@@ -301,7 +301,7 @@ def read_a_log(root: Path) -> object:
 
 def read_a_load(root: Path) -> object:
     """Read the workload of a benchmark."""
-    from dyngs.bench.rasterize import garden_workload
+    from dyngs.bench import garden_workload
 
     return garden_workload(only(root))
 

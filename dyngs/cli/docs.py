@@ -9,22 +9,18 @@ import sys
 from difflib import get_close_matches
 from pathlib import Path
 
+from dyngs.cli.arguments import Commands, add_command
 from dyngs.errors import DyngsError
 
 _LINK = re.compile(r"\[([^]]+)\]\(([^)#\s:]+)(?:#[^)\s]*)?\)")
 _FRONT = "README"
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``docs`` to the commands."""
-    parser = commands.add_parser(
-        "docs",
-        help="the documentation",
-        description="Show a page of the documentation (without a terminal: as Markdown), or the list of all pages.",
-    )
+def add_parser(commands: Commands) -> None:
+    about = "Show a page of the documentation (without a terminal: as Markdown), or the list of all pages."
+    parser = add_command(commands, "docs", run, "the documentation", about)
     parser.add_argument("topic", nargs="?", metavar="TOPIC", help="name of a page, for instance cli or photos")
     parser.add_argument("--path", action="store_true", help="print only where the page, or the folder, lies")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
+from dyngs.cli.arguments import Commands, add_command
 from dyngs.errors import DyngsError
 
 _REQUIRED = {
@@ -27,6 +28,7 @@ _REQUIRED = {
     "scikit-image": "skimage",
     "scipy": "scipy",
     "av": "av",
+    "argcomplete": "argcomplete",
 }
 _OPTIONAL = {
     "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install 'dyngs[metrics]'"),
@@ -45,10 +47,8 @@ class Finding:
     verdict: Literal["ok", "absent", "broken"] = "ok"
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``doctor`` to the commands."""
-    parser = commands.add_parser("doctor", help="report versions, cores, instruction set and optional packages")
-    parser.set_defaults(run=run)
+def add_parser(commands: Commands) -> None:
+    add_command(commands, "doctor", run, "report versions, cores, instruction set and optional packages")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -96,8 +96,7 @@ def _examine_core() -> Iterator[Finding]:
     yield Finding("native core", value)
     runtimes = openmp_runtimes()
     if runtimes is not None:
-        names = ", ".join(path.name for path in runtimes)
-        yield Finding("OpenMP runtimes", f"{len(runtimes)}: {names}" if runtimes else "0")
+        yield Finding("OpenMP runtimes", f"{len(runtimes)}: {', '.join(path.name for path in runtimes)}")
 
 
 def _examine_gpu() -> Iterator[Finding]:

@@ -6,7 +6,18 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_data_root, add_device, computing_device, data_root, input_path, threads
+from dyngs.cli.arguments import (
+    Commands,
+    add_command,
+    add_data_root,
+    add_device,
+    add_split,
+    add_threads,
+    computing_device,
+    data_root,
+    input_path,
+    print_notes,
+)
 from dyngs.errors import counted
 
 if TYPE_CHECKING:
@@ -18,26 +29,20 @@ _OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
 """Of the tested images, and on them."""
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``eval`` to the commands."""
-    parser = commands.add_parser(
-        "eval",
-        help="evaluate a run on held-out views",
-        description="Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split).",
-    )
+def add_parser(commands: Commands) -> None:
+    about = "Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split)."
+    parser = add_command(commands, "eval", run, "evaluate a run on held-out views", about)
     parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
-    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test", help="default test")
+    add_split(parser)
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    add_threads(parser)
     add_device(parser)
     add_data_root(parser)
-    parser.add_argument(
-        "--refine",
-        action="store_true",
-        help="also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; "
-        "always done after camera.refine",
+    about = (
+        "also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; always "
+        "done after camera.refine"
     )
-    parser.set_defaults(run=run)
+    parser.add_argument("--refine", action="store_true", help=about)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -60,8 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         data_root=data_root(arguments),
     )
     Console().print(report_table(report))
-    for note in report.notes:
-        print(f"note: {note}")
+    print_notes(report.notes)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 

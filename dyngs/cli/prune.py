@@ -6,7 +6,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_run_device, computing_device, input_path, output_path, run_device, threads
+from dyngs.cli.arguments import (
+    Commands,
+    add_command,
+    add_overrides,
+    add_run_device,
+    add_threads,
+    computing_device,
+    input_path,
+    output_path,
+    run_device,
+)
 from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
@@ -28,45 +38,32 @@ As a stage of training: dyngs train CONFIG ... prune.fraction=0.8. All options a
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``prune`` to the commands."""
-    parser = commands.add_parser(
+def add_parser(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "prune",
-        help="take from a run as much as a loss of 0.2 dB allows: a smaller, faster run and its file",
-        description="Remove Gaussians, faint blending, control nodes, pieces of splines, harmonics and precision as "
-        "far as views that fine-tuning does not see lose no more than --max-loss. Every trial is fine-tuned. Writes a "
-        "new run folder with its file and prints quality, speed and size before and after.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "take from a run as much as a loss of 0.2 dB allows: a smaller, faster run and its file",
+        "Remove Gaussians, faint blending, control nodes, pieces of splines, harmonics and precision as far as views "
+        "that fine-tuning does not see lose no more than --max-loss. Every trial is fine-tuned. Writes a new run "
+        "folder with its file and prints quality, speed and size before and after.",
+        _EPILOG,
     )
     parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
     parser.add_argument("--out", type=output_path, required=True, metavar="RUN2", help="folder of the new run")
-    parser.add_argument(
-        "--max-loss",
-        type=_decibels,
-        metavar="DB",
-        help=f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})",
-    )
-    parser.add_argument(
-        "--prune",
-        metavar="R",
-        help="no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else",
-    )
-    parser.add_argument(
-        "--score",
-        choices=("variation", "sensitivity", "contribution", "temporal"),
-        help="importance score of a Gaussian (default sensitivity)",
-    )
-    parser.add_argument(
-        "--masks", metavar="K", help="no search: number of key times of visibility masks (default: no masks)"
-    )
+    about = f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})"
+    parser.add_argument("--max-loss", type=_decibels, metavar="DB", help=about)
+    about = "no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else"
+    parser.add_argument("--prune", metavar="R", help=about)
+    scores = ("variation", "sensitivity", "contribution", "temporal")
+    parser.add_argument("--score", choices=scores, help="importance score of a Gaussian (default sensitivity)")
+    about = "no search: number of key times of visibility masks (default: no masks)"
+    parser.add_argument("--masks", metavar="K", help=about)
     parser.add_argument("--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    add_threads(parser)
     add_run_device(parser)
-    parser.add_argument(
-        "overrides", nargs="*", default=[], metavar="key=value", help="other config keys of the run (docs/cli.md)"
-    )
-    parser.set_defaults(run=run, takes_root=True)
+    add_overrides(parser, "key=value", "other config keys of the run (docs/cli.md)")
+    parser.set_defaults(takes_root=True)
 
 
 def run(arguments: argparse.Namespace) -> int:

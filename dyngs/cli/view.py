@@ -5,7 +5,19 @@ from __future__ import annotations
 import argparse
 import threading
 
-from dyngs.cli.arguments import add_data_root, add_device, computing_device, data_root, input_path, threads
+from dyngs.cli.arguments import (
+    Commands,
+    add_command,
+    add_data_root,
+    add_device,
+    add_threads,
+    add_up,
+    computing_device,
+    data_root,
+    input_path,
+    print_notes,
+    whole,
+)
 from dyngs.errors import DyngsError
 
 _EPILOG = """\
@@ -21,52 +33,27 @@ Needs viser: pip install 'dyngs[view]'. All controls are in docs/viewer.md.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``view`` to the commands."""
-    parser = commands.add_parser(
-        "view",
-        help="look at a run or a file in a browser",
-        description="Serve a page that shows a scene from anywhere at any time, beside the truth of its capture.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_parser(commands: Commands) -> None:
+    about = "Serve a page that shows a scene from anywhere at any time, next to the truth of its capture."
+    parser = add_command(commands, "view", run, "look at a run or a file in a browser", about, _EPILOG)
     parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help="run folder, file, or a folder of runs")
     add_serving_arguments(parser)
-    parser.add_argument(
-        "--motion", type=input_path, metavar="PATH", help="motion file for a person, or a folder of them"
-    )
-    parser.add_argument(
-        "--capture",
-        type=input_path,
-        metavar="PATH",
-        help="for a network of people: whom to predict, or a folder of people",
-    )
-    parser.add_argument(
-        "--up",
-        choices=("x", "y", "z", "-x", "-y", "-z"),
-        help="up axis (default: up for the cameras of a run; of a file what it says, or what is usual for its format)",
-    )
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
+    about = "motion file for a person, or a folder of them"
+    parser.add_argument("--motion", type=input_path, metavar="PATH", help=about)
+    about = "for a network of people: whom to predict, or a folder of people"
+    parser.add_argument("--capture", type=input_path, metavar="PATH", help=about)
+    add_up(parser)
+    add_threads(parser)
     add_device(parser)
     add_data_root(parser)
-    parser.set_defaults(run=run)
 
 
 def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of how the page is served."""
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on (default: this machine only); others get a link with a token",
-    )
-    parser.add_argument("--port", type=port, metavar="N", help="port (default: 8080, or the next that is free)")
-
-
-def port(text: str) -> int:
-    """Return the number of a port."""
-    if not (text.isascii() and text.isdigit() and len(text) < 6 and 1 <= int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port; write a whole number from 1 to 65535")
-    return int(text)
+    about = "address to listen on (default: this machine only); others get a link with a token"
+    parser.add_argument("--host", default="127.0.0.1", help=about)
+    kind = whole("a port", 1, 65535)
+    parser.add_argument("--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -88,8 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     first = first_of(source)
     if motions and first.person is None:
         raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")
-    for note in first.notes:
-        print(f"note: {note}")
+    print_notes(first.notes)
     serving = Serving(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
         print(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it", flush=True)

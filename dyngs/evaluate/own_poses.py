@@ -24,8 +24,7 @@ from dyngs.gaussians.scene import require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.metrics import Lpips, psnr
-from dyngs.runs.cameras import found_corrections
-from dyngs.runs.checkpoint import LoadedRun
+from dyngs.runs.checkpoint import LoadedRun, found_corrections
 from dyngs.training.corrections.camera_fit import fitted_to_image
 
 

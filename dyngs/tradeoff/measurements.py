@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, Field, TypeAdapter
 
 from dyngs.errors import reading, require_regular
 from dyngs.files.write import write_text
 from dyngs.tradeoff.variants import Variant
+
+_Measured = Annotated[float, Field(gt=1e-9)]
+"""Milliseconds, or a gain: a smaller number is none that was measured."""
+_AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 @dataclass(frozen=True)
 class Quartiles:
     """Median, lower and upper quartile."""
 
-    median: float
-    low: float
-    high: float
+    __pydantic_config__ = _AS_STORED
+    median: _Measured
+    low: _Measured
+    high: _Measured
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class Measurement:
         speed: None until it is measured.
     """
 
+    __pydantic_config__ = _AS_STORED
     variant: Variant
     num_views: int
     psnr: float
@@ -64,35 +70,20 @@ class Measurement:
         return 1.0 if self.speed is None else self.speed.gain.median
 
 
-_MEASUREMENT = TypeAdapter(Measurement)
-_SHORTEST = 1e-9
-"""Milliseconds, and a gain, below which a number is none that was measured."""
+_STORED = TypeAdapter(Measurement)
 
 
 def read_measurement(path: Path) -> Measurement:
     """Read a measurement from its JSON file."""
     with reading(path, "it is no measurement of a variant: remove it to have it measured again"):
         require_regular(path)
-        stored = json.loads(path.read_text(encoding="utf-8"), parse_float=_finite, parse_constant=_finite)
-        variant, speed = Variant(**stored.pop("variant")), stored.pop("speed")
-        if speed is not None:
-            speed = Speed(Quartiles(**speed["ms"]), Quartiles(**speed["gain"]))
-            if min(*speed.ms.__dict__.values(), *speed.gain.__dict__.values()) < _SHORTEST:
-                raise ValueError("a time that is not positive, or too short to be one")
-        return _MEASUREMENT.validate_python(asdict(Measurement(variant=variant, speed=speed, **stored)))
+        return _STORED.validate_json(path.read_bytes())
 
 
 def write_measurement(path: Path, measurement: Measurement) -> None:
     """Write a measurement as JSON, atomically."""
     values = asdict(measurement) | {"variant": measurement.variant.changes}
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text} is not finite")
-    return value
 
 
 def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:

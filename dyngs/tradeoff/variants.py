@@ -6,6 +6,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
+from pydantic import ConfigDict
+
 from dyngs.config import Config, DynamicModel
 from dyngs.config.schema import kinds_of
 from dyngs.conventions import RasterizeMode
@@ -36,6 +38,7 @@ class Variant:
         scale: width and height rendered, relative to those shown.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
     colour: str | None = None
     field: str | None = None
     field_size: float = 1.0
