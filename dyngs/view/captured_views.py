@@ -42,12 +42,10 @@ class CapturedViews:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the views, each once."""
         return tuple(view.name for view in self.views)
 
     @property
     def times(self) -> tuple[float | None, ...]:
-        """Times of the views."""
         return tuple(view.time for view in self.views)
 
     @property
@@ -58,14 +56,7 @@ class CapturedViews:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where a scene is looked at first.
-
-    Attributes:
-        start: the first camera.
-        center: (3,) point to orbit around.
-        extent: rough size of what is looked at, world units.
-        up: (3,) unit vector.
-    """
+    """The camera from which a scene is looked at first, the point (3,) to orbit around, its rough size, and up (3,)."""
 
     start: Cameras
     center: np.ndarray

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -46,13 +45,7 @@ def motion_files(path: Path | None) -> dict[str, Path]:
 
 
 def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles) -> Opened:
-    """Return the person of ``opened``, as it was loaded, in one of the motions.
-
-    Args:
-        opened: a person in the motion of the capture.
-        choice: ``AS_CAPTURED``, ``AT_REST``, ``BY_SLIDERS`` or the name of a file.
-        files: by name.
-        angles: of the sliders.
+    """Return the person of ``opened`` in a motion: as captured, at rest, by the ``angles`` of sliders, or of a file.
 
     Raises:
         DyngsError: the file cannot be read.
@@ -65,7 +58,9 @@ def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: An
 
 
 def posed(opened: Opened, angles: Angles) -> Opened:
-    """Return the person of ``opened`` in the rest pose with joints turned by ``angles``."""
+    """Return the person of ``opened`` in the rest pose with joints rotated by ``angles``."""
+    from scipy.spatial.transform import Rotation
+
     person = opened.person
     if person is None:
         raise ValueError("only a person can be posed")
@@ -73,19 +68,11 @@ def posed(opened: Opened, angles: Angles) -> Opened:
     poses = clip.poses.clone()
     for name, turns in angles.items():
         row = joint_row(name, poses.shape[1])
-        poses[0, row] = _composed(poses[0, row], turns)
+        rest = Rotation.from_rotvec(poses[0, row].double().cpu().numpy())
+        poses[0, row] = torch.from_numpy((rest * Rotation.from_euler("xyz", turns, degrees=True)).as_rotvec()).to(poses)
     return replace(opened, renderable=person.playing(replace(clip, poses=poses)), as_captured=False)
 
 
 def joint_row(name: str, count: int) -> int:
     """Return the row of a joint of a body with ``count`` joints."""
     return SMPLX_ROWS[count].index(JOINT_NAMES.index(name))
-
-
-def _composed(rest: torch.Tensor, degrees: tuple[float, float, float]) -> torch.Tensor:
-    """Return the axis-angle (3,) of ``rest`` (3,) after turns about x, y and z."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_euler("xyz", [math.radians(value) for value in degrees])
-    whole = Rotation.from_rotvec(rest.double().cpu().numpy()) * turn
-    return torch.from_numpy(whole.as_rotvec()).to(rest)

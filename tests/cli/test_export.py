@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,12 @@ def test_a_page_is_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert (tmp_path / "scene.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert main(["export", str(run), "--format", "html"]) == 0
     assert (run / "scene.html").is_file()
+
+
+def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
+    dotted = shutil.copytree(run, tmp_path / "rc_0.2")
+    assert main(["export", str(dotted), "--format", "html"]) == 0
+    assert "<title>rc_0.2</title>" in (dotted / "scene.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
