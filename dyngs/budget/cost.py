@@ -51,7 +51,7 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Cost:
+class ExpectedCost:
     """What a run of ``steps`` is expected to cost: seconds, bytes of memory and of disk, and its Gaussians."""
 
     steps: int
@@ -77,19 +77,18 @@ class CostMeter:
 
     def __call__(self, event: Event) -> None:
         """Take in a step."""
-        match event:
-            case StepDone():
-                now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
-                config = self.run.trainer.config
-                self._pixels = full_pixels(config, event.step, height * width)
-                if self._last is not None:
-                    cost = step_cost(config, event.step, self._pixels, event.num_gaussians)
-                    self._paces.append((now - self._last) / cost)
-                    self._stepping += now - self._last
-                self._last = now
+        if isinstance(event, StepDone):
+            now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
+            config = self.run.trainer.config
+            self._pixels = full_pixels(config, event.step, height * width)
+            if self._last is not None:
+                cost = step_cost(config, event.step, self._pixels, event.num_gaussians)
+                self._paces.append((now - self._last) / cost)
+                self._stepping += now - self._last
+            self._last = now
 
-    def found(self) -> Cost | None:
-        """Return what the whole run would cost; None where there were too few steps to tell."""
+    def found(self) -> ExpectedCost | None:
+        """Return what the full run would cost; None where there were too few steps to tell."""
         paces = self._paces[FIRST:]
         if not paces:
             return None
@@ -104,7 +103,7 @@ class CostMeter:
         least, expected, most = (peak + each * max(n - now, 0) for n in (counts.low, counts.middle, counts.high))
         paths = checkpoint_paths(self.run.folder)
         stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if config.train.save_every else 1)
-        return Cost(
+        return ExpectedCost(
             self.steps,
             Range(fast / spread, middle, slow * spread),
             Range(least / MEMORY, expected, most * MEMORY),

@@ -25,7 +25,7 @@ class LimitedRun:
     """A run with limits.
 
     Attributes:
-        config: as it is saved there; that of the trainer has its limits applied.
+        config: as it is saved in ``folder``; that of the trainer has its limits applied.
         given: seconds that it has.
         reserve: seconds that its limits need before the end.
     """
@@ -44,7 +44,7 @@ class LimitedRun:
 
     @property
     def stage(self) -> int:
-        """Return the number of removal stages that the run has reached; the last is its end."""
+        """See ``stage``."""
         return stage(self.config, self.trainer.done, self.used / self.given)
 
     def exchange(self, trainer: GaussianTrainer) -> None:

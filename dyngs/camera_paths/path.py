@@ -16,7 +16,6 @@ from dyngs.camera import Cameras
 from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
 from dyngs.data.geometry import cam_from_opengl, checked_pose
 from dyngs.errors import DyngsError, printable, require_regular
-from dyngs.files.write import write_text
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -114,22 +113,6 @@ def parse_times(text: str) -> tuple[float, ...]:
     return tuple(np.linspace(start, stop, int(count)).tolist())
 
 
-def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = None) -> None:
-    """Write a path as JSON in the format of ``read_path``, atomically; ``world_offset`` as there."""
-    cameras = path.cameras
-    poses = _rebased(cameras.cam_from_world.detach().cpu().double().numpy(), world_offset, sign=-1.0)
-    frames = []
-    for i in range(len(cameras)):
-        k = cameras.intrinsics[i].tolist()
-        frame: dict[str, Any] = {"cam_from_world": poses[i].tolist()}
-        frame |= {"fl_x": k[0][0], "fl_y": k[1][1], "cx": k[0][2], "cy": k[1][2]}
-        if path.times is not None:
-            frame["time"] = path.times[i]
-        frames.append(frame)
-    document = {"width": cameras.width, "height": cameras.height, "fps": path.fps, "frames": frames}
-    write_text(file, json.dumps(document, indent=1) + "\n")
-
-
 def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
     """Read a camera path from a JSON file; cameras are float32 on the CPU.
 
@@ -156,7 +139,8 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
     width, height = (int(_number(document, key, str(file), low=1, high=65536)) for key in ("width", "height"))
     fps = _number(document, "fps", str(file), low=1e-3, high=1000, default=30.0)
     poses, intrinsics, times = _read_cameras(document, given[0], (width, height), file)
-    poses = _rebased(poses, world_offset, sign=1.0)
+    if world_offset is not None:
+        poses[:, :3, 3] += poses[:, :3, :3] @ world_offset
     if given[0] == "keyframes":
         keys, num_frames = _read_keyframes(document, Keyframes(poses, intrinsics, np.zeros(0), times), fps, file)
         made = interpolate_keyframes(keys, np.arange(num_frames) / fps)
@@ -167,14 +151,6 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
         return path
     clamped, warnings = _clamped(times.tolist(), str(file))
     return replace(path, times=clamped, warnings=warnings)
-
-
-def _rebased(cam_from_world: np.ndarray, world_offset: np.ndarray | None, sign: float) -> np.ndarray:
-    """Return poses (F, 4, 4) for a world shifted by minus (sign 1) or plus (sign -1) the offset."""
-    moved = cam_from_world.copy()
-    if world_offset is not None:
-        moved[:, :3, 3] += sign * moved[:, :3, :3] @ world_offset
-    return moved
 
 
 def _read_cameras(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from types import TracebackType
 from typing import IO, Any
 
 SECONDS_BETWEEN_LINES = 10.0
@@ -16,9 +15,6 @@ class ProgressBar:
     """Context manager that shows how far work has come, to be called as a ``ReportProgress``.
 
     On a terminal, one bar for each kind of work; elsewhere plain lines, none for work that is soon done.
-
-    Args:
-        stream: where to; None: standard error.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
@@ -51,9 +47,7 @@ class ProgressBar:
         self._since = self._last_line = time.monotonic()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bars is not None:
             self._bars.stop()
 

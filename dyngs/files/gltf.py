@@ -248,13 +248,13 @@ class GltfFile:
 
 
 def _chunks(path: Path) -> tuple[bytes, bytes]:
-    """Return the JSON chunk and the binary chunk of a ``.glb``; a ``.gltf`` is all JSON."""
+    """Return the JSON chunk and the binary chunk of a file."""
     require_regular(path)
     try:
         content = path.read_bytes()
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({error.strerror})") from error
-    if content[:4] != b"glTF":
+    if content[:4] != b"glTF":  # a .gltf
         return content.removeprefix(b"\xef\xbb\xbf"), b""
     found: dict[bytes, bytes] = {}
     start = 12
@@ -288,8 +288,7 @@ class GlbDocument:
         """Add an accessor of (K, D) or (K,) numbers; return its index.
 
         Args:
-            values: float32, uint8, uint16 or uint32, which stay as they are until the file is written; rows of several
-                numbers take a multiple of four bytes.
+            values: float32, uint8, uint16 or uint32; rows of several numbers take a multiple of four bytes.
             use: ``VERTICES`` or ``INDICES`` for those of a mesh.
             limits: whether the smallest and the largest number of each column are stated.
         """
@@ -323,7 +322,6 @@ class GlbDocument:
             out.write(struct.pack("<I4s", len(text), b"JSON") + text)
             out.write(struct.pack("<I4s", self._size, b"BIN\0"))
             for part in self._data:
-                content = (
-                    part if isinstance(part, bytes) else part.astype(part.dtype.newbyteorder("<"), copy=False).tobytes()
-                )
-                out.write(content + b"\0" * (-len(content) % 4))
+                if not isinstance(part, bytes):
+                    part = part.astype(part.dtype.newbyteorder("<"), copy=False).tobytes()
+                out.write(part + b"\0" * (-len(part) % 4))

@@ -42,12 +42,7 @@ BACKGROUNDS = ("white", "black", "random")
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A trained model, ready to be drawn.
-
-    Attributes:
-        renderable: what is drawn at any time.
-        step, seconds_train: how far and how long it was trained (0 s where ``timing.json`` is lost).
-    """
+    """A trained model, ready to be drawn; ``seconds_train`` is 0 where ``timing.json`` is lost."""
 
     config: Config
     renderable: Renderable
@@ -102,23 +97,14 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Return the checkpoint in ``path``.
-
-    Raises:
-        DyngsError: a file that is missing, truncated, altered, or of another version; names an older one if there is.
-    """
+    """Return the checkpoint in ``path``. Raises DyngsError, which names an older one if there is."""
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
     with reading(path, _instead_of(path).removeprefix("; ")):
         return Checkpoint(info_of(header), tensors, path)
 
 
 def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
-    """Return the metadata in the header of a file.
-
-    Raises:
-        KeyError: something lacks.
-        ValueError, TypeError, OverflowError: a value is of another kind or out of range.
-    """
+    """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or OverflowError."""
     step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
     extent, background, mode = float(header["extent"]), header["background"], header["rasterize_mode"]
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= MAX_STEP:
@@ -144,10 +130,7 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
 
 
 def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
-    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints.
-
-    ``data_root`` is where its capture lies by now, if that was moved.
-    """
+    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has none."""
     config = load_resolved(run_dir, data_root=data_root)
     if config.model.is_network:
         raise DyngsError(

@@ -6,7 +6,6 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import IO, Any
 
 from dyngs.config import Config
@@ -19,15 +18,11 @@ PLAIN_LINES = 10
 
 
 class Progress:
-    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left.
+    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; a context manager.
 
-    Where there is no terminal, plain lines.
-
-    A context manager; tells nothing where ``total`` steps are already done.
+    Where there is no terminal, plain lines. Tells nothing where ``total`` steps are already done.
 
     Args:
-        total: steps that there will be.
-        done: steps done.
         every: steps between updates; the last step has one, too.
         stream: where to; None: standard error.
         config: returns the configuration as it is now, whose schedule decides the time left; None: steps all alike.
@@ -110,9 +105,7 @@ class Progress:
         self._forecast.restart(self._start, self._since)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 

@@ -31,12 +31,8 @@ class Quality:
 
 def with_render_settings(variant: Variant, model: SceneModel) -> SceneModel:
     """Return the ``model`` section of a run with the render settings of a variant."""
-    mode = None if variant.mode is None else RasterizeMode(variant.mode)
-    changes = {
-        "rasterize_mode": mode,
-        "alpha_min": variant.alpha_min,
-        "transmittance_min": variant.transmittance_min,
-    }
+    changes = {"alpha_min": variant.alpha_min, "transmittance_min": variant.transmittance_min}
+    changes |= {"rasterize_mode": None if variant.mode is None else RasterizeMode(variant.mode)}
     return model.model_copy(update={name: value for name, value in changes.items() if value is not None})
 
 

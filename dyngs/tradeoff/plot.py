@@ -20,7 +20,6 @@ MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'
 
 
 def can_plot() -> bool:
-    """Return whether matplotlib is installed."""
     return find_spec("matplotlib") is not None
 
 

@@ -96,7 +96,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Setting:
+class Varied:
     """A setting that can be varied.
 
     Attributes:
@@ -140,18 +140,18 @@ _FIELDS = tuple(kinds_of(DynamicModel.model_fields["deform"]))
 _COLOURS = tuple(kinds_of(Config.model_fields["colour"]))
 _MODES = tuple(mode.value for mode in RasterizeMode)
 SETTINGS = (
-    Setting("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
-    Setting("mask_times", (6, 16), low=2, high=1000, whole=True),
-    Setting("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
-    Setting("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
-    Setting("mode", _MODES, words=_MODES),
-    Setting("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
-    Setting("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
-    Setting("scale", (0.75, 0.5), low=0.05, high=1.0),
-    Setting("field_step", (4.0, 16.0), low=1 / 64, high=1024),
-    Setting("colour", _COLOURS, words=_COLOURS, trains=True),
-    Setting("field", _FIELDS, words=_FIELDS, trains=True),
-    Setting("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
+    Varied("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
+    Varied("mask_times", (6, 16), low=2, high=1000, whole=True),
+    Varied("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
+    Varied("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
+    Varied("mode", _MODES, words=_MODES),
+    Varied("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
+    Varied("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
+    Varied("scale", (0.75, 0.5), low=0.05, high=1.0),
+    Varied("field_step", (4.0, 16.0), low=1 / 64, high=1024),
+    Varied("colour", _COLOURS, words=_COLOURS, trains=True),
+    Varied("field", _FIELDS, words=_FIELDS, trains=True),
+    Varied("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
 )
 
 
@@ -159,20 +159,13 @@ SETTINGS = (
 class Variation:
     """A setting and the values to try."""
 
-    setting: Setting
+    setting: Varied
     values: tuple[Value, ...]
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """The settings of the run that is varied.
-
-    Attributes:
-        sh_degree: degree of its spherical harmonics, 0 if a network colours it.
-        mode, alpha_min, transmittance_min: it is rendered with.
-        mask_times: number of key times of its visibility masks.
-        field: kind of the deformation field; None: nothing moves.
-    """
+    """The settings of the run that is varied, as in ``Variant``; ``field`` None: nothing moves."""
 
     sh_degree: int
     mode: str
@@ -182,7 +175,7 @@ class RunSettings:
     colour: str
     field: str | None
 
-    def allows(self, setting: Setting, value: Value) -> bool:
+    def allows(self, setting: Varied, value: Value) -> bool:
         """Whether a value applies to the run and differs from its own."""
         if setting.name == "sh_degree":
             return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
@@ -195,9 +188,7 @@ class RunSettings:
 def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, ...]:
     """Return the variations of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE``; without any, all with defaults.
 
-    Args:
-        words: one per ``--vary``.
-        trains: settings that need training from scratch are allowed.
+    ``trains``: settings that need training from scratch are allowed.
     """
     if not words:
         return tuple(Variation(setting, setting.values) for setting in SETTINGS if trains or not setting.trains)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from camera_path_files import write_path
 from camera_rings import UP, ring_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,7 +24,6 @@ from dyngs.camera_paths.path import (
     resize_cameras,
     static_path,
     with_times,
-    write_path,
 )
 from dyngs.errors import DyngsError
 

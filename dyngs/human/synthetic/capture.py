@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
-from dyngs.files.outputs import new_capture
+from dyngs.files.outputs import new_folder
 from dyngs.files.write import write_image, write_text
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
@@ -107,7 +107,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     clips = {"train": _clip(body, options.num_frames, options.clip_seed, 0)}
     if options.num_new and test:
         clips["pose"] = _clip(body, options.num_new, options.clip_seed, 1)
-    with new_capture(out) as started:
+    with new_folder(out) as started:
         for name, clip in clips.items():
             motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
             meshes = list(_posed_meshes(clothed, motion, texture))
