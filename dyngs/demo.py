@@ -58,11 +58,7 @@ class DemoResult:
 
 
 def run_demo(out: Path, options: DemoOptions = DemoOptions()) -> DemoResult:
-    """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty.
-
-    Raises:
-        DyngsError: the folder cannot be written.
-    """
+    """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty. Raises DyngsError."""
     start = time.perf_counter()
     with claimed_folder(out) as folder:
         capture, run_dir, images, video = (folder / name for name in ("capture", "run", "images", "orbit.mp4"))
@@ -123,7 +119,6 @@ def is_unused(folder: Path) -> bool:
 
 
 def result_table(result: DemoResult) -> Table:
-    """Return the results as a table with one row."""
     from rich.table import Table
 
     report = result.report

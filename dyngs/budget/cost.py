@@ -1,8 +1,7 @@
 """The cost of a run of all its steps, by what was measured in one that ``train.minutes`` made shorter: a preview.
 
-A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.training.clock``); how
-fast this machine is at that was measured in every step. Gaussians are added at certain steps, about equally many each
-time. How far that was from whole runs: docs/budget.md.
+A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.training.clock``), at the
+measured pace; about equally many Gaussians are added each time. How far that was from full runs: docs/budget.md.
 """
 
 from __future__ import annotations
@@ -76,7 +75,6 @@ class CostMeter:
         self._pixels = self._stepping = 0.0
 
     def __call__(self, event: Event) -> None:
-        """Take in a step."""
         if isinstance(event, StepDone):
             now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
             config = self.run.trainer.config

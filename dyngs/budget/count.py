@@ -73,7 +73,6 @@ class CountLimit:
 
 
 def count_limit(run: LimitedRun) -> CountLimit | None:
-    """Return the limit of a run, None without one."""
     times = {view.time for view in run.trainer.images.views if view.time is not None}
     most = most_gaussians(run.trainer.config, len(times))
     return None if most is None else CountLimit(run, most)

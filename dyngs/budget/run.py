@@ -44,11 +44,9 @@ class LimitedRun:
 
     @property
     def stage(self) -> int:
-        """See ``stage``."""
         return stage(self.config, self.trainer.done, self.used / self.given)
 
     def exchange(self, trainer: GaussianTrainer) -> None:
-        """Go on with another trainer."""
         self.trainer = self.loop.trainer = trainer
 
     def remove(self, kept: Tensor) -> tuple[float, float]:
@@ -60,7 +58,6 @@ class LimitedRun:
         return before, training_quality(trainer, trainer.model.scene)
 
     def say(self, text: str) -> None:
-        """Tell people."""
         self.loop.tell(Message(text))
 
 

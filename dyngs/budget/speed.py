@@ -142,11 +142,7 @@ class SpeedLimit:
             self.hold()
 
     def reached(self) -> str:
-        """Return the line about ``budget.min_fps`` after a run.
-
-        Raises:
-            DyngsError: it is too slow after all.
-        """
+        """Return the line about ``budget.min_fps`` after a run. Raises DyngsError: it is too slow after all."""
         found, trainer = self.found, self.run.trainer
         got, count = 1 / found.seconds, trainer.num_gaussians
         if got < self.fps:

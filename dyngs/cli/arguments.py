@@ -92,13 +92,11 @@ def image_size(text: str) -> tuple[int, int]:
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
-    """Add ``--threads``."""
     kind = whole("a number of threads", 0, 1024, ", 0 for all cores")
     parser.add_argument("--threads", type=kind, default=0, metavar="N", help="number of threads, 0 = all cores")
 
 
 def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
-    """Add ``--device``."""
     about = f"what computes; auto: a CUDA GPU that can be used, else the CPU (default {default})"
     parser.add_argument("--device", choices=_DEVICES, default=default, help=about)
 
@@ -114,7 +112,6 @@ def run_device(arguments: argparse.Namespace) -> list[str]:
 
 
 def add_split(parser: argparse._ActionsContainer, about: str = "default test", default: str | None = "test") -> None:
-    """Add ``--split``."""
     parser.add_argument("--split", choices=("test", "val", "train", "pose"), default=default, help=about)
 
 
@@ -125,13 +122,11 @@ def add_up(parser: argparse.ArgumentParser, of: str = "") -> None:
 
 
 def add_motion(parser: argparse._ActionsContainer) -> None:
-    """Add ``--motion``."""
     about = "motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma"
     parser.add_argument("--motion", type=input_path, metavar="FILE", help=about)
 
 
 def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:
-    """Add words ``key=value``."""
     parser.add_argument("overrides", nargs="*", default=[], metavar=metavar, help=about)
 
 
@@ -142,11 +137,7 @@ def add_data_root(parser: argparse.ArgumentParser) -> None:
 
 
 def data_root(arguments: argparse.Namespace) -> Path | None:
-    """Return the folder of ``add_data_root``; None: the capture was not moved.
-
-    Raises:
-        DyngsError: another word.
-    """
+    """Return the folder of ``add_data_root``; None: the capture was not moved. Raises DyngsError: another word."""
     found = None
     for word in arguments.overrides:
         key, equals, value = word.partition("=")
@@ -175,8 +166,7 @@ def data_section(overrides: list[str], capture_format: str = "auto") -> DataConf
 def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Check that no output of a command would replace what it reads, as far as its arguments and overrides say.
 
-    Raises:
-        DyngsError: see ``dyngs.files.outputs.Inputs.require_output``.
+    Raises DyngsError: see ``dyngs.files.outputs.Inputs.require_output``.
     """
     words = [word.partition("=") for word in getattr(arguments, "overrides", ())]
     outputs = [*_values(parser, arguments, output_path), *(value for key, _, value in words if key == "run.dir")]
@@ -203,8 +193,7 @@ def _values(parser: argparse.ArgumentParser, arguments: argparse.Namespace, kind
 def computing_device(choice: str) -> torch.device:
     """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line on stderr says why.
 
-    Raises:
-        DyngsError: ``cuda`` where no GPU can be used.
+    Raises DyngsError: ``cuda`` where no GPU can be used.
     """
     from dyngs.ops.device import device_for, why_on_cpu
 

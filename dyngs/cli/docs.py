@@ -24,7 +24,6 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show a page, or print where it is."""
     folder = docs_folder()
     if arguments.path:
         print(folder if arguments.topic is None else page(folder, arguments.topic))
@@ -51,8 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 def docs_folder() -> Path:
     """Return the folder of the pages: in an installation that of the package, in a checkout that of the repository.
 
-    Raises:
-        DyngsError: it is not there.
+    Raises DyngsError: it is not there.
     """
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "docs", package.parent / "docs"):
@@ -62,11 +60,7 @@ def docs_folder() -> Path:
 
 
 def page(folder: Path, topic: str) -> Path:
-    """Return the page of a topic.
-
-    Raises:
-        DyngsError: there is none; names those that are similar.
-    """
+    """Return the page of a topic. Raises DyngsError: there is none; names those that are similar."""
     pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
     name = topic.removesuffix(".md")
     if name in pages:

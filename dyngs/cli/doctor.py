@@ -14,22 +14,9 @@ from typing import Literal
 from dyngs.cli.arguments import Commands, add_command
 from dyngs.errors import DyngsError
 
-_REQUIRED = {
-    "torch": "torch",
-    "numpy": "numpy",
-    "pydantic": "pydantic",
-    "pyyaml": "yaml",
-    "safetensors": "safetensors",
-    "rich": "rich",
-    "pycolmap": "pycolmap",
-    "trimesh": "trimesh",
-    "kornia": "kornia",
-    "OpenImageIO": "OpenImageIO",
-    "scikit-image": "skimage",
-    "scipy": "scipy",
-    "av": "av",
-    "argcomplete": "argcomplete",
-}
+_SAME = ("torch", "numpy", "pydantic", "safetensors", "rich", "pycolmap", "trimesh", "kornia", "OpenImageIO", "scipy")
+_REQUIRED = {name: name for name in (*_SAME, "av", "argcomplete")} | {"pyyaml": "yaml", "scikit-image": "skimage"}
+"""Packages, and the modules that they have."""
 _OPTIONAL = {
     "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install 'dyngs[metrics]'"),
     "lpips": ("lpips", "the LPIPS metric: pip install 'dyngs[metrics]'"),
@@ -52,7 +39,6 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the report."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -70,7 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def examine() -> Iterator[Finding]:
-    """Yield the rows of the report."""
     yield Finding("dyngs", _version("dyngs") or "not installed (run from a source folder)")
     yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
     yield Finding("cores", f"{_usable_cores()} usable of {os.cpu_count()}")

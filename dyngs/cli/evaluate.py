@@ -83,14 +83,9 @@ def report_table(report: EvalReport) -> Table:
     if report.psnr_own_poses is not None:
         table.add_row(f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB")
     table.add_row("SSIM", f"{report.ssim:.4f}")
-    for label, value in _rows_of_person(report):
-        table.add_row(label, value)
-    for label, value in _rows_of_regions(report):
+    for label, value in (*_rows_of_person(report), *_rows_of_regions(report)):
         table.add_row(label, escape(value))
-    for label, name, value in (
-        ("FLIP", "flip", report.flip),
-        (f"LPIPS ({report.lpips_net})", "lpips", report.lpips),
-    ):
+    for label, name, value in (("FLIP", "flip", report.flip), (f"LPIPS ({report.lpips_net})", "lpips", report.lpips)):
         reason = escape(report.reasons.get(name, "not measured"))
         table.add_row(label, reason if value is None else f"{value:.4f}")
     for label, value in _rows_over_time(report):
@@ -126,14 +121,12 @@ def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the PSNR of parts of images; of a still capture only what is known."""
+    """Return labels and values of the PSNR of parts of images; of a static capture only what is known."""
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
-    for label, name, value in (
-        ("on what moves", "psnr_moving", report.psnr_moving),
-        ("on what does not", "psnr_static", report.psnr_static),
-    ):
+    moving, static = report.psnr_moving, report.psnr_static
+    for label, name, value in (("on what moves", "psnr_moving", moving), ("on what does not", "psnr_static", static)):
         if value is not None:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
         elif report.psnr_per_time:
@@ -142,7 +135,6 @@ def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the metrics over time."""
     if not report.psnr_per_time:
         return []
     values = [at.psnr for at in report.psnr_per_time]
@@ -150,10 +142,8 @@ def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
     low, mean, high = min(values), sum(values) / len(values), max(values)
     spread = f"min {low:.2f}, mean {mean:.2f}, max {high:.2f} dB; worst at time {worst.time:g}"
     rows = [(f"PSNR at {counted(len(values), 'time')}", spread)]
-    for label, name, value in (
-        ("flicker", "flicker", report.flicker),
-        ("flicker error", "flicker_error", report.flicker_error),
-    ):
+    flickers = (("flicker", "flicker", report.flicker), ("flicker error", "flicker_error", report.flicker_error))
+    for label, name, value in flickers:
         reason = report.reasons.get(name, "not measured")
         known = "0 (nothing moves)" if name == "flicker" and not report.num_moving else f"{value or 0:.3f} of 255"
         rows.append((label, reason if value is None else known))

@@ -152,8 +152,7 @@ def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
 def _kind(arguments: argparse.Namespace) -> str:
     """Return the name of the format: what --format says, else what the suffix of --out names, else ply.
 
-    Raises:
-        DyngsError: an unknown suffix, or one of another format than --format.
+    Raises DyngsError: an unknown suffix, or one of another format than --format.
     """
     from dyngs.splats.formats import all_suffixes, known_format
 

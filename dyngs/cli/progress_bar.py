@@ -26,7 +26,6 @@ class ProgressBar:
         self._since = self._last_line = time.monotonic()
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` parts of ``what`` are done."""
         if self._is_terminal:
             if self._bars is None:  # not before: work that needs no bar leaves no line
                 self._bars = _rich_bars(self._stream)

@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, Promise | None]:
-    """Prune as asked for; return the new folder, and what is promised of it where the share was searched for."""
+    """Prune as requested; return the new folder, and what is promised of it where the fraction was searched for."""
     from dyngs.api.prune import prune_run, prune_within
 
     chosen = any(text.startswith(("prune.fraction=", "prune.mask_times=")) for text in overrides)

@@ -135,7 +135,6 @@ def _has_fixed_camera(arguments: argparse.Namespace) -> bool:
 
 
 def _render(arguments: argparse.Namespace) -> list[Path]:
-    """Render and return the paths of the written files."""
     import torch
 
     from dyngs.export.chosen_path import choose_path

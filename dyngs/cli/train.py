@@ -122,11 +122,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
 
 
 def parse_config(words: Sequence[str], resume: Path | None) -> Config:
-    """Return the configuration for the words after ``dyngs train``.
-
-    Raises:
-        DyngsError: nothing to train, an override that a resumed run does not take, or a wrong key or value.
-    """
+    """Return the configuration for the words after ``dyngs train``. Raises DyngsError."""
     from dyngs.config.io import load_config, load_resolved
 
     has_preset = bool(words) and "=" not in words[0]

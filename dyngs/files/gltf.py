@@ -157,11 +157,7 @@ class _Document(_Part):
 
 
 class GltfFile:
-    """The document of a file, and access to the numbers in its buffers.
-
-    Raises:
-        DyngsError: not glTF 2.0, or damaged.
-    """
+    """The document of a file, and access to the numbers in its buffers. Raises DyngsError: not glTF 2.0, or damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -183,8 +179,7 @@ class GltfFile:
     def numbers(self, index: int, kind: str, dtype: type[np.floating] = np.float64) -> np.ndarray:
         """Return the numbers (K, D) of an accessor, normalised integers in [-1, 1] or [0, 1]; NaN and infinities stay.
 
-        Raises:
-            DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
+        Raises DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
         """
         document = self.document
         if index >= len(document.accessors):

@@ -36,10 +36,9 @@ class Inputs:
     def require_output(self, out: Path) -> None:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
-        Raises:
-            DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is read;
-                or it is a folder that holds a link to an input. A run folder in a capture, an empty folder, and a
-                folder around a capture may be written to.
+        Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is
+        read; or it is a folder that holds a link to an input. A run folder in a capture, an empty folder, and a folder
+        around a capture may be written to.
         """
         if not os.path.lexists(out):
             return
@@ -82,8 +81,7 @@ def require_new_folder(out: Path) -> None:
 def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) -> Iterator[Path]:
     """Yield a hidden folder beside ``out`` that gets its name when the block ends well, and is removed otherwise.
 
-    Raises:
-        DyngsError: by ``require``, before and after; ``out`` cannot be written.
+    Raises DyngsError: by ``require``, before and after; ``out`` cannot be written.
     """
     require(out)
     started = temporary_folder_beside(out)

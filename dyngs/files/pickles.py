@@ -127,7 +127,6 @@ class Unpickler:
         return self.line(_LONGEST_LINE).decode("utf-8")
 
     def push(self, value: object) -> None:
-        """Push a value."""
         self._stack.append(value)
 
     def pop(self) -> Any:
@@ -136,12 +135,10 @@ class Unpickler:
         return self._stack.pop()
 
     def top(self) -> Any:
-        """Return the topmost value."""
         self._require(1)
         return self._stack[-1]
 
     def mark(self) -> None:
-        """Mark the height of the stack."""
         if len(self._marks) >= _MOST_MARKS:
             raise ValueError("it is nested too deeply")
         self._marks.append(len(self._stack))
@@ -174,7 +171,6 @@ class Unpickler:
         self.push(self._memo[str(index)])
 
     def push_container(self, value: Any) -> None:
-        """Push a new container."""
         self._containers += 1
         require_at_most(self._path, self._containers, _MOST_CONTAINERS, "containers")
         self.push(value)
@@ -281,7 +277,6 @@ def require_tree(where: Path, found: object, more: int = 0) -> None:
 
 
 def _items(value: Any) -> list[Any] | None:
-    """Return the items of a container, None for other values."""
     if isinstance(value, dict):
         return [*value.keys(), *value.values()]
     if isinstance(value, (list, tuple)):
@@ -350,7 +345,6 @@ def _set_pairs(unpickler: Unpickler) -> None:
 
 
 def _set_item(unpickler: Unpickler) -> None:
-    """SETITEM."""
     value = unpickler.pop()
     unpickler.set_items([unpickler.pop(), value])
 

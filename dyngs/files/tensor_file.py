@@ -52,11 +52,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Read header and tensors of a file.
-
-    Raises:
-        DyngsError: a file that is missing, truncated, altered, of another kind or version.
-    """
+    """Read header and tensors of a file. Raises DyngsError."""
     require_regular(path)
     try:
         with safe_open(path, framework="pt") as file:

@@ -57,8 +57,7 @@ class TemplateRef:
 def write_avatar(run: LoadedRun, path: Path) -> Path:
     """Write the person of a run, upright and at rest at the place of the capture (docs/formats.md); return ``path``.
 
-    Raises:
-        DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
+    Raises DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
     """
     scene, model = avatar_of(run.scene), run.config.model
     if scene is None or not isinstance(model, HumanModel):
@@ -172,7 +171,6 @@ def _check(tensors: Mapping[str, Tensor]) -> None:
 
 
 def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
-    """Return the scene of checked tensors."""
 
     def part(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}

@@ -52,11 +52,7 @@ class LoadedRun:
 
     @property
     def scene(self) -> Scene:
-        """Its scene of Gaussians.
-
-        Raises:
-            DyngsError: it is made of something else.
-        """
+        """Its scene of Gaussians. Raises DyngsError: it is made of something else."""
         return require_gaussians(self.renderable, f"a run of model.kind={self.config.model.kind}")
 
 
@@ -80,8 +76,7 @@ def step_of(path: Path) -> int:
 def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float) -> Path:
     """Write a checkpoint atomically, remove all but the newest ``KEEP_CHECKPOINTS``, and return its path.
 
-    Raises:
-        DyngsError: a model with values that are not finite (earlier checkpoints stay), a full disk, and the like.
+    Raises DyngsError: a model with values that are not finite (earlier checkpoints stay), a full disk, and the like.
     """
     tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
     for name, x in tensors.items():

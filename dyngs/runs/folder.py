@@ -120,11 +120,7 @@ def note_asked(folder: Path, asked: Config) -> None:
 
 
 def note_root(folder: Path, data: DataConfig) -> None:
-    """Write into the configuration of a run where its capture lies by now, if that differs.
-
-    Raises:
-        DyngsError: no capture is there; the configuration stays as it was.
-    """
+    """Write into the configuration of a run where its capture lies by now, if that differs and there is a capture."""
     for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:

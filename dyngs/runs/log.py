@@ -21,10 +21,8 @@ class LogRecord:
     """One line of ``log.jsonl``.
 
     Attributes:
-        loss: of this step, regularizers included.
-        psnr: of this step's image, dB; None where its mask leaves nothing.
-        num_gaussians: after the step.
-        num_moving: those of them that depend on time.
+        loss, psnr: of this step; of its image, dB, None where its mask leaves nothing.
+        num_gaussians, num_moving: after the step, and those of them that depend on time.
         bad_gradients: how often so far a Gaussian was left out of a step because its gradient was not finite.
         seconds: training time so far, over all resumes.
     """
@@ -87,7 +85,6 @@ class RunLog:
 
 
 def record_of(event: StepDone) -> LogRecord:
-    """Return the line of a step."""
     quality = event.report.psnr
     return LogRecord(
         step=event.step,

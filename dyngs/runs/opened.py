@@ -209,11 +209,7 @@ class Opened(LoadedRun):
         return replace(self, renderable=playing, fps=motion.fps, as_captured=False)
 
     def at_rest(self) -> Opened:
-        """Return the same with its person in the rest pose of the template, upright on the floor.
-
-        Raises:
-            DyngsError: it is no person.
-        """
+        """Return the same with its person in the rest pose of the template, upright on the floor. Raises DyngsError."""
         scene, _ = self._person_for("--pose rest")
         rest = placement.rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         return replace(self, renderable=scene.playing(rest), as_captured=False)

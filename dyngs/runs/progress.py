@@ -47,7 +47,6 @@ class Progress:
         self._task: Any = None
 
     def __call__(self, event: Event) -> None:
-        """Show ``event``."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
                 self.update(record_of(event), event.report.truth.shape[0] * event.report.truth.shape[1])
@@ -80,7 +79,6 @@ class Progress:
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 
     def expect(self, total: int) -> None:
-        """Set the total number of steps to ``total``."""
         self._total = total
         if self._bar is not None:
             self._bar.update(self._task, total=total)

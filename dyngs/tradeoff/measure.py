@@ -62,6 +62,5 @@ def time_interleaved(drawings: Sequence[Drawing], images: Sequence[Image], round
 
 
 def quartiles(values: np.ndarray) -> Quartiles:
-    """Return median and quartiles."""
     low, high = np.percentile(values, [25, 75])
     return Quartiles(float(median(values)), float(low), float(high))

@@ -74,14 +74,12 @@ _STORED = TypeAdapter(Measurement)
 
 
 def read_measurement(path: Path) -> Measurement:
-    """Read a measurement from its JSON file."""
     with reading(path, "it is no measurement of a variant: remove it to have it measured again"):
         require_regular(path)
         return _STORED.validate_json(path.read_bytes())
 
 
 def write_measurement(path: Path, measurement: Measurement) -> None:
-    """Write a measurement as JSON, atomically."""
     values = asdict(measurement) | {"variant": measurement.variant.changes}
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 

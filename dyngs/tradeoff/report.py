@@ -66,13 +66,11 @@ def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
 
 
 def exchange_cells(rate: ExchangeRate) -> tuple[str, ...]:
-    """Return the cells of an exchange rate below ``EXCHANGE_HEAD``."""
     costs = ("no gain" if cost is None else f"{cost:+.2f}" for cost in (rate.db_per_speed, rate.db_per_size))
     return rate.setting, *costs, f"{rate.speed:.2f}", f"{rate.size:.2f}"
 
 
 def _cells(row: TableRow) -> tuple[str, ...]:
-    """Return the cells of a row below ``_HEAD``."""
     return (
         row.name,
         f"{row.psnr:.2f}",

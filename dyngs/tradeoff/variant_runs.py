@@ -122,7 +122,6 @@ def finished(config: Config, out: Path) -> Path:
 
 
 def run_settings(run_dir: Path) -> RunSettings:
-    """Return the settings of a run."""
     if has_only_scene_file(run_dir):
         raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from")
     config = load_resolved(run_dir)

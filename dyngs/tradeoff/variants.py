@@ -25,8 +25,7 @@ class Variant:
     """Changes of a run; the defaults change nothing.
 
     Attributes:
-        colour: ``colour.kind`` to train with.
-        field: ``model.deform.kind`` to train with.
+        colour, field: ``colour.kind`` and ``model.deform.kind`` to train with.
         field_size: factor on the nodes, channels, neurons or frequencies of the field to train with.
         prune: fraction of the Gaussians removed, by ``sensitivity``.
         mask_times: key times of visibility masks.
@@ -60,7 +59,6 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """Name for tables and plots."""
         words = (f"{k}={value:g}" if isinstance(value, float) else f"{k}={value}" for k, value in self.changes.items())
         return " ".join(words) or "as it is"
 
@@ -104,7 +102,7 @@ class Varied:
         values: tried by default, stronger ones later.
         low, high: range of numbers, inclusive; no numbers if ``low > high``.
         words: allowed beside numbers.
-        whole: numbers are integers.
+        integers: no other numbers.
         trains: every value but that of the run needs training from scratch.
     """
 
@@ -113,22 +111,21 @@ class Varied:
     low: float = 1.0
     high: float = 0.0
     words: tuple[str, ...] = ()
-    whole: bool = False
+    integers: bool = False
     trains: bool = False
 
     @property
     def allowed(self) -> str:
         """The allowed values, for messages."""
-        kind = "a whole number" if self.whole else "a number"
+        kind = "a whole number" if self.integers else "a number"
         number = [f"{kind} from {self.low:g} to {self.high:g}"] if self.low <= self.high else []
         return " or ".join([*number, *self.words])
 
     def parsed(self, text: str) -> Value:
-        """Return the value of a text."""
         if text in self.words:
             return text
         try:
-            value = int(text) if self.whole else float(text)
+            value = int(text) if self.integers else float(text)
         except ValueError:
             value = float("nan")
         if not self.low <= value <= self.high:
@@ -141,8 +138,8 @@ _COLOURS = tuple(kinds_of(Config.model_fields["colour"]))
 _MODES = tuple(mode.value for mode in RasterizeMode)
 SETTINGS = (
     Varied("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
-    Varied("mask_times", (6, 16), low=2, high=1000, whole=True),
-    Varied("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
+    Varied("mask_times", (6, 16), low=2, high=1000, integers=True),
+    Varied("sh_degree", (2, 1, 0), low=0, high=3, integers=True),
     Varied("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
     Varied("mode", _MODES, words=_MODES),
     Varied("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),

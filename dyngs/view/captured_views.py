@@ -23,13 +23,9 @@ THUMBNAIL = 96
 
 @dataclass(frozen=True)
 class CapturedViews:
-    """Cameras of a capture, and their images.
+    """V views of a capture, each with a camera of the size of training, and their images, also small ones.
 
-    Attributes:
-        views: V views.
-        cameras: one camera each, of the size of training.
-        images: of the views, composited on demand; None where there are none that show what the scene plays.
-        thumbnails: the same, small.
+    There are no images where those of the capture do not show what the scene plays.
     """
 
     views: tuple[View, ...] = ()

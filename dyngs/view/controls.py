@@ -8,8 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from dyngs.errors import counted
 from dyngs.gaussians.scene import Scene
 from dyngs.runs.opened import Opened
@@ -69,7 +67,7 @@ class Controls:
         if opened.person is not None and not opened.in_training:
             parts["Person"] = lambda: add_person_controls(browsing, self._serving.motions)
         if network is not None:
-            parts["Predict from"] = lambda: add_image_controls(browsing, network, self._predicted)
+            parts["Predict from"] = lambda: add_image_controls(browsing, network)
         parts |= {"Camera path": lambda: add_path_controls(browsing), "Help": lambda: _add_help(gui, opened)}
         self._of_scene = []
         for name, add in parts.items():
@@ -156,20 +154,16 @@ class Controls:
 
         browsing.session.ask(load, "scene")
 
-    def _predicted(self, opened: Opened) -> None:
-        """Show the person as predicted from other images, from the same camera."""
-        browsing = self._browsing
-        browsing.session.show(opened)
-        browsing.client.add_notification("Predicted", opened.notes[-1], auto_close_seconds=8.0)
-
     def _screenshot(self) -> None:
         """Send what is shown as a .png, in the thread that draws."""
-        browsing = self._browsing
-        if browsing.session.eye is None:
+        from PIL import Image
+
+        session, stream = self._browsing.session, io.BytesIO()
+        if session.eye is None:
             return
-        image = draw(browsing.session.opened, browsing.session.shot())
-        name = f"{browsing.session.opened.name}_{browsing.session.time:.3f}.png"
-        browsing.client.send_file_download(name, png_of(image), save_immediately=True)
+        Image.fromarray(draw(session.opened, session.shot())).save(stream, "png")
+        name = f"{session.opened.name}_{session.time:.3f}.png"
+        self._browsing.client.send_file_download(name, stream.getvalue(), save_immediately=True)
 
 
 def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
@@ -217,8 +211,8 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
     gui.add_button("All joints at rest").on_click(reset)
 
 
-def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callable[[Opened], None]) -> None:
-    """Add the choice of the images that a network predicts the person from, which ``show`` then shows."""
+def add_image_controls(browsing: Browsing, network: PeopleNetwork) -> None:
+    """Add the choice of the images that a network predicts the person from."""
     gui, session, person = browsing.client.gui, browsing.session, browsing.loaded.name
     names = (_NONE, *network.images_of(person))
     hint = f"none: {network.num_images} that see much of the person"
@@ -234,7 +228,8 @@ def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callabl
             finally:
                 note.remove()
             browsing.loaded = opened
-            show(opened)
+            session.show(opened)  # from the same camera
+            browsing.client.add_notification("Predicted", opened.notes[-1], auto_close_seconds=8.0)
 
         session.ask(work)
 
@@ -242,7 +237,6 @@ def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callabl
 
 
 def add_path_controls(browsing: Browsing) -> None:
-    """Add the controls of the path that this browser records."""
     gui, session = browsing.client.gui, browsing.session
     recorded = [Recording()]
     status = gui.add_markdown("no keyframes yet")
@@ -274,12 +268,3 @@ def add_path_controls(browsing: Browsing) -> None:
     loop.on_update(lambda _: record(replace(recorded[0], loops=bool(loop.value))))
     gui.add_button("Preview").on_click(lambda _: session.preview(recorded[0]))
     gui.add_button("Save path", hint=f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}").on_click(save)
-
-
-def png_of(image: np.ndarray) -> bytes:
-    """Return an image (H, W, 3) uint8 as the bytes of a .png file."""
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "png")
-    return stream.getvalue()

@@ -42,7 +42,6 @@ class Frusta:
             self._browsing.session.ask(lambda index=index: self._add(opened, index, generation))
 
     def remove(self) -> None:
-        """Remove all frusta."""
         self._generation += 1
         handles, self._handles = self._handles, []
         for handle, _, _ in handles:

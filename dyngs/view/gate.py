@@ -77,11 +77,7 @@ def link_to(host: str, port: int, token: str | None = None) -> str:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return the port to listen on: ``port``; None: 8080, or the next that is free.
-
-    Raises:
-        DyngsError: the port is taken or not allowed, or ``host`` is not an address of this machine.
-    """
+    """Return the port to listen on: ``port``; None: 8080, or the next that is free. Raises DyngsError."""
     for candidate in [port] if port is not None else [*range(DEFAULT_PORT, DEFAULT_PORT + 50), 0]:
         try:
             return _bound(host, candidate)

@@ -27,11 +27,7 @@ Angles = Mapping[str, tuple[float, float, float]]
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:
-    """Return the motion files in a folder, or the file itself, by name; empty for None.
-
-    Raises:
-        DyngsError: no such file or folder, or none in it.
-    """
+    """Return the motion files in a folder, or the file itself, by name; empty for None. Raises DyngsError."""
     if path is None:
         return {}
     if path.is_file():
@@ -47,8 +43,7 @@ def motion_files(path: Path | None) -> dict[str, Path]:
 def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles) -> Opened:
     """Return the person of ``opened`` in a motion: as captured, at rest, by the ``angles`` of sliders, or of a file.
 
-    Raises:
-        DyngsError: the file cannot be read.
+    Raises DyngsError: the file cannot be read.
     """
     if choice == AS_CAPTURED:
         return opened
@@ -74,5 +69,4 @@ def posed(opened: Opened, angles: Angles) -> Opened:
 
 
 def joint_row(name: str, count: int) -> int:
-    """Return the row of a joint of a body with ``count`` joints."""
     return SMPLX_ROWS[count].index(JOINT_NAMES.index(name))

@@ -35,11 +35,9 @@ class Serving:
     """How the page is served.
 
     Attributes:
-        host: address to listen on.
-        port: that is asked for; None: 8080 or the next that is free.
+        port: None: 8080 or the next that is free.
         motions: motion files for people, by name.
-        target: seconds that an image may take while something moves.
-        longest: seconds that any image may take.
+        target, longest: seconds that an image may take while something moves, and at all.
         in_thread: images are drawn in a thread of the server; else by whoever calls ``drawer.draw_one``.
     """
 

@@ -48,15 +48,9 @@ class Eye:
 
 @dataclass(frozen=True)
 class Timeline:
-    """The time that is shown.
+    """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
 
-    Attributes:
-        time: in [0, 1] when the clock read ``since``.
-        since: seconds of a monotonic clock.
-        playing: whether time passes.
-        loops: whether it begins again after 1; else it stops there.
-        speed: factor of the speed of the recording.
-        seconds: that the recording takes from time 0 to 1.
+    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or stops.
     """
 
     time: float = 0.0
@@ -90,10 +84,9 @@ class Display:
     """What is shown.
 
     Attributes:
-        layer, part: as in ``Shot``.
+        layer, part, divide: as in ``Shot``.
         comparing: show the truth next to the render.
         view: index of the view that is compared with; None: the nearest.
-        divide: fraction of the width that shows the render.
         longest: most pixels of the longer side of an image.
     """
 
@@ -162,7 +155,6 @@ class Session:
         self._note_change()
 
     def set_time(self, time: float) -> None:
-        """Show another time."""
         with self._lock:
             self.timeline = replace(self.timeline, time=min(max(time, 0.0), 1.0), since=self._clock())
         self._note_change()
@@ -184,7 +176,6 @@ class Session:
         self._note_change()
 
     def preview(self, recording: Recording) -> None:
-        """Show a recorded path once."""
         with self._lock:
             self._preview = (recording, self._clock()) if len(recording) else None
         self._note_change()

@@ -64,8 +64,7 @@ class PeopleNetwork:
 def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
     """Return a network with the people it was trained on, or those of ``capture``: one, or a folder of them.
 
-    Raises:
-        DyngsError: not the run of a network, or no captures there.
+    Raises DyngsError: not the run of a network, or no captures there.
     """
     config, model = network_config(run)
     data = config.data if capture is None else config.data.model_copy(update={"root": capture.absolute()})
@@ -150,11 +149,7 @@ def open_to_view(path: Path, name: str, up: str | None = None, data_root: Path |
 
 
 def first_of(source: Source) -> Opened:
-    """Return the first scene that can be loaded; a note says which could not.
-
-    Raises:
-        DyngsError: none can; the error of the first.
-    """
+    """Return the first scene that can be loaded; a note says which could not. Raises DyngsError."""
     failed: list[DyngsError] = []
     for name in source.names:
         try:

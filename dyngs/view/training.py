@@ -70,8 +70,7 @@ class DrawnBetweenSteps:
 class TrainingView:
     """Listener that serves a page with the scene of a training; a context manager. ``say`` is told the link.
 
-    Raises:
-        DyngsError: a network is trained, which has no scene, viser is missing, or the port cannot be had.
+    Raises DyngsError: a network is trained, which has no scene, viser is missing, or the port cannot be had.
     """
 
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
