@@ -25,7 +25,7 @@ from dyngs.errors import DyngsError, counted
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.tradeoff.measurements import Measurement
+    from dyngs.tradeoff.measure import Measurement
     from dyngs.tradeoff.table import TableRow
 
 _EPILOG = """\

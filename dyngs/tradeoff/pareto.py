@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from dyngs.tradeoff.measurements import Measurement
+from dyngs.tradeoff.measure import Measurement
 from dyngs.tradeoff.variants import SEVERAL, Variant
 
 MIN_DOUBLINGS = 0.05

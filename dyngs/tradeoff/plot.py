@@ -8,7 +8,7 @@ from html import escape
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from dyngs.tradeoff.measurements import pareto_mask
+from dyngs.tradeoff.measure import pareto_mask
 from dyngs.tradeoff.table import TableRow
 from dyngs.tradeoff.variants import SEVERAL
 

@@ -11,7 +11,7 @@ from html import escape
 from pathlib import Path
 
 from dyngs.files.write import atomic_file, write_text
-from dyngs.tradeoff.measurements import Measurement
+from dyngs.tradeoff.measure import Measurement
 from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates
 from dyngs.tradeoff.plot import can_plot, plot, png_of, svg_of
 from dyngs.tradeoff.table import TableRow, table_rows

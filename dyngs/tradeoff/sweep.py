@@ -27,8 +27,14 @@ from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.inputs import inputs_of
-from dyngs.tradeoff.measure import measure_quality, render_options_of, time_interleaved
-from dyngs.tradeoff.measurements import Measurement, read_measurement, write_measurement
+from dyngs.tradeoff.measure import (
+    Measurement,
+    measure_quality,
+    read_measurement,
+    render_options_of,
+    time_interleaved,
+    write_measurement,
+)
 from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
@@ -107,15 +113,16 @@ class _Session:
         if path.is_file():
             return read_measurement(path)
         folder, drawing = self._runs.folder(variant), self._drawing(variant)
-        quality = measure_quality(drawing, (self._loader[i] for i in range(len(self._loader))), self._lpips)
+        images = (self._loader[i] for i in range(len(self._loader)))
+        psnr, ssim, lpips = measure_quality(drawing, images, self._lpips)
         shown = self._images(MEMORY_VIEWS)
         on_cpu = self._plan.device == CPU
         measurement = Measurement(
             variant=variant,
             num_views=len(self._loader),
-            psnr=quality.psnr,
-            ssim=quality.ssim,
-            lpips=quality.lpips,
+            psnr=psnr,
+            ssim=ssim,
+            lpips=lpips,
             num_gaussians=len(require_gaussians(drawing.scene, variant.slug)),
             mb=megabytes_on_disk(folder),
             memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background) if on_cpu else None,

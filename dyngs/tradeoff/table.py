@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from dyngs.errors import DyngsError, printable
-from dyngs.tradeoff.measurements import Measurement, on_front
+from dyngs.tradeoff.measure import Measurement, on_front
 from dyngs.tradeoff.variants import Variant
 
 METRICS = ("psnr", "ssim", "lpips", "fps", "mb", "memory_mb", "gaussians")

@@ -60,7 +60,7 @@ UNCHECKED = {
     "human/fit/inputs.py:read_person": OWN,
     "human/motion/amass.py:write_amass": VALUES,
     "storage/file.py:write_scene": VALUES,
-    "tradeoff/measurements.py:write_measurement": OWN,
+    "tradeoff/measure.py:write_measurement": OWN,
     "tradeoff/report.py:write_report": OWN,
 }
 """Functions that write without a check of their own, each with its reason."""

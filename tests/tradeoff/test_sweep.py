@@ -18,8 +18,7 @@ from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.scene import render_options
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
-from dyngs.tradeoff.measure import render_options_of
-from dyngs.tradeoff.measurements import Measurement, read_measurement
+from dyngs.tradeoff.measure import Measurement, read_measurement, render_options_of
 from dyngs.tradeoff.report import write_report
 from dyngs.tradeoff.sweep import Plan, sweep
 from dyngs.tradeoff.table import table_rows
