@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from camera_path_files import write_path
 from motion_files import Clip, as_local, glb_of, random_motion, skeleton, tiny_body, write_bvh
 from moving_scene import camera, row_of_balls
 from synthetic_bodies import model, write_npz, write_obj, write_pickle
@@ -16,7 +15,7 @@ from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
 from dyngs.camera import Cameras
-from dyngs.camera_paths.path import CameraPath
+from dyngs.camera_paths.path import CameraPath, write_path
 from dyngs.config import Config, DataConfig, DynamicModel, SceneModel, StaticModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.tracks import TrueTracks, write_true_tracks
@@ -335,6 +334,7 @@ def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
     from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed
     from dyngs.tradeoff.measurements import write_measurement as write
+
     from dyngs.tradeoff.variants import Variant
 
     speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))

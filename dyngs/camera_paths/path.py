@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
 from dyngs.data.geometry import cam_from_opengl, checked_pose
 from dyngs.errors import DyngsError, printable
 from dyngs.files.fields import read_json_object
+from dyngs.files.write import write_text
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -91,6 +93,19 @@ def parse_times(text: str) -> tuple[float, ...]:
     if not 1 <= count <= _MAX_FRAMES:
         raise DyngsError(f"{shown}: the count must be from 1 to {_MAX_FRAMES}; {wanted}")
     return tuple(np.linspace(start, stop, int(count)).tolist())
+
+
+def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = None) -> None:
+    """Write a path as JSON in the format of ``read_path``, atomically; ``world_offset`` as there."""
+    cameras, frames = path.cameras, []
+    for i in range(len(cameras)):
+        pose, k = cameras.cam_from_world[i].detach().cpu().double().numpy().copy(), cameras.intrinsics[i].tolist()
+        if world_offset is not None:
+            pose[:3, 3] -= pose[:3, :3] @ world_offset
+        frame = {"cam_from_world": pose.tolist(), "fl_x": k[0][0], "fl_y": k[1][1], "cx": k[0][2], "cy": k[1][2]}
+        frames.append(frame if path.times is None else frame | {"time": path.times[i]})
+    document = {"width": cameras.width, "height": cameras.height, "fps": path.fps, "frames": frames}
+    write_text(file, json.dumps(document, indent=1) + "\n")
 
 
 def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:

@@ -6,15 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_overrides,
-    add_threads,
-    data_section,
-    input_path,
-    output_path,
-)
+from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError, as_word, counted
 
@@ -46,7 +38,7 @@ _OF_A_FIT = {
 """Options of ``dyngs data fit``, which are fields of ``FitInputs``."""
 
 
-def add_parser(commands: Commands) -> None:
+def add_parser(commands: args.Commands) -> None:
     about = "inspect a capture, estimate poses, fit a body, convert a motion, write a synthetic capture"
     verbs = commands.add_parser("data", help=about).add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_inspect(verbs)
@@ -56,8 +48,8 @@ def add_parser(commands: Commands) -> None:
     _add_synth(verbs)
 
 
-def _add_inspect(verbs: Commands) -> None:
-    parser = add_command(
+def _add_inspect(verbs: args.Commands) -> None:
+    parser = args.add_command(
         verbs,
         "inspect",
         run_inspect,
@@ -65,32 +57,32 @@ def _add_inspect(verbs: Commands) -> None:
         "Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos without poses: "
         "size, rate, length, sound, sharpness, motion, and what to run next.",
     )
-    parser.add_argument("path", type=input_path, metavar="PATH", help="capture folder, video file, or folder of videos")
-    add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
+    parser.add_argument("path", type=args.input_path, metavar="PATH", help="capture folder, video, or folder of videos")
+    args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
-    parser.add_argument("--image", type=output_path, metavar="FILE", help="draw cameras and points to this image file")
+    parser.add_argument("--image", type=args.output_path, metavar="FILE", help="draw cameras and points to this image")
     parser.add_argument("--deep", action="store_true", help="decode every image in full (slow)")
 
 
-def _add_sfm(verbs: Commands) -> None:
+def _add_sfm(verbs: args.Commands) -> None:
     about = "Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`."
-    parser = add_command(verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about)
+    parser = args.add_command(verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about)
     images = "folder of photos, a video file, or folder of videos that ran at once"
-    parser.add_argument("images", type=input_path, metavar="IMAGES", help=images)
-    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
+    parser.add_argument("images", type=args.input_path, metavar="IMAGES", help=images)
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument("--mapper", choices=("auto", "global", "incremental"), default="auto", help="COLMAP's mapping")
-    parser.add_argument("--masks", type=input_path, metavar="DIR", help="masks of the photos, white = keep")
+    parser.add_argument("--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep")
     frames = "frames to take of a video (default 100; of each of several: up to 300)"
     parser.add_argument("--frames", type=int, metavar="N", help=frames)
     start = "when a video of several begins; once for each"
     parser.add_argument("--start", action="append", default=[], metavar="NAME=SECONDS", help=start)
-    add_threads(parser)
-    add_overrides(parser, "data.key=value", "data.follow_links, data.max_megapixels")
+    args.add_threads(parser)
+    args.add_overrides(parser, "data.key=value", "data.follow_links, data.max_megapixels")
 
 
-def _add_fit(verbs: Commands) -> None:
-    parser = add_command(
+def _add_fit(verbs: args.Commands) -> None:
+    parser = args.add_command(
         verbs,
         "fit",
         run_fit,
@@ -99,15 +91,15 @@ def _add_fit(verbs: Commands) -> None:
         "frame. OUT is a capture for `dyngs train human`.",
     )
     about = "folder of a capture; or a video, or a folder of images, of one fixed camera"
-    parser.add_argument("capture", type=input_path, metavar="CAPTURE", help=about)
-    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
+    parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help=about)
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     for name, (metavar, about) in _OF_A_FIT.items():
-        parser.add_argument(f"--{name}", type=input_path, metavar=metavar, help=about)
-    add_overrides(parser, "data.key=value", "keys of data")
+        parser.add_argument(f"--{name}", type=args.input_path, metavar=metavar, help=about)
+    args.add_overrides(parser, "data.key=value", "keys of data")
 
 
-def _add_motion(verbs: Commands) -> None:
-    parser = add_command(
+def _add_motion(verbs: args.Commands) -> None:
+    parser = args.add_command(
         verbs,
         "motion",
         run_motion,
@@ -115,16 +107,18 @@ def _add_motion(verbs: Commands) -> None:
         "Read a motion, retarget it to the template if it has another skeleton, and write it as .npz in the layout of "
         "AMASS SMPL-X, y up.",
     )
-    parser.add_argument("file", type=input_path, metavar="FILE", help="AMASS or SMPL-X .npz, .bvh, .glb, .gltf, .vrma")
-    parser.add_argument("out", type=output_path, metavar="OUT.npz", help="a new file")
+    parser.add_argument(
+        "file", type=args.input_path, metavar="FILE", help="AMASS, SMPL-X .npz, .bvh, .glb, .gltf, .vrma"
+    )
+    parser.add_argument("out", type=args.output_path, metavar="OUT.npz", help="a new file")
     parser.add_argument("--fps", type=float, metavar="F", help="resample to F frames per second (default: as in FILE)")
     parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")
     parser.add_argument("--clip", metavar="NAME", help="name of the animation if a glTF file has several")
-    parser.add_argument("--body", type=input_path, metavar="BODY", help="body template file (default: that of dyngs)")
+    parser.add_argument("--body", type=args.input_path, metavar="BODY", help="body template (default: that of dyngs)")
 
 
-def _add_synth(verbs: Commands) -> None:
-    parser = add_command(
+def _add_synth(verbs: args.Commands) -> None:
+    parser = args.add_command(
         verbs,
         "synth",
         run_synth,
@@ -135,7 +129,7 @@ def _add_synth(verbs: Commands) -> None:
         "from all around, with exact body parameters.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
-    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
     views = "training views; for room and human: times (default 48, for human 12)"
     parser.add_argument("--views", type=int, metavar="N", help=views)
@@ -155,7 +149,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
-    options = data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
+    options = args.data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
@@ -176,7 +170,7 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
 
     if arguments.image is not None:
         raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
-    with images_up_to(data_section(arguments.overrides).max_megapixels):
+    with images_up_to(args.data_section(arguments.overrides).max_megapixels):
         print(video_report(arguments.path))
     return 0
 
@@ -186,7 +180,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     from dyngs.capture.sfm import SfmOptions, estimate_poses
     from dyngs.capture.unposed import is_several_videos
 
-    limits = data_section(arguments.overrides)
+    limits = args.data_section(arguments.overrides)
     if is_several_videos(arguments.images):
         return _run_sfm_of_videos(arguments, limits)
     if arguments.start:
@@ -251,7 +245,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
     from dyngs.human.fit.fitted_capture import write_fitted_capture
     from dyngs.human.fit.inputs import FitInputs
 
-    options = data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
+    options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
     passed = {name: getattr(arguments, name) for name in _OF_A_FIT}
     with ProgressBar() as report:
         inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person))

@@ -6,18 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_data_root,
-    add_device,
-    add_split,
-    add_threads,
-    computing_device,
-    data_root,
-    input_path,
-    print_notes,
-)
+from dyngs.cli import arguments as args
 from dyngs.errors import counted
 
 if TYPE_CHECKING:
@@ -29,15 +18,15 @@ _OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
 """Of the tested images, and on them."""
 
 
-def add_parser(commands: Commands) -> None:
+def add_parser(commands: args.Commands) -> None:
     about = "Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split)."
-    parser = add_command(commands, "eval", run, "evaluate a run on held-out views", about)
-    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
-    add_split(parser)
+    parser = args.add_command(commands, "eval", run, "evaluate a run on held-out views", about)
+    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`")
+    args.add_split(parser)
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
-    add_threads(parser)
-    add_device(parser)
-    add_data_root(parser)
+    args.add_threads(parser)
+    args.add_device(parser)
+    args.add_data_root(parser)
     about = (
         "also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; always "
         "done after camera.refine"
@@ -61,11 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
         lpips_net=arguments.lpips_net,
         threads=arguments.threads,
         refine_poses=arguments.refine,
-        device=computing_device(arguments.device).type,
-        data_root=data_root(arguments),
+        device=args.computing_device(arguments.device).type,
+        data_root=args.data_root(arguments),
     )
     Console().print(report_table(report))
-    print_notes(report.notes)
+    args.print_notes(report.notes)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 

@@ -8,20 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_data_root,
-    add_motion,
-    data_root,
-    input_path,
-    is_avatar_file,
-    output_path,
-    print_notes,
-    print_written,
-    run_of_scene_file,
-    scene_time,
-)
+from dyngs.cli import arguments as args
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_redrawn
 from dyngs.errors import DyngsError, as_word, counted
 
@@ -71,8 +58,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands) -> None:
-    parser = add_command(
+def add_parser(commands: args.Commands) -> None:
+    parser = args.add_command(
         commands,
         "export",
         run,
@@ -81,16 +68,16 @@ def add_parser(commands: Commands) -> None:
         ".dyngs file, as a page that plays by itself, a person as an avatar or a mesh, or the cameras.",
         _EPILOG,
     )
-    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder, or an avatar file (.safetensors)")
+    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder, or an avatar (.safetensors)")
     formats = (*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras")
     about = "file format (default: what the suffix of --out names, else ply)"
     parser.add_argument("--format", choices=formats, help=about)
     about = "file, or folder of a sequence (default: splats... in RUN)"
-    parser.add_argument("--out", type=output_path, metavar="PATH", help=about)
+    parser.add_argument("--out", type=args.output_path, metavar="PATH", help=about)
     when = parser.add_mutually_exclusive_group()
-    when.add_argument("--time", type=scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
+    when.add_argument("--time", type=args.scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
-    add_motion(parser)
+    args.add_motion(parser)
     about = (
         "--format dyngs: largest root-mean-square change of the images, in grey levels of 255 (default: what lowers "
         "the PSNR of training views by 0.025 dB)"
@@ -102,20 +89,20 @@ def add_parser(commands: Commands) -> None:
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
     part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
-    add_data_root(parser)
+    args.add_data_root(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print where they are and how large."""
     from dyngs.runs.opened import open_scene
 
-    arguments.run_dir = run_of_scene_file(arguments.run_dir)
+    arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
     _require_fitting(arguments, kind)
     writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
-    is_file = is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
+    is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
     if kind in writers:
@@ -125,18 +112,18 @@ def run(arguments: argparse.Namespace) -> int:
     if kind == "tracks" and arguments.static:
         raise DyngsError("--static goes with --format ply; Gaussians that never move have no tracks")
     times = _times(arguments)
-    opened = _moved(arguments, open_scene(arguments.run_dir, data_root=data_root(arguments)))
+    opened = _moved(arguments, open_scene(arguments.run_dir, data_root=args.data_root(arguments)))
     if arguments.motion is not None:
         times = opened.scene.times if times is None else times
     if opened.scene.is_static and times is not None:
-        print_notes(("nothing moves in this run: it is the same at all times",))
+        args.print_notes(("nothing moves in this run: it is the same at all times",))
     if kind == "tracks":
         files = _export_tracks(arguments, opened, times)
     elif kind == MOVING:
         files = _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
     else:
         files = _export_splats(arguments, opened, times, kind)
-    print_written(*files)
+    args.print_written(*files)
     return 0
 
 
@@ -191,7 +178,7 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     if arguments.times is None and arguments.time is None:
         return None
     inside, warnings = clamped_times((arguments.time,) if arguments.times is None else parse_times(arguments.times))
-    print_notes((), warnings)
+    args.print_notes((), warnings)
     return inside
 
 
@@ -213,7 +200,7 @@ def _export_splats(
     own, part = format_named(kind), _part(arguments)
     suffix, scene = own.suffixes[0], scene_part(opened.scene, part)
     if opened.scene.colour is not None:
-        print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
+        args.print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
     how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
@@ -221,7 +208,7 @@ def _export_splats(
     is_file = out is not None and known_format(out) is not None
     if is_sequence and is_file and not arguments.static:
         raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
-    print_notes((line,))
+    args.print_notes((line,))
     if is_sequence and not arguments.static:
         moments = times or ()
         written = write_run_sequence(opened, out or arguments.run_dir / stem, moments, part, how, suffix)
@@ -229,7 +216,9 @@ def _export_splats(
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
-            print_notes(("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",))
+            args.print_notes(
+                ("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",)
+            )
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
         written = [write_run_splats(opened, path, moments[0], part, how)]
@@ -255,7 +244,7 @@ def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[f
     if arguments.sh_degree is not None:
         raise DyngsError(f"--sh-degree does not go with --format {MOVING}, which holds no harmonics")
     how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
-    print_notes((line,))
+    args.print_notes((line,))
     part, scene = _part(arguments), scene_part(opened.scene, _part(arguments))
     out = arguments.out or arguments.run_dir
     if not out.is_dir() and out.suffix.lower() != SUFFIX:
@@ -276,7 +265,7 @@ def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[f
     tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)
     count, moments, _ = tracks.positions.shape
     moving = f"{int(tracks.moving.sum()):,} of them moving"
-    print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
+    args.print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
     return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]
 
 
@@ -296,17 +285,17 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
         raise DyngsError(
             f"{out}: --format dyngs writes a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
         )
-    written = write_scene_file(arguments.run_dir, out, max_change, data_root=data_root(arguments))
+    written = write_scene_file(arguments.run_dir, out, max_change, data_root=args.data_root(arguments))
     change = written.precision.change
     if change is None:
         warning = (
             "the capture cannot be read: quantisation steps are fixed, and the change of images is not measured; if it "
             "was moved, add data.root=FOLDER"
         )
-        print_notes((), (warning,))
+        args.print_notes((), (warning,))
     else:
         note = f"images change by {change:.2f} grey levels of 255 (root mean square over some training views)"
-        print_notes((note,))
+        args.print_notes((note,))
     ratio = written.num_bytes_exact / written.num_bytes
     print(f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)")
     return 0
@@ -317,7 +306,7 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
     from dyngs.runs.checkpoint import load_run
 
     path = arguments.out or arguments.run_dir / "avatar.safetensors"
-    print_written(write_avatar(load_run(arguments.run_dir), path))
+    args.print_written(write_avatar(load_run(arguments.run_dir), path))
     return 0
 
 
@@ -332,7 +321,7 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         raise DyngsError(f"--joints goes with --format ply and glb, not with {kind}")
     suffix = ".ply" if kind == "ply" else ".glb"
     source: Path = arguments.run_dir
-    if is_avatar_file(source) and arguments.out is None:
+    if args.is_avatar_file(source) and arguments.out is None:
         raise DyngsError(f"{source}: where to? Give --out FILE{suffix}")
     out: Path = arguments.out or source / f"{stem}{suffix}"
     if out.is_dir() or out.suffix.lower() != suffix:
@@ -340,11 +329,11 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         raise DyngsError(f"{out}: {option} writes one file; give --out {name}")
     if suffix == ".ply" and arguments.motion is not None:
         raise DyngsError("--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb")
-    opened = _moved(arguments, open_scene(source, data_root=data_root(arguments)))
+    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
     played = Played(arguments.motion.stem, opened.fps or FRAME_RATE) if arguments.motion is not None else None
     written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
-    print_notes(written.notes)
-    print_written(written.path)
+    args.print_notes(written.notes)
+    args.print_written(written.path)
     return 0
 
 
@@ -354,16 +343,16 @@ def _export_page(arguments: argparse.Namespace) -> int:
     from dyngs.runs.opened import open_scene
 
     source: Path = arguments.run_dir
-    if arguments.out is None and is_avatar_file(source):
+    if arguments.out is None and args.is_avatar_file(source):
         raise DyngsError(f"{source}: where to? Give --out FILE.html")
     out: Path = arguments.out or source / "scene.html"
     if out.suffix.lower() not in (".html", ".htm") or out.is_dir():
         raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
-    opened = _moved(arguments, open_scene(source, data_root=data_root(arguments)))
+    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
     if arguments.from_up is not None:
         opened = replace(opened, stated_up=arguments.from_up)
     written = write_page(opened, out, time=0.0 if arguments.time is None else arguments.time)
-    print_notes(written.notes)
+    args.print_notes(written.notes)
     print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); it plays in any browser with WebGL 2, offline")
     return 0
 
@@ -376,11 +365,11 @@ def _export_cameras(arguments: argparse.Namespace) -> int:
     from dyngs.runs.checkpoint import found_corrections, load_run
 
     source: Path = arguments.run_dir
-    if is_avatar_file(source):
+    if args.is_avatar_file(source):
         raise DyngsError(f"{source}: an avatar file has no cameras; give a run")
     out: Path = arguments.out or source / "cameras"
     path = out if out.suffix.lower() == ".json" else out / NAME
-    run = load_run(source, data_root(arguments))
+    run = load_run(source, args.data_root(arguments))
     capture = read_capture(run.config.data)
     if path.resolve().parent == capture.root.resolve():
         raise DyngsError(f"{path}: would stand in for the cameras of the capture; give another folder")
@@ -389,10 +378,12 @@ def _export_cameras(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{source}: refined cameras lie in checkpoints, and there is none; restore one or train again")
     splits: dict[Split, Sequence[View]] = {name: views for name, views in capture.splits.items() if name != "pose"}
     if found is None:
-        print_notes(("camera.refine was not used in this run: these are the cameras of the capture",))
+        args.print_notes(("camera.refine was not used in this run: these are the cameras of the capture",))
     else:
         splits = {name: [found.corrected_view(view) for view in views] for name, views in splits.items()}
-        print_notes(("training cameras as training found them; others have the capture's poses, and known lenses",))
+        args.print_notes(
+            ("training cameras as training found them; others have the capture's poses, and known lenses",)
+        )
     written = write_cameras(path, capture, splits)
     count, root = counted(len(all_views(capture.splits)), "camera"), as_word(path.parent)
     print(f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them")

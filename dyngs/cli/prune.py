@@ -6,17 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_overrides,
-    add_run_device,
-    add_threads,
-    computing_device,
-    input_path,
-    output_path,
-    run_device,
-)
+from dyngs.cli import arguments as args
 from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
@@ -38,8 +28,8 @@ As a stage of training: dyngs train CONFIG ... prune.fraction=0.8. All options a
 """
 
 
-def add_parser(commands: Commands) -> None:
-    parser = add_command(
+def add_parser(commands: args.Commands) -> None:
+    parser = args.add_command(
         commands,
         "prune",
         run,
@@ -49,8 +39,8 @@ def add_parser(commands: Commands) -> None:
         "folder with its file and prints quality, speed and size before and after.",
         _EPILOG,
     )
-    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
-    parser.add_argument("--out", type=output_path, required=True, metavar="RUN2", help="folder of the new run")
+    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`")
+    parser.add_argument("--out", type=args.output_path, required=True, metavar="RUN2", help="folder of the new run")
     about = f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})"
     parser.add_argument("--max-loss", type=_decibels, metavar="DB", help=about)
     about = "no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else"
@@ -60,9 +50,9 @@ def add_parser(commands: Commands) -> None:
     about = "no search: number of key times of visibility masks (default: no masks)"
     parser.add_argument("--masks", metavar="K", help=about)
     parser.add_argument("--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000")
-    add_threads(parser)
-    add_run_device(parser)
-    add_overrides(parser, "key=value", "other config keys of the run (docs/cli.md)")
+    args.add_threads(parser)
+    args.add_run_device(parser)
+    args.add_overrides(parser, "key=value", "other config keys of the run (docs/cli.md)")
     parser.set_defaults(takes_root=True)
 
 
@@ -78,10 +68,10 @@ def run(arguments: argparse.Namespace) -> int:
     keys = {"prune": "fraction", "score": "score", "masks": "mask_times", "steps": "steps"}
     asked = {key: getattr(arguments, option) for option, key in keys.items()}
     overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
-    overrides += [f"run.threads={arguments.threads}", *run_device(arguments), *arguments.overrides]
+    overrides += [f"run.threads={arguments.threads}", *args.run_device(arguments), *arguments.overrides]
     folder, promise = _pruned(arguments, overrides)
     pruned = load_run(folder)
-    device = computing_device(pruned.config.run.device)
+    device = args.computing_device(pruned.config.run.device)
     before, after = compared(
         [arguments.run_dir, file_of(folder)], arguments.threads or num_cores(), device, pruned.config.data.root
     )

@@ -7,26 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_data_root,
-    add_device,
-    add_motion,
-    add_split,
-    add_threads,
-    add_up,
-    computing_device,
-    data_root,
-    image_size,
-    input_path,
-    input_word,
-    output_path,
-    print_notes,
-    run_of_scene_file,
-    scene_time,
-    whole,
-)
+from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
@@ -50,27 +31,30 @@ examples:
 """
 
 
-def add_parser(commands: Commands) -> None:
+def add_parser(commands: args.Commands) -> None:
     about = "Render the views of a split beside their ground truth, a camera path, or a fixed camera over time."
     short = "render images and videos of a run, an avatar or a file of Gaussians"
-    parser = add_command(commands, "render", run, short, about, _EPILOG)
+    parser = args.add_command(commands, "render", run, short, about, _EPILOG)
     source = "run folder, avatar file (.safetensors), or any 3DGS .ply"
-    parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help=source)
-    parser.add_argument("--out", type=output_path, metavar="DIR", help="folder for the images")
+    parser.add_argument("source", type=args.input_path, metavar="RUN_OR_FILE", help=source)
+    parser.add_argument("--out", type=args.output_path, metavar="DIR", help="folder for the images")
     cameras = parser.add_mutually_exclusive_group()
-    add_split(cameras, "render the views of this split (default: test)", None)
+    args.add_split(cameras, "render the views of this split (default: test)", None)
     path = "camera path: orbit (default for a file), spiral, along (as the capture was filmed), or a .json file"
-    cameras.add_argument("--path", type=input_word, metavar="PATH", help=path)
+    cameras.add_argument("--path", type=args.input_word, metavar="PATH", help=path)
     when = parser.add_mutually_exclusive_group()
-    when.add_argument("--time", type=scene_time, metavar="T", help="render the scene at this time, from 0 to 1")
+    when.add_argument("--time", type=args.scene_time, metavar="T", help="render the scene at this time, from 0 to 1")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B, one per frame")
     view = "without --path: render from the camera of this view (default: the first one)"
     parser.add_argument("--view", metavar="NAME|N", help=view)
     person = parser.add_mutually_exclusive_group()
-    add_motion(person)
+    args.add_motion(person)
     person.add_argument("--pose", choices=("rest",), help="show a person in the rest pose of the template")
-    parser.add_argument("--video", type=output_path, metavar="FILE.mp4", help="write a video as well")
-    frames, kind = "number of frames of orbit, spiral and along (default 120)", whole("a number of frames", 1, 10**9)
+    parser.add_argument("--video", type=args.output_path, metavar="FILE.mp4", help="write a video as well")
+    frames, kind = (
+        "number of frames of orbit, spiral and along (default 120)",
+        args.whole("a number of frames", 1, 10**9),
+    )
     parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     fps = "frames per second of the video (default 30, or as in the .json)"
     parser.add_argument("--fps", type=float, metavar="F", help=fps)
@@ -78,13 +62,13 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--depth", action="store_true", help=depth)
     parser.add_argument("--alpha", action="store_true", help="write opacity as well")
     size = "image size for a path or fixed camera, in pixels"
-    parser.add_argument("--size", type=image_size, metavar="WxH", help=size)
+    parser.add_argument("--size", type=args.image_size, metavar="WxH", help=size)
     background = "background for a path or fixed camera (default: that of training)"
     parser.add_argument("--background", choices=("white", "black"), help=background)
-    add_up(parser, " of the path")
-    add_threads(parser)
-    add_device(parser)
-    add_data_root(parser)
+    args.add_up(parser, " of the path")
+    args.add_threads(parser)
+    args.add_device(parser)
+    args.add_data_root(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -104,7 +88,7 @@ def _check(arguments: argparse.Namespace) -> None:
     known = command_for(arguments.source)
     if known is not None and not (arguments.source / "config.yaml").is_file():
         raise DyngsError(f"{arguments.source}: nothing that can be drawn; {known}")
-    arguments.source = run_of_scene_file(arguments.source)
+    arguments.source = args.run_of_scene_file(arguments.source)
     is_file = arguments.source.is_file()
     if is_file and arguments.split:
         raise DyngsError(f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json")
@@ -141,17 +125,17 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     from dyngs.export.images import OutputOptions, write_path_images, write_split_images
     from dyngs.runs.opened import open_run
 
-    device = computing_device(arguments.device)
+    device = args.computing_device(arguments.device)
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not _is_path(arguments):
         with ProgressBar() as report:
-            opened = open_run(arguments.source, data_root=data_root(arguments))
+            opened = open_run(arguments.source, data_root=args.data_root(arguments))
             return write_split_images(opened, arguments.split or "test", arguments.out, output, report, device)
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
-    print_notes((*opened.notes, *path.notes), path.warnings)
+    args.print_notes((*opened.notes, *path.notes), path.warnings)
     if not arguments.fps:
         output = replace(output, fps=path.fps)
     with ProgressBar() as report:
@@ -162,7 +146,7 @@ def _opened(arguments: argparse.Namespace) -> Opened:
     """Return what is rendered, in the motion and before the background that are requested."""
     from dyngs.runs.opened import open_scene
 
-    opened = open_scene(arguments.source, nonfinite="skip", data_root=data_root(arguments))
+    opened = open_scene(arguments.source, nonfinite="skip", data_root=args.data_root(arguments))
     if arguments.motion is not None:
         opened = opened.in_motion(arguments.motion)
     elif arguments.pose == "rest":

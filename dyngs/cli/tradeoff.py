@@ -8,18 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_device,
-    add_overrides,
-    add_split,
-    add_threads,
-    computing_device,
-    input_word,
-    output_path,
-    whole,
-)
+from dyngs.cli import arguments as args
 from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
@@ -41,8 +30,8 @@ _WIDTH = 100
 """Columns of the tables where there is no terminal."""
 
 
-def add_parser(commands: Commands) -> None:
-    parser = add_command(
+def add_parser(commands: args.Commands) -> None:
+    parser = args.add_command(
         commands,
         "tradeoff",
         run,
@@ -52,9 +41,9 @@ def add_parser(commands: Commands) -> None:
         _EPILOG,
     )
     target = "run folder, or a config to train first"
-    parser.add_argument("target", type=input_word, metavar="RUN_OR_CONFIG", help=target)
-    add_overrides(parser, "key=value", "overrides of the config")
-    parser.add_argument("--out", type=output_path, metavar="DIR", help="output folder (default RUN/tradeoff)")
+    parser.add_argument("target", type=args.input_word, metavar="RUN_OR_CONFIG", help=target)
+    args.add_overrides(parser, "key=value", "overrides of the config")
+    parser.add_argument("--out", type=args.output_path, metavar="DIR", help="output folder (default RUN/tradeoff)")
     vary = "vary only this setting, weaker values first; repeatable (default: all settings)"
     parser.add_argument("--vary", action="append", default=[], metavar="SETTING[=A,B]", help=vary)
     parser.add_argument("--train", action="store_true", help="also vary settings that need training from scratch")
@@ -63,17 +52,17 @@ def add_parser(commands: Commands) -> None:
         ("combine", 0, 4, "combinations in each of three directions (default 4)"),
         ("rounds", 1, 5, "renders of each timed view (default 5)"),
     ):
-        kind = whole("a number", low, 10**9)
+        kind = args.whole("a number", low, 10**9)
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=about)
-    add_split(parser)
+    args.add_split(parser)
     require = "requirements such as 'psnr>=30,fps>=20,mb<=5'; writes the best run"
     parser.add_argument("--require", metavar="LIST", help=require)
     goal = parser.add_mutually_exclusive_group()
     metrics = "choose by psnr, ssim, lpips, fps, mb, memory_mb or gaussians"
     goal.add_argument("--minimize", metavar="METRIC", help=metrics)
     goal.add_argument("--maximize", metavar="METRIC", help="likewise (default psnr)")
-    add_threads(parser)
-    add_device(parser)
+    args.add_threads(parser)
+    args.add_device(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -111,7 +100,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.combine,
         arguments.split,
         arguments.rounds,
-        computing_device(arguments.device),
+        args.computing_device(arguments.device),
     )
     try:
         measurements = sweep(runs, plan, print)

@@ -10,15 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_overrides,
-    add_run_device,
-    computing_device,
-    input_path,
-    run_device,
-)
+from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
 from dyngs.errors import DyngsError, as_word, counted
@@ -48,15 +40,15 @@ WITH_RESUME = ("train.steps", "data.root", *_FOR_THIS_CALL)
 """Keys that may be given with ``--resume``."""
 
 
-def add_parser(commands: Commands) -> None:
+def add_parser(commands: args.Commands) -> None:
     about = "Train a model from a capture. Writes a run folder (default runs/NAME)."
-    parser = add_command(commands, "train", run, "train a model from a capture", about, _EPILOG)
-    add_overrides(parser, "CONFIG key=value", "preset or YAML file, and overrides")
+    parser = args.add_command(commands, "train", run, "train a model from a capture", about, _EPILOG)
+    args.add_overrides(parser, "CONFIG key=value", "preset or YAML file, and overrides")
     resume = "continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one"
-    parser.add_argument("--resume", type=input_path, metavar="RUN", help=resume)
+    parser.add_argument("--resume", type=args.input_path, metavar="RUN", help=resume)
     parser.add_argument("--view", action="store_true", help="show the scene in a browser while it trains")
     add_serving_arguments(parser)
-    add_run_device(parser)
+    args.add_run_device(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,8 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
     """Train as the first of ``processes``, or alone."""
-    config = parse_config([*arguments.overrides, *run_device(arguments)], arguments.resume)
-    computing_device(config.run.device)  # where none is, before anything else is done
+    config = parse_config([*arguments.overrides, *args.run_device(arguments)], arguments.resume)
+    args.computing_device(config.run.device)  # where none is, before anything else is done
     if arguments.port is not None and not arguments.view:
         raise DyngsError("--port goes with --view")
     from dyngs.api.train import train

@@ -5,19 +5,7 @@ from __future__ import annotations
 import argparse
 import threading
 
-from dyngs.cli.arguments import (
-    Commands,
-    add_command,
-    add_data_root,
-    add_device,
-    add_threads,
-    add_up,
-    computing_device,
-    data_root,
-    input_path,
-    print_notes,
-    whole,
-)
+from dyngs.cli import arguments as args
 from dyngs.errors import DyngsError
 
 _EPILOG = """\
@@ -33,26 +21,26 @@ Needs viser: pip install 'dyngs[view]'. All controls are in docs/viewer.md.
 """
 
 
-def add_parser(commands: Commands) -> None:
+def add_parser(commands: args.Commands) -> None:
     about = "Serve a page that shows a scene from anywhere at any time, next to the truth of its capture."
-    parser = add_command(commands, "view", run, "look at a run or a file in a browser", about, _EPILOG)
-    parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help="run folder, file, or a folder of runs")
+    parser = args.add_command(commands, "view", run, "look at a run or a file in a browser", about, _EPILOG)
+    parser.add_argument("source", type=args.input_path, metavar="RUN_OR_FILE", help="run, file, or a folder of runs")
     add_serving_arguments(parser)
     about = "motion file for a person, or a folder of them"
-    parser.add_argument("--motion", type=input_path, metavar="PATH", help=about)
+    parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
     about = "for a network of people: whom to predict, or a folder of people"
-    parser.add_argument("--capture", type=input_path, metavar="PATH", help=about)
-    add_up(parser)
-    add_threads(parser)
-    add_device(parser)
-    add_data_root(parser)
+    parser.add_argument("--capture", type=args.input_path, metavar="PATH", help=about)
+    args.add_up(parser)
+    args.add_threads(parser)
+    args.add_device(parser)
+    args.add_data_root(parser)
 
 
 def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of how the page is served."""
     about = "address to listen on (default: this machine only); others get a link with a token"
     parser.add_argument("--host", default="127.0.0.1", help=about)
-    kind = whole("a port", 1, 65535)
+    kind = args.whole("a port", 1, 65535)
     parser.add_argument("--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)")
 
 
@@ -70,12 +58,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
     motions = motion_files(arguments.motion)
-    device = computing_device(arguments.device)
-    source = open_source(arguments.source, arguments.up, arguments.capture, device, data_root(arguments))
+    device = args.computing_device(arguments.device)
+    source = open_source(arguments.source, arguments.up, arguments.capture, device, args.data_root(arguments))
     first = first_of(source)
     if motions and first.person is None:
         raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")
-    print_notes(first.notes)
+    args.print_notes(first.notes)
     serving = Serving(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
         print(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it", flush=True)

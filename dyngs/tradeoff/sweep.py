@@ -38,7 +38,7 @@ from dyngs.tradeoff.measure import (
 from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
-from dyngs.tradeoff.variants import Variant, Variation, single_changes
+from dyngs.tradeoff.variants import Variant, Varied, single_changes
 
 TIMED_VIEWS = 8
 """Number of views for timing, evenly spread over the split; quality is measured on all."""
@@ -60,7 +60,7 @@ class Plan:
         device: draws what is measured.
     """
 
-    variations: tuple[Variation, ...]
+    settings: tuple[Varied, ...]
     finetune: int = 0
     combine: int = 4
     split: str = "test"
@@ -82,10 +82,10 @@ def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Mea
         own = run_settings(runs.run_dir)  # refuses what cannot be varied before anything is written
         session = _Session(runs, plan, meter, log)
         _require_same_source(runs, plan)
-        idle = [v.setting.name for v in plan.variations if not any(own.allows(v.setting, value) for value in v.values)]
+        idle = [s.name for s in plan.settings if not any(own.allows(s, value) for value in s.values)]
         if idle:
             log(f"nothing to vary in this run: {', '.join(idle)}")
-        singles = [Variant(), *single_changes(plan.variations, own, plan.finetune)]
+        singles = [Variant(), *single_changes(plan.settings, own, plan.finetune)]
         measured = session.measured(singles)
         return session.measured([*singles, *combinations(measured[0], measured[1:], plan.combine)])
 

@@ -153,14 +153,6 @@ SETTINGS = (
 
 
 @dataclass(frozen=True)
-class Variation:
-    """A setting and the values to try."""
-
-    setting: Varied
-    values: tuple[Value, ...]
-
-
-@dataclass(frozen=True)
 class RunSettings:
     """The settings of the run that is varied, as in ``Variant``; ``field`` None: nothing moves."""
 
@@ -182,14 +174,14 @@ class RunSettings:
         return own.get(setting.name) != value
 
 
-def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, ...]:
+def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Varied, ...]:
     """Return the variations of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE``; without any, all with defaults.
 
     ``trains``: settings that need training from scratch are allowed.
     """
     if not words:
-        return tuple(Variation(setting, setting.values) for setting in SETTINGS if trains or not setting.trains)
-    found: dict[str, Variation] = {}
+        return tuple(setting for setting in SETTINGS if trains or not setting.trains)
+    found: dict[str, Varied] = {}
     for word in words:
         name, equals, listed = word.partition("=")
         setting = next((s for s in SETTINGS if s.name == name), None)
@@ -202,17 +194,17 @@ def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, 
             raise DyngsError(f"--vary {name} is given twice; write --vary {name}=VALUE,VALUE")
         texts = re.split(r"\s*,\s*", listed.strip())
         values = tuple(setting.parsed(text) for text in texts) if equals else setting.values
-        found[name] = Variation(setting, tuple(dict.fromkeys(values)))
+        found[name] = replace(setting, values=tuple(dict.fromkeys(values)))
     return tuple(found.values())
 
 
-def single_changes(variations: Sequence[Variation], run: RunSettings, finetune: int) -> list[Variant]:
+def single_changes(settings: Sequence[Varied], run: RunSettings, finetune: int) -> list[Variant]:
     """Return one variant per setting and value that applies to a run; pruned and masked ones also with fine-tuning."""
     variants = []
-    for variation in variations:
-        name = variation.setting.name
-        for value in variation.values:
-            if run.allows(variation.setting, value):
+    for setting in settings:
+        name = setting.name
+        for value in setting.values:
+            if run.allows(setting, value):
                 variant = Variant(**{name: value})  # pyright: ignore[reportArgumentType]
                 if name == "field_step":
                     variant = replace(variant, storage=AUTO)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from camera_path_files import write_path
 from camera_rings import UP, ring_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,6 +23,7 @@ from dyngs.camera_paths.path import (
     resize_cameras,
     static_path,
     with_times,
+    write_path,
 )
 from dyngs.errors import DyngsError
 

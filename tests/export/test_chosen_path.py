@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from camera_path_files import write_path
 from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
 
 from dyngs.api.train import train
-from dyngs.camera_paths.path import CameraPath
+from dyngs.camera_paths.path import CameraPath, write_path
 from dyngs.config import Config, DataConfig, HumanModel, RunConfig, TrainConfig
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import ImageLoader

@@ -42,6 +42,7 @@ UNCHECKED = {
     "api/choose.py:write_choices": OWN,
     "bench.py:write_report": VALUES,
     "budget/size.py:write_within": OWN,
+    "camera_paths/path.py:write_path": VALUES,
     "capture/background.py:with_background_masks": OWN,
     "capture/multi_video/camera_poses.py:fixed_model": OWN,
     "capture/multi_video/estimate.py:write_facts": OWN,

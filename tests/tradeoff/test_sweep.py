@@ -97,7 +97,7 @@ def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: Va
 
 
 def test_on_a_gpu_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    briefly = replace(PLAN, variations=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
+    briefly = replace(PLAN, settings=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
     expected = sweep(VariantRuns(runs.run_dir, tmp_path / "here", 1), briefly, lambda line: None)
     monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
@@ -177,7 +177,7 @@ def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns,
 
 def test_what_cannot_be_varied_is_named(runs: VariantRuns) -> None:
     said: list[str] = []
-    sweep(runs, replace(PLAN, variations=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
+    sweep(runs, replace(PLAN, settings=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
     assert said == ["nothing to vary in this run: sh_degree"]
 
 
