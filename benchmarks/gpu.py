@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.bench.rasterize import Workload, garden_workload, random_workload
+from dyngs.bench import Workload, garden_workload, random_workload
 from dyngs.camera import Cameras
 from dyngs.camera_paths.orbit import frame_orbit_for_points
 from dyngs.compat import rasterization

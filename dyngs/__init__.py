@@ -5,10 +5,10 @@ The public names are imported on first use, so that ``import dyngs`` alone stays
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from dyngs.api.load import load
     from dyngs.api.train import train
     from dyngs.camera import Cameras
@@ -58,4 +58,6 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'dyngs' has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(_HOMES[name]), name)

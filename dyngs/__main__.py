@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import sys
-from types import FrameType
+try:
+    import os
+    import signal
+    import sys
+    from types import FrameType
+except KeyboardInterrupt:  # Ctrl-C before there is a handler for it
+    raise SystemExit(130) from None
 
 
 def main() -> int:
-    """Run the command line and return the exit code; Ctrl-C ends it in silence while modules are being imported."""
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from dyngs.cli import main as run
-
-    signal.signal(signal.SIGINT, _interrupt if before is signal.default_int_handler else before)
+    """Run the command line and return the exit code."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+    try:
+        from dyngs.cli import main as run
+    except KeyboardInterrupt:
+        return 130
     return run()
 
 

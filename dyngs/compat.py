@@ -102,7 +102,7 @@ def rasterization(
         DyngsError: shapes that do not fit, NaN or infinite input, numbers out of their range (planes in the wrong
             order, focal lengths or sizes that are not positive, ...), or an argument that dyngs does not support.
     """
-    unsupported = {
+    refused = {
         "tile_size": tile_size != TILE,
         "sparse_grad": sparse_grad,
         "distributed": distributed,
@@ -118,7 +118,9 @@ def rasterization(
         "rolling_shutter": getattr(rolling_shutter, "name", rolling_shutter) not in (None, "GLOBAL"),
         "viewmats_rs": viewmats_rs is not None,
     }
-    _refuse(unsupported)
+    if any(refused.values()):
+        names = ", ".join(name for name, used in refused.items() if used)
+        raise DyngsError(f"rasterization: dyngs does not support {names} with the value given")
     _check_settings(width, height, near_plane, far_plane, radius_clip, eps2d, channel_chunk)
     check_choice("rasterization: render_mode", render_mode, ("RGB", "D", "ED", "RGB+D", "RGB+ED"))
     check_choice("rasterization: rasterize_mode", rasterize_mode, ("classic", "antialiased"))
@@ -157,12 +159,6 @@ class _Splats:
         return x if self.camera_ids is None else x[self.camera_ids, self.gaussian_ids]
 
 
-def _refuse(unsupported: dict[str, bool]) -> None:
-    names = [name for name, used in unsupported.items() if used]
-    if names:
-        raise DyngsError(f"rasterization: dyngs does not support {', '.join(names)} with the value given")
-
-
 def _check_settings(
     width: int, height: int, near: float, far: float, radius_clip: float, eps2d: float, channel_chunk: int
 ) -> None:
@@ -188,13 +184,13 @@ def _check_shapes(tensors: dict[str, Tensor], sh_degree: int | None, *, with_col
     if means.dtype not in (torch.float32, torch.float64):
         raise DyngsError(f"rasterization: means is {means.dtype}; use float32 (or float64 for checks)")
     n, c = len(means), tensors["viewmats"].shape[0] if tensors["viewmats"].ndim else 0
-    wanted: dict[str, tuple[int, ...]] = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    wanted |= {"viewmats": (c, 4, 4), "Ks": (c, 3, 3)}
+    shapes: dict[str, tuple[int, ...]] = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    shapes |= {"viewmats": (c, 4, 4), "Ks": (c, 3, 3)}
     if with_colors:  # to depth alone the background does not matter
-        wanted["backgrounds"] = (c, *((3,) if sh_degree is not None else colors.shape[-1:]))
+        shapes["backgrounds"] = (c, *((3,) if sh_degree is not None else colors.shape[-1:]))
     for name, x in tensors.items():
-        if name in wanted and tuple(x.shape) != wanted[name]:
-            raise DyngsError(f"rasterization: {name} must be {wanted[name]}, got {tuple(x.shape)}")
+        if name in shapes and tuple(x.shape) != shapes[name]:
+            raise DyngsError(f"rasterization: {name} must be {shapes[name]}, got {tuple(x.shape)}")
         if x.dtype != means.dtype:
             raise DyngsError(f"rasterization: {name} is {x.dtype}, but means is {means.dtype}; use one dtype")
     _check_colors(colors, n, c, sh_degree)
@@ -242,11 +238,9 @@ def _colors(means: Tensor, cameras: Cameras, colors: Tensor, projection: Project
         return colors.expand(c, n, colors.shape[-1])
     if colors.ndim == 3:
         return evaluate_harmonics(means, cameras.centers, colors, projection.radii, sh_degree)
-    per_camera = [
-        evaluate_harmonics(means, cameras.centers[i : i + 1], colors[i], projection.radii[i : i + 1], sh_degree)
-        for i in range(c)
-    ]
-    return torch.cat(per_camera)
+    each = [slice(i, i + 1) for i in range(c)]
+    centers, radii = cameras.centers, projection.radii
+    return torch.cat([evaluate_harmonics(means, centers[i], colors[i][0], radii[i], sh_degree) for i in each])
 
 
 def _with_depth(

@@ -24,15 +24,12 @@ from dyngs.runs.opened import open_run
 if TYPE_CHECKING:
     from rich.table import Table
 
-DEFAULT_OUT = Path("dyngs-demo")
-
 
 @dataclass(frozen=True)
 class DemoOptions:
     """Size of the demo.
 
     Attributes:
-        steps: training steps.
         threads: 0 = all cores.
         size: width and height of the images, pixels.
         num_times: number of training images, one camera and one time each.
@@ -50,54 +47,35 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Results of the demo.
+    """The run, its rendered test views, an orbit video, the model for other programs, metrics and the total time."""
 
-    Attributes:
-        folder: folder of everything below.
-        capture, run_dir, images: folders of the input, the run, and the rendered test views.
-        sheet, video, ply: contact sheet, orbit video, and the model for other programs.
-        report: metrics of the test views.
-        seconds: total time.
-    """
-
-    folder: Path
-    capture: Path
     run_dir: Path
     images: Path
-    sheet: Path
     video: Path
     ply: Path
     report: EvalReport
     seconds: float
 
 
-def run_demo(out: Path = DEFAULT_OUT, options: DemoOptions = DemoOptions()) -> DemoResult:
-    """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty.
-
-    Raises:
-        DyngsError: the folder cannot be written.
-    """
+def run_demo(out: Path, options: DemoOptions = DemoOptions()) -> DemoResult:
+    """Run the demo in ``out``, or in ``out-2`` and so on if ``out`` is not empty. Raises DyngsError."""
     start = time.perf_counter()
     with claimed_folder(out) as folder:
-        return _run_demo(folder, options, start)
-
-
-def _run_demo(folder: Path, options: DemoOptions, start: float) -> DemoResult:
-    capture, run_dir, images = folder / "capture", folder / "run", folder / "images"
-    print(f"[1/4] ray tracing the images of the demo scene into {capture}", flush=True)
-    write_dynamic_capture("spin", capture, DynamicOptions(size=options.size, num_times=options.num_times, samples=3))
-    print(f"[2/4] training {options.steps} steps into {run_dir}", flush=True)
-    train(demo_config(capture, run_dir, options))
-    print("[3/4] evaluating on held-out views", flush=True)
-    report = evaluate_run(run_dir, threads=options.threads)
-    print("[4/4] rendering the test views and an orbit around the moving scene", flush=True)
-    opened, video = open_run(run_dir), folder / "orbit.mp4"
-    write_split_images(opened, "test", images)
-    path = choose_path(opened, PathOptions("orbit", options.num_frames))
-    write_path_images(opened, path, None, OutputOptions(video=video))
-    ply = write_run_splats(opened, folder / "splats.ply").path
-    seconds = time.perf_counter() - start
-    return DemoResult(folder, capture, run_dir, images, images / "sheet.png", video, ply, report, seconds)
+        capture, run_dir, images, video = (folder / name for name in ("capture", "run", "images", "orbit.mp4"))
+        print(f"[1/4] ray tracing the images of the demo scene into {capture}", flush=True)
+        moving = DynamicOptions(size=options.size, num_times=options.num_times, samples=3)
+        write_dynamic_capture("spin", capture, moving)
+        print(f"[2/4] training {counted(options.steps, 'step')} into {run_dir}", flush=True)
+        train(demo_config(capture, run_dir, options))
+        print("[3/4] evaluating on held-out views", flush=True)
+        report = evaluate_run(run_dir, threads=options.threads)
+        print("[4/4] rendering the test views and an orbit around the moving scene", flush=True)
+        opened = open_run(run_dir)
+        write_split_images(opened, "test", images)
+        path = choose_path(opened, PathOptions("orbit", options.num_frames))
+        write_path_images(opened, path, None, OutputOptions(video=video))
+        ply = write_run_splats(opened, folder / "splats.ply").path
+        return DemoResult(run_dir, images, video, ply, report, time.perf_counter() - start)
 
 
 def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
@@ -117,48 +95,35 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
     return config.model_copy(update={"data": data, "run": config.run.model_copy(update={"dir": run_dir})})
 
 
-def unused_folder(wanted: Path) -> Path:
-    """Return the first of ``wanted``, ``wanted-2``, ``wanted-3``... that does not exist or is empty.
-
-    Raises:
-        DyngsError: a thousand are in use.
-    """
-    for number in range(1, 1001):
-        folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
-        if _is_unused(folder):
-            return folder
-    raise DyngsError(f"{wanted}: so many demos lie there already; delete some or give --out another folder")
-
-
 @contextmanager
-def claimed_folder(wanted: Path) -> Iterator[Path]:
-    """Yield an unused folder, locked against other demos."""
+def claimed_folder(out: Path) -> Iterator[Path]:
+    """Yield the first of ``out``, ``out-2``, ``out-3``... that holds nothing, locked against other demos."""
     with ExitStack() as stack:
         for number in range(1, 1001):
-            folder = unused_folder(wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}"))
+            folder = out if number == 1 else out.with_name(f"{out.name}-{number}")
+            if not is_unused(folder):
+                continue
             try:
                 stack.enter_context(writing(folder))
             except InUseError:
                 continue
-            if _is_unused(folder):
+            if is_unused(folder):
                 yield folder
                 return
-    raise DyngsError(f"{wanted}: so many demos run there already; give --out another folder")
+    raise DyngsError(f"{out}: so many demos lie there already; delete some or give --out another folder")
 
 
-def _is_unused(folder: Path) -> bool:
+def is_unused(folder: Path) -> bool:
     """Whether ``folder`` can be made, or holds at most a lock file."""
     return not folder.exists() or (folder.is_dir() and all(path.name == LOCK_NAME for path in folder.iterdir()))
 
 
 def result_table(result: DemoResult) -> Table:
-    """Return the results as a table with one row."""
     from rich.table import Table
 
     report = result.report
-    table = Table(
-        title=f"{counted(report.num_views, 'test view')} of {report.width}x{report.height}, {report.step} steps"
-    )
+    size = f"{report.width}x{report.height}"
+    title = f"{counted(report.num_views, 'test view')} of {size}, {counted(report.step, 'step')}"
     cells = {
         "PSNR dB": f"{report.psnr:.2f}",
         "SSIM": f"{report.ssim:.4f}",
@@ -169,6 +134,7 @@ def result_table(result: DemoResult) -> Table:
         "training s": f"{report.seconds_train:.1f}",
         "total s": f"{result.seconds:.1f}",
     }
+    table = Table(title=title)
     for name in cells:
         table.add_column(name, justify="right")
     table.add_row(*cells.values())

@@ -270,7 +270,7 @@ def read_a_path(root: Path) -> object:
 
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
-    from dyngs.tradeoff.measurements import read_measurement
+    from dyngs.tradeoff.measure import read_measurement
     from dyngs.tradeoff.table import table_rows
 
     measurement = read_measurement(only(root))
@@ -301,7 +301,7 @@ def read_a_log(root: Path) -> object:
 
 def read_a_load(root: Path) -> object:
     """Read the workload of a benchmark."""
-    from dyngs.bench.rasterize import garden_workload
+    from dyngs.bench import garden_workload
 
     return garden_workload(only(root))
 

@@ -331,8 +331,8 @@ def write_keyframes(root: Path) -> None:
 
 def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
-    from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed
-    from dyngs.tradeoff.measurements import write_measurement as write
+    from dyngs.tradeoff.measure import Measurement, Quartiles, Speed
+    from dyngs.tradeoff.measure import write_measurement as write
     from dyngs.tradeoff.variants import Variant
 
     speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))

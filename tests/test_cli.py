@@ -175,7 +175,7 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("render nowhere --out x", "nowhere: no such run or file"),
         ("render nowhere --out x --size big", "1280x720"),
         ("render nowhere --out x --size 0x5", "1280x720"),
-        ("render nowhere --out x --frames 0", "whole number above 0"),
+        ("render nowhere --out x --frames 0", "whole number from 1"),
         ("render nowhere --out x --split test --path orbit", "not allowed with"),
         ("render nowhere", "--out DIR (or --video FILE.mp4 with --path, --time, --times or --view)"),
         ("render nowhere --out x --time nan", "'nan' is not a time"),
@@ -196,7 +196,7 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("data sfm nowhere out", "nowhere"),
         ("data synth still out --size 0", "--size"),
         ("demo --steps 0", "--steps"),
-        ("demo --steps few", "invalid int value: 'few'"),
+        ("demo --steps few", "'few' is not a number of steps"),
     ],
 )
 def test_wrong_usage_and_missing_input_end_in_one_line(
@@ -297,6 +297,34 @@ def test_ctrl_c_at_any_time_of_the_start_gets_no_traceback(capture: Path, tmp_pa
             process.kill()
         assert "Traceback" not in error, f"after {wait} s: {error}"
         assert process.returncode in (130, -signal.SIGINT)
+
+
+@pytest.mark.parametrize("module", ["signal", "dyngs.cli", "dyngs.cli.arguments", "shlex"])
+def test_ctrl_c_while_a_module_is_imported_gets_no_traceback(module: str) -> None:
+    """Before there is a handler, and after."""
+    code = (
+        "import builtins, os, sys\n"
+        "known = builtins.__import__\n"
+        "def interrupted(name, *arguments):\n"
+        f"    if name == {module!r} and sys._getframe(1).f_globals['__name__'].startswith('dyngs'):\n"
+        "        if 'signal' not in sys.modules or name == 'signal':\n"
+        "            raise KeyboardInterrupt\n"
+        "        os.kill(os.getpid(), 2)\n"
+        "    return known(name, *arguments)\n"
+        "builtins.__import__ = interrupted\n"
+        "sys.argv[1:] = ['train', '--help']\n"
+        "from dyngs.__main__ import main\n"
+        "sys.exit(main())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert (done.returncode, done.stderr.strip()) in ((130, ""), (130, "dyngs: interrupted")), done.stderr
 
 
 def test_export_accepts_every_suffix_that_its_help_names(capsys: Capture) -> None:

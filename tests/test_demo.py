@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.cli import main
-from dyngs.demo import DemoOptions, claimed_folder, demo_config, run_demo, unused_folder
+from dyngs.demo import DemoOptions, claimed_folder, demo_config, run_demo
 from dyngs.runs.lock import LOCK_NAME
 
 TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
@@ -16,7 +16,7 @@ TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 
 def test_everything_that_is_promised_lies_there(tmp_path: Path) -> None:
     result = run_demo(tmp_path / "demo", TINY)
-    for path in (result.capture, result.run_dir, result.images, result.sheet, result.video, result.ply):
+    for path in (result.run_dir, result.images, result.images / "sheet.png", result.video, result.ply):
         assert path.exists()
         assert (tmp_path / "demo") in path.parents
     assert json.loads((result.run_dir / "metrics.json").read_text())["psnr"] == result.report.psnr
@@ -25,13 +25,19 @@ def test_everything_that_is_promised_lies_there(tmp_path: Path) -> None:
 
 def test_a_second_demo_leaves_the_first_alone(tmp_path: Path) -> None:
     wanted = tmp_path / "demo"
-    assert unused_folder(wanted) == wanted
+
+    def claimed() -> Path:
+        with claimed_folder(wanted) as folder:
+            return folder
+
+    assert claimed() == wanted
     wanted.mkdir()
-    assert unused_folder(wanted) == wanted
+    assert claimed() == wanted
+    wanted.mkdir(exist_ok=True)
     (wanted / "mine").touch()
-    assert unused_folder(wanted) == tmp_path / "demo-2"
+    assert claimed() == tmp_path / "demo-2"
     (tmp_path / "demo-2").touch()
-    assert unused_folder(wanted) == tmp_path / "demo-3"
+    assert claimed() == tmp_path / "demo-3"
 
 
 def test_two_demos_at_once_take_two_folders(tmp_path: Path) -> None:

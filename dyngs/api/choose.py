@@ -35,7 +35,7 @@ from dyngs.data.images.images import target_size
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.files.write import write_text
 from dyngs.kinds import GaussianTrainer, assemble, with_points
 from dyngs.models.schedule import image_divisor
@@ -103,7 +103,7 @@ class Choice:
     def __str__(self) -> str:
         return (
             f"{self.setting} {'taken' if self.taken else 'not taken'}: {self.gain:+.2f} dB (standard error "
-            f"{self.error:.2f}) to {self.without:.2f} dB on {self.views} views ({self.seconds:.0f} s)"
+            f"{self.error:.2f}) to {self.without:.2f} dB on {counted(self.views, 'view')} ({self.seconds:.0f} s)"
         )
 
 
@@ -155,7 +155,7 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
 
 def _decided(config: Config, settings: Sequence[Setting], plan: _Plan, capture: Capture) -> tuple[Config, list[Choice]]:
     """Return ``config`` with the settings that win, each tried on top of those before it, and all figures."""
-    print(f"small runs of {plan.steps:,} steps, compared on training views that are held out:", flush=True)
+    print(f"small runs of {counted(plan.steps, 'step')}, compared on training views that are held out:", flush=True)
     runs, found = plan.trained(config, capture), list[Choice]()
     for setting in settings:
         changed, begun = setting.applied(config), time.monotonic()

@@ -13,6 +13,7 @@ from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
 from dyngs.config.io import load_config, load_resolved, packaged_preset
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
+from dyngs.files.outputs import new_folder
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.human.prediction.network import PredictedAvatar, predict_gaussians
@@ -21,7 +22,7 @@ from dyngs.human.template.body_reader import load_template
 from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import new_folder, require_empty
+from dyngs.runs.folder import require_empty
 from dyngs.training.adaptation import adapt_network
 from dyngs.training.prediction import filmed, human_options, load_network, new_network, scene_of
 
@@ -134,7 +135,7 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
     trainer = assemble(config)
     scene, training = scene_of(human, avatar, Rates(config.train.steps))
     trainer.model.begin_with(scene, training)
-    with new_folder(out) as started:
+    with new_folder(out, require_empty) as started:
         write_config(config, started)
         save_checkpoint(started, trainer.checkpoint(), seconds)
 

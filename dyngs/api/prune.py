@@ -18,6 +18,7 @@ from dyngs.data.read import read_capture, require_folder
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
+from dyngs.files.outputs import new_folder
 from dyngs.kinds import assemble
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
@@ -25,7 +26,7 @@ from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Limit, Search, Stored
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
 from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER, new_folder, require_empty
+from dyngs.runs.folder import EXPORT_FOLDER, require_empty
 from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
 
@@ -86,7 +87,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     if not config.prune.is_wanted:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
     require_folder(config.data.root)
-    with new_folder(out) as started:
+    with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         save_checkpoint(started, start, 0.0)
         write_config(config, started)
@@ -132,7 +133,7 @@ def prune_within(
         search = Search(trainer, start, tell, _unseen(config, trainer.device))
         found = search.run(max_loss)
         stored = search.stored(found, max_loss)
-    with new_folder(out) as started:
+    with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         _write(started, stored, seconds_at(run_dir, start.info.step) + time.perf_counter() - begun)
     chosen = stored.candidate

@@ -28,7 +28,7 @@ from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture, require_folder
-from dyngs.errors import DyngsError, as_word
+from dyngs.errors import DyngsError, as_word, counted
 from dyngs.evaluate.report import evaluate_run
 from dyngs.kinds import GaussianTrainer, build
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
@@ -157,7 +157,10 @@ def train(
         if resume_from is not None:
             config = _with_new_length(config, folder, resumed)
         if resumed is not None and resumed.info.step >= config.total_steps and not _owes_file(config, folder):
-            print(f"{folder}: all {config.total_steps:,} steps are done; train.steps=N goes on to more", flush=True)
+            print(
+                f"{folder}: all {counted(config.total_steps, 'step')} are done; train.steps=N goes on to more",
+                flush=True,
+            )
             return folder
         asked = asked_for(folder) if resume_from is not None else config
         config, choices, capture = _chosen(config, begins=resumed is None)

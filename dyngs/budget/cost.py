@@ -1,8 +1,7 @@
 """The cost of a run of all its steps, by what was measured in one that ``train.minutes`` made shorter: a preview.
 
-A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.training.clock``); how
-fast this machine is at that was measured in every step. Gaussians are added at certain steps, about equally many each
-time. How far that was from whole runs: docs/budget.md.
+A step is taken to cost a constant, and in proportion to its pixels and its Gaussians (``dyngs.training.clock``), at the
+measured pace; about equally many Gaussians are added each time. How far that was from full runs: docs/budget.md.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Cost:
+class ExpectedCost:
     """What a run of ``steps`` is expected to cost: seconds, bytes of memory and of disk, and its Gaussians."""
 
     steps: int
@@ -76,20 +75,18 @@ class CostMeter:
         self._pixels = self._stepping = 0.0
 
     def __call__(self, event: Event) -> None:
-        """Take in a step."""
-        match event:
-            case StepDone():
-                now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
-                config = self.run.trainer.config
-                self._pixels = full_pixels(config, event.step, height * width)
-                if self._last is not None:
-                    cost = step_cost(config, event.step, self._pixels, event.num_gaussians)
-                    self._paces.append((now - self._last) / cost)
-                    self._stepping += now - self._last
-                self._last = now
+        if isinstance(event, StepDone):
+            now, (height, width) = time.perf_counter(), event.report.truth.shape[:2]
+            config = self.run.trainer.config
+            self._pixels = full_pixels(config, event.step, height * width)
+            if self._last is not None:
+                cost = step_cost(config, event.step, self._pixels, event.num_gaussians)
+                self._paces.append((now - self._last) / cost)
+                self._stepping += now - self._last
+            self._last = now
 
-    def found(self) -> Cost | None:
-        """Return what the whole run would cost; None where there were too few steps to tell."""
+    def found(self) -> ExpectedCost | None:
+        """Return what the full run would cost; None where there were too few steps to tell."""
         paces = self._paces[FIRST:]
         if not paces:
             return None
@@ -104,7 +101,7 @@ class CostMeter:
         least, expected, most = (peak + each * max(n - now, 0) for n in (counts.low, counts.middle, counts.high))
         paths = checkpoint_paths(self.run.folder)
         stored = (paths[-1].stat().st_size if paths else 0) / max(now, 1) * (2 if config.train.save_every else 1)
-        return Cost(
+        return ExpectedCost(
             self.steps,
             Range(fast / spread, middle, slow * spread),
             Range(least / MEMORY, expected, most * MEMORY),

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
+from dyngs.errors import counted
 from dyngs.prune.score import highest
 from dyngs.prune.stage import default_scores
 from dyngs.training.events import Event, StepDone
@@ -19,11 +20,7 @@ from dyngs.training.limits import CLOSE, most_gaussians
 
 
 class CountLimit:
-    """Listener that keeps the number of Gaussians within a limit.
-
-    Args:
-        run: what is limited.
-        most: Gaussians that it may end with.
+    """Listener that keeps the number of Gaussians within ``most``.
 
     Attributes:
         before: their number before the first removal; 0: there was none.
@@ -36,16 +33,14 @@ class CountLimit:
 
     def __call__(self, event: Event) -> None:
         """Remove Gaussians after a step of a late stage, if there are too many."""
-        match event:
-            case StepDone():
-                count = self.run.trainer.num_gaussians
-                if count > self.most and self.run.stage:
-                    before, after = self.run.remove(highest(default_scores(self.run.trainer), 1 - self.most / count))
-                    self.before, self.lost = self.before or count, self.lost + before - after
-                    self.run.say(
-                        f"step {event.step}: {self._name}: {count:,} -> {self.most:,} Gaussians; {after - before:+.2f} "
-                        "dB on training views"
-                    )
+        count = self.run.trainer.num_gaussians
+        if isinstance(event, StepDone) and count > self.most and self.run.stage:
+            before, after = self.run.remove(highest(default_scores(self.run.trainer), 1 - self.most / count))
+            self.before, self.lost = self.before or count, self.lost + before - after
+            self.run.say(
+                f"step {event.step}: {self._name}: {count:,} -> {counted(self.most, 'Gaussian')}; "
+                f"{after - before:+.2f} dB on training views"
+            )
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for a checkpoint; empty where nothing was removed."""
@@ -70,7 +65,7 @@ class CountLimit:
             cost = "it held growth back; what more would bring is not known"
         else:
             cost = "it cost nothing"
-        return f"{self._name}: asked for at most {self.most:,} Gaussians, got {count:,}; {cost}"
+        return f"{self._name}: asked for at most {counted(self.most, 'Gaussian')}, got {count:,}; {cost}"
 
     @property
     def _name(self) -> str:
@@ -78,7 +73,6 @@ class CountLimit:
 
 
 def count_limit(run: LimitedRun) -> CountLimit | None:
-    """Return the limit of a run, None without one."""
     times = {view.time for view in run.trainer.images.views if view.time is not None}
     most = most_gaussians(run.trainer.config, len(times))
     return None if most is None else CountLimit(run, most)

@@ -25,7 +25,7 @@ class LimitedRun:
     """A run with limits.
 
     Attributes:
-        config: as it is saved there; that of the trainer has its limits applied.
+        config: as it is saved in ``folder``; that of the trainer has its limits applied.
         given: seconds that it has.
         reserve: seconds that its limits need before the end.
     """
@@ -44,11 +44,9 @@ class LimitedRun:
 
     @property
     def stage(self) -> int:
-        """Return the number of removal stages that the run has reached; the last is its end."""
         return stage(self.config, self.trainer.done, self.used / self.given)
 
     def exchange(self, trainer: GaussianTrainer) -> None:
-        """Go on with another trainer."""
         self.trainer = self.loop.trainer = trainer
 
     def remove(self, kept: Tensor) -> tuple[float, float]:
@@ -60,7 +58,6 @@ class LimitedRun:
         return before, training_quality(trainer, trainer.model.scene)
 
     def say(self, text: str) -> None:
-        """Tell people."""
         self.loop.tell(Message(text))
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config.io import RESOLVED_NAME
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.scene import Scene
 from dyngs.kinds import GaussianTrainer, restored_scene
 from dyngs.models.checkpoint import CheckpointInfo
@@ -53,7 +53,7 @@ class SizeReport:
     def __str__(self) -> str:
         how = [f"{self.coarser:.3g} times coarser than usual"] if self.coarser > 1 else []
         if self.num_kept < self.num_gaussians:
-            how += [f"{self.num_kept:,} of {self.num_gaussians:,} Gaussians"]
+            how += [f"{self.num_kept:,} of {counted(self.num_gaussians, 'Gaussian')}"]
         return (
             f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({EXPORT_FOLDER}/{SCENE_FILE}"
             f"{''.join(f', {x}' for x in how)}); {self.after - self.before:+.2f} dB on training views "
@@ -79,27 +79,18 @@ def has_file(run_dir: Path) -> bool:
 
 @torch.no_grad()
 def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> SizeReport:
-    """Write ``scene.dyngs``, at most ``megabytes`` large, into a folder of ``run_dir``, and return a report.
+    """Write ``scene.dyngs``, of at most so many 1e6 bytes, into a folder of ``run_dir``, and return a report.
 
     Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
-    makes training images better than the former alone.
-
-    Args:
-        trainer: at the end of its run; it is left as it is.
-        run_dir: of the run.
-        megabytes: 1e6 bytes.
+    makes training images better than the former alone. The ``trainer`` is at the end of its run and left as it is.
     """
-    whole, scene, config = (
-        trainer.checkpoint(),
-        trainer.model.scene.to(CPU),
-        trainer.config,
-    )  # files are made on the CPU
-    images = probe_images(trainer)
+    full, config = trainer.checkpoint(), trainer.config
+    scene, images = trainer.model.scene.to(CPU), probe_images(trainer)  # files are made on the CPU
     before = quality_of(trainer, scene, images)
-    plan = storage_plan(config, whole, scene, None)
+    plan = storage_plan(config, full, scene, None)
 
     def stored(kept: Scene, coarseness: Tensor | None) -> _File | None:
-        found = _fitted(whole.info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
+        found = _fitted(full.info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
         if found is None:
             return None
         data, coarser = found

@@ -19,7 +19,7 @@ from torch import Tensor
 from dyngs.budget.run import LimitedRun, stage, two_digits
 from dyngs.config import Config
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.scene import Scene, render_options
 from dyngs.kinds import GaussianTrainer
@@ -63,15 +63,12 @@ class Measured:
     """Measurements and removals for a speed.
 
     Attributes:
-        base: seconds of a drawing with hardly any Gaussians.
-        seconds: of a drawing when that was measured last.
-        cap: Gaussians that there may be by what was measured; 0: as many as are wanted.
+        base, seconds: of a drawing with hardly any Gaussians, and when that was measured last.
+        cap: Gaussians that there may be by what was measured; 0: any number.
         passed: stages at which Gaussians were removed where that was needed.
-        before: number of Gaussians before the first removal; 0: there was none.
-        quality: of training images then, dB.
+        before, quality: number of Gaussians before the first removal, 0 without one, and dB of training images then.
         lost: dB of them by all removals, before anything was trained again.
-        measuring: seconds that it took to measure ``base``.
-        removing: seconds that the last removal took; 0: there was none.
+        measuring, removing: seconds that it took to measure ``base``, and that the last removal took.
     """
 
     base: float = 0.0
@@ -131,26 +128,21 @@ class SpeedLimit:
 
     def __call__(self, event: Event) -> None:
         """Measure the speed while Gaussians are added; remove some in a late stage, if drawing is too slow."""
-        match event:
-            case StepDone():
-                now = self.run.stage
-                if now > self.found.passed:
-                    self.found.passed = now
-                    # Before the end nothing is removed if the time that is left is not enough to do it twice.
-                    if event.is_last or self.run.given - self.run.used > 2 * self._reserve():
-                        self._remove()
-                elif self._is_growing(event.step):
-                    trainer = self.run.trainer
-                    self.found.seconds = drawing_seconds(trainer, trainer.model.scene, GROWTH_VIEWS)
-                    self.found.cap = self._allowed(trainer.num_gaussians)
-                    self.hold()
+        if not isinstance(event, StepDone):
+            return
+        now, trainer = self.run.stage, self.run.trainer
+        if now > self.found.passed:
+            self.found.passed = now
+            # Before the end nothing is removed if the time that is left is not enough to do it twice.
+            if event.is_last or self.run.given - self.run.used > 2 * self._reserve():
+                self._remove()
+        elif self._is_growing(event.step):
+            self.found.seconds = drawing_seconds(trainer, trainer.model.scene, GROWTH_VIEWS)
+            self.found.cap = allowed(self.found, self.fps, trainer.num_gaussians, trainer.config)
+            self.hold()
 
     def reached(self) -> str:
-        """Return the line about ``budget.min_fps`` after a run.
-
-        Raises:
-            DyngsError: it is too slow after all.
-        """
+        """Return the line about ``budget.min_fps`` after a run. Raises DyngsError: it is too slow after all."""
         found, trainer = self.found, self.run.trainer
         got, count = 1 / found.seconds, trainer.num_gaussians
         if got < self.fps:
@@ -162,11 +154,11 @@ class SpeedLimit:
         if found.before:
             now = training_quality(trainer, trainer.model.scene)
             cost = (
-                f"{found.before:,} -> {count:,} Gaussians; {-found.lost:+.2f} dB on training views when that was done "
-                f"({found.quality:.2f} before, {now:.2f} at the end)"
+                f"{found.before:,} -> {counted(count, 'Gaussian')}; {-found.lost:+.2f} dB on training views when that "
+                f"was done ({found.quality:.2f} before, {now:.2f} at the end)"
             )
         elif CLOSE * found.cap <= count and 0 < found.cap < self.run.trainer.config.strategy.growth_limit:
-            cost = f"{count:,} Gaussians; it held growth back; what more would bring is not known"
+            cost = f"{counted(count, 'Gaussian')}; it held growth back; what more would bring is not known"
         return f"budget.min_fps: asked {self.fps:g}, got {got:.3g}; {cost}"
 
     def _is_growing(self, step: int) -> bool:
@@ -205,8 +197,8 @@ class SpeedLimit:
         found.removing = time.perf_counter() - start
         self.hold()
         self.run.say(
-            f"step {trainer.done}: budget.min_fps: {count:,} -> {left:,} Gaussians, {1 / found.seconds:.3g} per "
-            f"second; {after - before:+.2f} dB on training views"
+            f"step {trainer.done}: budget.min_fps: {count:,} -> {counted(left, 'Gaussian')}, {1 / found.seconds:.3g} "
+            f"per second; {after - before:+.2f} dB on training views"
         )
 
     def _fastest(self, scores: Tensor) -> tuple[Tensor, float] | None:
@@ -234,10 +226,6 @@ class SpeedLimit:
             if seconds > CLOSE_ENOUGH * goal:
                 break
         return found
-
-    def _allowed(self, count: int) -> int:
-        """Return how many Gaussians there may be before pruning, if ``count`` are drawn in ``found.seconds``."""
-        return allowed(self.found, self.fps, count, self.run.trainer.config)
 
 
 def allowed(found: Measured, fps: float, count: int, config: Config) -> int:

@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.budget.run import LimitedRun, two_digits
 from dyngs.config import Config
 from dyngs.deform.schedule import motion_begins_after
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.runs.config_file import write_config
 from dyngs.training.clock import Forecast, with_steps
@@ -37,15 +37,11 @@ class Deadline:
     """Listener that ends a run in time.
 
     Args:
-        run: what is limited.
-        most_steps: that are wanted if they fit.
+        most_steps: that are requested, if they fit.
         fits: the number of steps may change; otherwise only the end of the time ends the run.
-        refit_seconds: what preparing the run anew took last.
+        refit_seconds: what preparing the run anew took last; ``save_seconds``: what saving took.
         save: writes a checkpoint.
-        on_refit: called with the new trainer, after the run goes on with it.
-
-    Attributes:
-        save_seconds: what saving took last.
+        on_refit: called after the run goes on with a new trainer.
     """
 
     def __init__(
@@ -66,16 +62,13 @@ class Deadline:
 
     def __call__(self, event: Event) -> None:
         """Go on, after a step, with as many steps as fit into the time; with none where it is over."""
-        match event:
-            case StepDone():
-                config, done, now = self.run.config, event.step, self.run.used
-                if done >= config.train.steps:
-                    return
-                height, width = event.report.truth.shape[:2]
-                self._forecast.observe(config, done, now, event.num_gaussians, height * width)
-                found = self.steps(config, done, now)
-                if found != config.train.steps:
-                    self._go_on(found, done)
+        config = self.run.config
+        if isinstance(event, StepDone) and event.step < config.train.steps:
+            done, now, (height, width) = event.step, self.run.used, event.report.truth.shape[:2]
+            self._forecast.observe(config, done, now, event.num_gaussians, height * width)
+            found = self.steps(config, done, now)
+            if found != config.train.steps:
+                self._go_on(found, done)
 
     def _begin(self, done: int, now: float) -> None:
         """Measure the pace from here on: after ``done`` steps, ``now`` seconds after the beginning."""
@@ -83,11 +76,7 @@ class Deadline:
         self._forecast.restart(done, now, self.run.trainer.num_gaussians)
 
     def steps(self, config: Config, done: int, now: float) -> int:
-        """Return how many steps the run should have after ``done`` in ``now`` seconds; ``done`` where the time is over.
-
-        Args:
-            config: of the run as it is; its own number of steps is returned where it should stay.
-        """
+        """Return how many steps a run of ``config`` should have, after ``done`` in ``now`` seconds."""
         total, given, reserve = config.train.steps, self.run.given, self.run.reserve
         if self._since is None:
             self._begin(done, now)
@@ -116,9 +105,9 @@ class Deadline:
         done = self.run.trainer.done
         asked = f"asked {self.run.given / 60:g}, got {self.run.used / 60:.2f}"
         if not self.fits:
-            return f"train.minutes: {asked}: {done:,} steps"
+            return f"train.minutes: {asked}: {counted(done, 'step')}"
         cost = "; what more would bring is not known" if done < self.most_steps else ": all, it cost nothing"
-        return f"train.minutes: {asked}: {done:,} of {self.most_steps:,} steps{cost}"
+        return f"train.minutes: {asked}: {done:,} of {counted(self.most_steps, 'step')}{cost}"
 
     def _go_on(self, steps: int, done: int) -> None:
         run = self.run
@@ -141,36 +130,33 @@ class Deadline:
 def first_fit(config: Config, trainer: GaussianTrainer, used: float) -> Config:
     """Return ``config`` with as many steps as fit, at most its own, by the measured rate of a copy of ``trainer``.
 
-    Args:
-        config: of the run.
-        trainer: newly assembled from it; left as it is.
-        used: seconds that are not there for steps, up to now and at the end.
+    ``used``: seconds that are not there for steps, up to now and at the end.
 
     Raises:
         DyngsError: too few fit; says how many minutes would do.
     """
-    minutes, wanted = config.train.minutes or math.inf, config.train.steps
+    minutes, steps = config.train.minutes or math.inf, config.train.steps
     begin = time.perf_counter()
     pilot = refitted(trainer, config)
     prepared = time.perf_counter()
-    for _ in range(min(PILOT_WARM_UP, wanted - 1)):
+    for _ in range(min(PILOT_WARM_UP, steps - 1)):
         pilot.step()
     done = pilot.done
     forecast = Forecast(done, time.perf_counter(), pilot.num_gaussians)
-    while pilot.done < min(done + PILOT_STEPS, wanted):
+    while pilot.done < min(done + PILOT_STEPS, steps):
         height, width = pilot.step().truth.shape[:2]
         now = time.perf_counter()
         forecast.observe(config, pilot.done, now, pilot.num_gaussians, height * width)
         if now - prepared > PILOT_FRACTION * 60 * minutes:
             break
     used += (prepared - begin) + (time.perf_counter() - begin)
-    found = fitting_steps(forecast, config, 0, AIM * 60 * minutes - used, wanted)
-    fewest = min(FEWEST_STEPS, wanted)
+    found = fitting_steps(forecast, config, 0, AIM * 60 * minutes - used, steps)
+    fewest = min(FEWEST_STEPS, steps)
     if found < fewest:
         needed = (used + forecast.seconds(with_steps(config, fewest), fewest, 0)) / AIM / 60
         raise DyngsError(
-            f"train.minutes={minutes:g}: about {found} steps would fit, and fewer than {fewest} are of no use; "
-            f"{two_digits(needed, math.ceil):g} would do, or smaller images (data.longest_side)"
+            f"train.minutes={minutes:g}: about {counted(found, 'step')} would fit, and fewer than {fewest} are of no "
+            f"use; {two_digits(needed, math.ceil):g} would do, or smaller images (data.longest_side)"
         )
     return with_steps(config, found)
 
@@ -197,10 +183,9 @@ def fitting_steps(forecast: Forecast, config: Config, done: int, seconds: float,
 
 def same_phase(old: Config, new: Config, done: int) -> bool:
     """Return whether changing ``old`` to ``new`` after ``done`` neither omits nor repeats any one-time event."""
-    return _happened(old, done) == _happened(new, done)
 
+    def happened(config: Config) -> list[bool]:
+        once = motion_begins_after(config, config.train.steps), config.colour.measured_after(config.train.steps)
+        return [done >= step for step in once if step is not None]
 
-def _happened(config: Config, done: int) -> tuple[bool, ...]:
-    """Return, for each one-time event of a run, whether it has happened after ``done`` steps."""
-    once = motion_begins_after(config, config.train.steps), config.colour.measured_after(config.train.steps)
-    return tuple(done >= step for step in once if step is not None)
+    return happened(old) == happened(new)

@@ -26,19 +26,10 @@ def path_along(
 ) -> CameraPath:
     """Return a smooth path along V >= 1 cameras, with intrinsics of the first.
 
-    With times that all differ, which is a clip of one moving camera, the path plays the clip from the first time to the
-    last. Otherwise it visits every place once, at even speed: in the order given if that is a walk, else by a short way
-    from the first camera on. Places, viewing directions and up directions are means over the cameras near on the way,
-    with Gaussian weights.
-
-    Args:
-        cameras: usually those of training, in the order of their names.
-        num_frames: F.
-        times: (V,) scene times of the cameras in [0, 1]; None: a static scene.
-        up: (3,) up in the images; None: that of the cameras near.
-
-    Returns:
-        F cameras, with times if the path plays a clip.
+    With ``times`` (V,) that all differ, which is a clip of one moving camera, the path plays the clip from the first
+    time to the last. Otherwise it visits every position once, at even speed: in the order of the capture if that is a
+    walk, else by a short way from the first camera on. Positions, viewing directions and up directions (without ``up``)
+    are means over the cameras near on the way, with Gaussian weights.
     """
     poses = world_from_cam(cameras)
     kept = np.linspace(0, len(poses) - 1, min(len(poses), _MOST_CAMERAS)).round().astype(int)

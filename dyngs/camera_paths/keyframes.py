@@ -40,12 +40,7 @@ def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
     (nearly) rests on one side of a keyframe, so that equal keyframes give a fixed camera. Focal lengths are
     interpolated geometrically, the principal point and the scene time linearly.
 
-    Args:
-        keys: K >= 1 keyframes.
-        seconds: (F,) any; before the first and after the last keyframe the camera rests, a loop repeats.
-
-    Returns:
-        F cameras, without a period.
+    Before the first and after the last of K >= 1 keyframes the camera rests, a loop repeats.
     """
     from scipy.spatial.transform import Rotation, Slerp
 
@@ -90,7 +85,6 @@ def _hermite(knots: np.ndarray, points: np.ndarray, t: np.ndarray) -> np.ndarray
 
 
 def _shortened(vectors: np.ndarray, longest: np.ndarray) -> np.ndarray:
-    """Return vectors (K, 3) shortened to at most (K,) ``longest``."""
     length = np.linalg.norm(vectors, axis=1)
     scale = np.divide(longest, length, out=np.ones_like(length), where=length > longest)
     return vectors * scale[:, None]

@@ -23,11 +23,9 @@ _NARROWEST_ARC = math.radians(10)
 
 @dataclass(frozen=True)
 class Orbit:
-    """Azimuth, height and distance of V cameras around the point that they look at.
+    """Azimuth, height and distance of V cameras around the point (3,) that they look at.
 
     Attributes:
-        center: (3,) the point.
-        up: (3,) unit.
         level: (2, 3) unit vectors, perpendicular to ``up``: azimuth 0, towards the first camera, and 90 degrees.
         azimuths: (V,) radians from the middle of the arc, within half a circle.
         radii, heights: (V,) distances from the axis and along it, world units.
@@ -57,7 +55,7 @@ class Orbit:
         return (f"the capture was filmed from an arc of {degrees:.0f} degrees: the orbit swings along it and back",)
 
     def eyes(self, azimuths: np.ndarray) -> np.ndarray:
-        """Return places (F, 3) at ``azimuths`` (F,) radians from the middle.
+        """Return positions (F, 3) at ``azimuths`` (F,) radians from the middle.
 
         All around: at the mean radius and height. On an arc: at those of the cameras near the azimuth.
         """
@@ -94,16 +92,11 @@ def orbit_of(cameras: Cameras, up: np.ndarray | None = None) -> Orbit:
 
 
 def orbit_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None) -> Cameras:
-    """Return cameras on a level circle around the point that the given ``cameras`` look at.
+    """Return cameras on a level circle around the point that V >= 1 ``cameras`` look at, and ``up`` (3,) is its axis.
 
-    Radius and height are means over the given cameras; intrinsics are those of the first. A ring of cameras gives the
-    ring itself. Cameras on an arc, with nobody behind: the path swings from its middle to one end, to the other, and
-    back, at the radius and height of the cameras near.
-
-    Args:
-        cameras: V >= 1 cameras, usually those of training.
-        num_frames: F; all around, frame 0 is at the azimuth of the first camera.
-        up: (3,) axis of the circle; None: ``up_direction`` of the cameras.
+    Radius and height are means over the cameras; intrinsics, and the azimuth of frame 0, are those of the first. A ring
+    of cameras gives the ring itself. Cameras on an arc, with nobody behind: the path swings from its middle to one end,
+    to the other, and back, at the radius and height of the cameras near.
     """
     orbit = orbit_of(cameras, up)
     turn = 2 * np.pi * np.arange(num_frames) / max(num_frames, 1)
@@ -116,15 +109,9 @@ def spiral_path(
 ) -> Cameras:
     """Return cameras on a closed spiral in front of a scene seen from one side, as in LLFF.
 
-    The spiral is centred on the mean camera and as wide as the 90% quantile of the distances of the given cameras from
-    it; all cameras look at the same point.
-
-    Args:
-        cameras: V >= 1 cameras, roughly facing one way.
-        num_frames: F.
-        up: (3,) up in the images; None: ``up_direction`` of the cameras.
-        turns: circles per loop.
-        zoom: extent along the viewing axis, relative to the width of the spiral.
+    The spiral is centred on the mean of V >= 1 cameras, which roughly face one way, and as wide as the 90% quantile of
+    their distances from it; all cameras look at the same point. ``turns``: circles per loop; ``zoom``: extent along the
+    viewing axis, relative to the width.
     """
     poses = world_from_cam(cameras)
     centers, target = poses[:, :3, 3], look_at_point(cameras)
@@ -146,14 +133,8 @@ def frame_orbit_for_points(
 ) -> Cameras:
     """Return an orbit around a set of points whose robust extent fills the image.
 
-    The centre is the median. The extent is the sphere around it that holds 99% of the points within the 1st to 99th
-    percentile of every axis, so that outliers have no effect.
-
-    Args:
-        means: (N, 3) points in world units; non-finite ones are ignored.
-        num_frames: F.
-        size: width and height in pixels.
-        up: up direction of the world; (0, -1, 0) for many COLMAP captures.
+    The centre is the median. The extent is the sphere around it that holds 99% of the points (N, 3) within the 1st to
+    99th percentile of every axis, so that outliers have no effect; those that are not finite are ignored.
 
     Raises:
         DyngsError: no finite point, or a zero up direction.

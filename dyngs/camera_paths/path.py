@@ -15,7 +15,8 @@ import torch
 from dyngs.camera import Cameras
 from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
 from dyngs.data.geometry import cam_from_opengl, checked_pose
-from dyngs.errors import DyngsError, printable, require_regular
+from dyngs.errors import DyngsError, printable
+from dyngs.files.fields import read_json_object
 from dyngs.files.write import write_text
 
 _MAX_FRAMES = 100_000
@@ -25,14 +26,9 @@ PLACED_PATHS = ("orbit", "spiral", "along")
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Cameras in the order of the frames.
+    """F cameras in the order of the frames, and scene times in [0, 1], or None for a static scene.
 
-    Attributes:
-        cameras: F cameras.
-        fps: frames per second.
-        times: (F,) scene times in [0, 1], or None for a static scene.
-        warnings: messages about changed input.
-        notes: messages about where the cameras were placed.
+    There are warnings about changed input, and notes about where the cameras were placed.
     """
 
     cameras: Cameras
@@ -46,15 +42,7 @@ class CameraPath:
 
 
 def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
-    """Return the path with other scene times.
-
-    Args:
-        path: F cameras.
-        times: F scene times; those outside [0, 1] are clamped, with a warning.
-
-    Raises:
-        DyngsError: another number of times than cameras, or a time that is not finite.
-    """
+    """Return the path with other scene times, as many as cameras; those outside [0, 1] are clamped, with a warning."""
     if len(times) != len(path):
         raise DyngsError(f"the camera path has {len(path)} cameras, but there are {len(times)} times; give as many")
     clamped, warnings = _clamped(times, "times")
@@ -62,13 +50,7 @@ def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
 
 
 def static_path(camera: Cameras, times: Sequence[float], fps: float = 30.0) -> CameraPath:
-    """Return the path of one fixed camera at many scene times.
-
-    Args:
-        camera: one camera.
-        times: F >= 1 scene times, as in ``with_times``.
-        fps: frames per second.
-    """
+    """Return the path of one fixed camera at F >= 1 scene times, as in ``with_times``."""
     if len(camera) != 1:
         raise ValueError(f"a static path needs one camera, got {len(camera)}")
     poses, intrinsics = (x.expand(len(times), *x.shape[1:]).clone() for x in (camera.cam_from_world, camera.intrinsics))
@@ -98,8 +80,7 @@ def path_file(path: str) -> Path | None:
 def parse_times(text: str) -> tuple[float, ...]:
     """Return COUNT evenly spaced times from ``START:STOP:COUNT``, both ends included; a single one is START.
 
-    Raises:
-        DyngsError: ``text`` is anything else.
+    Raises DyngsError: ``text`` is anything else.
     """
     wanted = "write START:STOP:COUNT, for instance 0:1:60 for 60 evenly spaced times"
     shown = printable(repr(text), 60)
@@ -116,47 +97,35 @@ def parse_times(text: str) -> tuple[float, ...]:
 
 def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = None) -> None:
     """Write a path as JSON in the format of ``read_path``, atomically; ``world_offset`` as there."""
-    cameras = path.cameras
-    poses = _rebased(cameras.cam_from_world.detach().cpu().double().numpy(), world_offset, sign=-1.0)
-    frames = []
+    cameras, frames = path.cameras, []
     for i in range(len(cameras)):
-        k = cameras.intrinsics[i].tolist()
-        frame: dict[str, Any] = {"cam_from_world": poses[i].tolist()}
-        frame |= {"fl_x": k[0][0], "fl_y": k[1][1], "cx": k[0][2], "cy": k[1][2]}
-        if path.times is not None:
-            frame["time"] = path.times[i]
-        frames.append(frame)
+        pose, k = cameras.cam_from_world[i].detach().cpu().double().numpy().copy(), cameras.intrinsics[i].tolist()
+        if world_offset is not None:
+            pose[:3, 3] -= pose[:3, :3] @ world_offset
+        frame = {"cam_from_world": pose.tolist(), "fl_x": k[0][0], "fl_y": k[1][1], "cx": k[0][2], "cy": k[1][2]}
+        frames.append(frame if path.times is None else frame | {"time": path.times[i]})
     document = {"width": cameras.width, "height": cameras.height, "fps": path.fps, "frames": frames}
     write_text(file, json.dumps(document, indent=1) + "\n")
 
 
 def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
-    """Read a camera path from a JSON file; cameras are float32 on the CPU.
+    """Read a camera path from a JSON file (docs/camera_paths.md); cameras are float32 on the CPU.
 
-    Args:
-        file: see docs/camera_paths.md.
-        world_offset: (3,) ``Capture.world_offset``: the file is in the coordinates of the capture, the returned cameras
-            are in the rebased world.
+    The file is in the coordinates of the capture, the returned cameras are in the world rebased by ``world_offset``
+    (3,), ``Capture.world_offset``.
 
     Raises:
         DyngsError: names the file, the frame and the key that is missing or wrong.
     """
-    require_regular(file)
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DyngsError(f"cannot read the camera path {file}: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise DyngsError(f"{file} is not a JSON file ({error}); see docs/camera_paths.md for the format") from error
-    if not isinstance(document, dict):
-        raise DyngsError(f"{file}: a camera path is a JSON object with a list 'frames'; see docs/camera_paths.md")
+    document: dict[str, Any] = read_json_object(file, "a camera path is a JSON object; see docs/camera_paths.md")
     given = [name for name in ("frames", "keyframes") if name in document]
     if len(given) != 1 or not isinstance(document[given[0]], list) or not document[given[0]]:
         raise DyngsError(f"{file}: a camera path needs one non-empty list, 'frames' or 'keyframes'; see docs")
     width, height = (int(_number(document, key, str(file), low=1, high=65536)) for key in ("width", "height"))
     fps = _number(document, "fps", str(file), low=1e-3, high=1000, default=30.0)
     poses, intrinsics, times = _read_cameras(document, given[0], (width, height), file)
-    poses = _rebased(poses, world_offset, sign=1.0)
+    if world_offset is not None:
+        poses[:, :3, 3] += poses[:, :3, :3] @ world_offset
     if given[0] == "keyframes":
         keys, num_frames = _read_keyframes(document, Keyframes(poses, intrinsics, np.zeros(0), times), fps, file)
         made = interpolate_keyframes(keys, np.arange(num_frames) / fps)
@@ -167,14 +136,6 @@ def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:
         return path
     clamped, warnings = _clamped(times.tolist(), str(file))
     return replace(path, times=clamped, warnings=warnings)
-
-
-def _rebased(cam_from_world: np.ndarray, world_offset: np.ndarray | None, sign: float) -> np.ndarray:
-    """Return poses (F, 4, 4) for a world shifted by minus (sign 1) or plus (sign -1) the offset."""
-    moved = cam_from_world.copy()
-    if world_offset is not None:
-        moved[:, :3, 3] += sign * moved[:, :3, :3] @ world_offset
-    return moved
 
 
 def _read_cameras(
@@ -261,11 +222,7 @@ def _clamped(times: Sequence[float], where: str) -> tuple[tuple[float, ...], tup
 
 
 def _read_pose(frame: dict[str, Any], where: str) -> np.ndarray:
-    """Return the world-to-camera pose (4, 4) of a frame.
-
-    Raises:
-        DyngsError: it is missing or not rigid.
-    """
+    """Return the world-to-camera pose (4, 4) of a frame."""
     given = [key for key in ("cam_from_world", "transform_matrix") if key in frame]
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")

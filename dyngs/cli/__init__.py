@@ -1,7 +1,7 @@
 """The ``dyngs`` command: one module of this package per subcommand.
 
-Every module offers ``add_parser(commands)`` and a ``run(arguments) -> int``. What is heavy (torch, the native core,
-readers) is imported inside ``run``, so that ``dyngs --help`` is instant.
+Every module offers ``add_parser(commands)``, which adds its command, and a ``run(arguments) -> int``. What is heavy
+(torch, the native core, readers) is imported inside ``run``, so that ``dyngs --help`` is instant.
 
 Exit codes: 0 done; 2 bad input or usage, after one line on stderr; 130 interrupted. Anything unexpected keeps its
 traceback, because it is a bug. With ``--debug`` the traceback of any error comes before its line.
@@ -49,13 +49,16 @@ _OUT_OF_MEMORY = "out of memory; use smaller images (data.longest_side) or a sma
 _TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
 _GPU_OUT_OF_MEMORY = "CUDA out of memory"
 _GPU_IS_FULL = "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
-_OF_DATA = ("inspect", "sfm", "motion", "synth")
+_OF_DATA = ("inspect", "sfm", "fit", "motion", "synth")
 """Commands of ``dyngs data``."""
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (default: ``sys.argv``) and return the exit code."""
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks, at the Tab key
+        parser = make_parser()
+        completion.finder(parser)(parser, always_complete_options=False)
     arguments, debug = _without_debug(list(sys.argv[1:] if argv is None else argv))
     _show_any_name()
     try:
@@ -70,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exception(error)
         return _fail(str(error) if isinstance(error, DyngsError) else full)
     except KeyboardInterrupt as interrupt:
-        print(f"\ndyngs: interrupted{_after_colon(interrupt)}", file=sys.stderr)
+        print(f"\ndyngs: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except OSError as error:
         _abandon_if_broken(sys.stdout)
@@ -148,13 +151,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
-    return _add_commands(
-        _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
-    )
-
-
-def _add_commands(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    parser = _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
@@ -177,10 +174,6 @@ def _abandon_if_broken(stream: TextIO) -> None:
         stream.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _after_colon(error: BaseException) -> str:
-    return f": {error}" if str(error) else ""
 
 
 def _describe_os_error(error: OSError) -> str:

@@ -1,4 +1,4 @@
-"""Types of command-line arguments, and notes printed by several commands."""
+"""Arguments and their types, and notes printed by several commands."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from dyngs.errors import DyngsError
 
@@ -18,7 +18,27 @@ if TYPE_CHECKING:
 
     from dyngs.config import DataConfig
 
-MAX_THREADS = 1024
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+AXES = ("x", "y", "z", "-x", "-y", "-z")
+_DEVICES = ("auto", "cpu", "cuda")
+
+
+def add_command(
+    commands: Commands,
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    help: str,
+    description: str | None = None,
+    epilog: str | None = None,
+) -> argparse.ArgumentParser:
+    """Add a command that ``run`` carries out; return its parser."""
+    formatter = argparse.HelpFormatter if epilog is None else argparse.RawDescriptionHelpFormatter
+    parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=formatter)
+    parser.set_defaults(run=run)
+    return parser
+
+
+# ---------------------------------------------------------------------------------------------------- types
 
 
 def input_path(text: str) -> Path:
@@ -36,11 +56,117 @@ def output_path(text: str) -> Path:
     return Path(text)
 
 
+def whole(what: str, low: int, high: int, more: str = "") -> Callable[[str], int]:
+    """Return the type of an argument that is a whole number; ``what`` is its name with an article, for messages."""
+
+    def parse(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and len(text) < 10 and low <= int(text) <= high):
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not {what}; write a whole number from {low} to {high:,}{more}"
+            )
+        return int(text)
+
+    return parse
+
+
+def scene_time(text: str) -> float:
+    """Return a finite time; values outside [0, 1] are clamped later, with a warning."""
+    try:
+        time = float(text)
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time; write a number from 0 to 1, for instance 0.5")
+    return time
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Return width and height from ``WIDTHxHEIGHT``."""
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
+    if not match or "0" in match.groups():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for instance 1280x720")
+    return int(match[1]), int(match[2])
+
+
+# ---------------------------------------------------------------------------------------------------- arguments
+
+
+def add_threads(parser: argparse.ArgumentParser) -> None:
+    kind = whole("a number of threads", 0, 1024, ", 0 for all cores")
+    parser.add_argument("--threads", type=kind, default=0, metavar="N", help="number of threads, 0 = all cores")
+
+
+def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
+    about = f"what computes; auto: a CUDA GPU that can be used, else the CPU (default {default})"
+    parser.add_argument("--device", choices=_DEVICES, default=default, help=about)
+
+
+def add_run_device(parser: argparse.ArgumentParser) -> None:
+    """Add ``--device`` to a command that trains: it sets ``run.device``."""
+    parser.add_argument("--device", choices=_DEVICES, help="what computes, as run.device=... (default auto)")
+
+
+def run_device(arguments: argparse.Namespace) -> list[str]:
+    """Return the override that ``--device`` of ``add_run_device`` means."""
+    return [] if arguments.device is None else [f"run.device={arguments.device}"]
+
+
+def add_split(parser: argparse._ActionsContainer, about: str = "default test", default: str | None = "test") -> None:
+    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default=default, help=about)
+
+
+def add_up(parser: argparse.ArgumentParser, of: str = "") -> None:
+    """Add ``--up``, the axis that is up in the scene."""
+    usual = "default: up for the cameras of a run; of a file what it says, or what is usual for its format"
+    parser.add_argument("--up", choices=AXES, help=f"up axis{of} ({usual})")
+
+
+def add_motion(parser: argparse._ActionsContainer) -> None:
+    about = "motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma"
+    parser.add_argument("--motion", type=input_path, metavar="FILE", help=about)
+
+
+def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:
+    parser.add_argument("overrides", nargs="*", default=[], metavar=metavar, help=about)
+
+
+def add_data_root(parser: argparse.ArgumentParser) -> None:
+    """Add ``data.root=FOLDER`` to a command that reads the capture of a run."""
+    add_overrides(parser, "data.root=FOLDER", "where the capture of the run lies by now")
+    parser.set_defaults(takes_root=True)
+
+
+def data_root(arguments: argparse.Namespace) -> Path | None:
+    """Return the folder of ``add_data_root``; None: the capture was not moved. Raises DyngsError: another word."""
+    found = None
+    for word in arguments.overrides:
+        key, equals, value = word.partition("=")
+        if key.strip() != "data.root" or not equals or not value.strip():
+            raise DyngsError(
+                f"{word!r}: the run keeps its own configuration; only data.root=FOLDER, where its capture was moved "
+                "to, may be given"
+            )
+        found = Path(value.strip())
+    return found
+
+
+def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
+    """Return the data section with overrides ``data.key=value``; its root has no meaning."""
+    from dyngs.config.io import load_config
+
+    for word in overrides:
+        if not word.startswith("data.") or word.startswith(("data.root=", "data.format=")):
+            raise DyngsError(f"{word!r}: give keys of data here, such as data.follow_links=true")
+    return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data
+
+
+# ---------------------------------------------------------------------------------------------------- inputs, outputs
+
+
 def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Check that no output of a command would replace what it reads, as far as its arguments and overrides say.
 
-    Raises:
-        DyngsError: see ``dyngs.files.outputs.Inputs.require_output``.
+    Raises DyngsError: see ``dyngs.files.outputs.Inputs.require_output``.
     """
     words = [word.partition("=") for word in getattr(arguments, "overrides", ())]
     outputs = [*_values(parser, arguments, output_path), *(value for key, _, value in words if key == "run.dir")]
@@ -64,42 +190,10 @@ def _values(parser: argparse.ArgumentParser, arguments: argparse.Namespace, kind
             yield from value if isinstance(value, list) else (value,)
 
 
-def threads(text: str) -> int:
-    """Return a number of threads; 0 means all cores."""
-    if not (text.isascii() and text.isdigit() and len(text) < 5 and int(text) <= MAX_THREADS):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a number of threads; write a whole number up to {MAX_THREADS}, 0 for all cores"
-        )
-    return int(text)
-
-
-def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
-    """Add ``--device``."""
-    parser.add_argument(
-        "--device",
-        choices=("auto", "cpu", "cuda"),
-        default=default,
-        help=f"what computes; auto: a CUDA GPU that can be used, else the CPU (default {default})",
-    )
-
-
-def add_run_device(parser: argparse.ArgumentParser) -> None:
-    """Add ``--device`` to a command that trains: it sets ``run.device``."""
-    parser.add_argument(
-        "--device", choices=("auto", "cpu", "cuda"), help="what computes, as run.device=... (default auto)"
-    )
-
-
-def run_device(arguments: argparse.Namespace) -> list[str]:
-    """Return the override that ``--device`` of ``add_run_device`` means."""
-    return [] if arguments.device is None else [f"run.device={arguments.device}"]
-
-
 def computing_device(choice: str) -> torch.device:
     """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line on stderr says why.
 
-    Raises:
-        DyngsError: ``cuda`` where no GPU can be used.
+    Raises DyngsError: ``cuda`` where no GPU can be used.
     """
     from dyngs.ops.device import device_for, why_on_cpu
 
@@ -107,32 +201,6 @@ def computing_device(choice: str) -> torch.device:
     if reason is not None:
         print(f"dyngs: {reason}", file=sys.stderr)
     return device
-
-
-def scene_time(text: str) -> float:
-    """Return a finite time; values outside [0, 1] are clamped later, with a warning."""
-    try:
-        time = float(text)
-    except ValueError:
-        time = math.nan
-    if not math.isfinite(time):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time; write a number from 0 to 1, for instance 0.5")
-    return time
-
-
-def image_size(text: str) -> tuple[int, int]:
-    """Return width and height from ``WIDTHxHEIGHT``."""
-    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
-    if not match or "0" in match.groups():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write WIDTHxHEIGHT, for instance 1280x720")
-    return int(match[1]), int(match[2])
-
-
-def frame_count(text: str) -> int:
-    """Return a positive number of frames."""
-    if not (text.isdecimal() and len(text) < 10 and int(text)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of frames; write a whole number above 0")
-    return int(text)
 
 
 def is_avatar_file(path: Path) -> bool:
@@ -159,32 +227,6 @@ def run_of_scene_file(path: Path) -> Path:
     return path.parent
 
 
-def add_data_root(parser: argparse.ArgumentParser) -> None:
-    """Add ``data.root=FOLDER`` to a command that reads the capture of a run."""
-    parser.add_argument(
-        "overrides", nargs="*", default=[], metavar="data.root=FOLDER", help="where the capture of the run lies by now"
-    )
-    parser.set_defaults(takes_root=True)
-
-
-def data_root(arguments: argparse.Namespace) -> Path | None:
-    """Return the folder of ``add_data_root``; None: the capture was not moved.
-
-    Raises:
-        DyngsError: another word.
-    """
-    found = None
-    for word in arguments.overrides:
-        key, equals, value = word.partition("=")
-        if key.strip() != "data.root" or not equals or not value.strip():
-            raise DyngsError(
-                f"{word!r}: the run keeps its own configuration; only data.root=FOLDER, where its capture was moved "
-                "to, may be given"
-            )
-        found = Path(value.strip())
-    return found
-
-
 def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
     """Print notes to stdout and warnings to stderr."""
     for note in notes:
@@ -193,13 +235,7 @@ def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
         print(f"dyngs: warning: {warning}", file=sys.stderr)
 
 
-def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
-    """Return the data section with overrides ``data.key=value``; its root has no meaning."""
-    from dyngs.config.io import load_config
-
-    other = [
-        word for word in overrides if not word.startswith("data.") or word.startswith(("data.root=", "data.format="))
-    ]
-    if other:
-        raise DyngsError(f"{other[0]!r}: give keys of data here, such as data.follow_links=true")
-    return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data
+def print_written(*paths: Path) -> None:
+    """Print where files are and how large."""
+    where = paths[0] if len(paths) == 1 else f"{len(paths)} files, {paths[0]} to {paths[-1].name}"
+    print(f"written: {where} ({sum(path.stat().st_size for path in paths) / 1e6:.1f} MB)")

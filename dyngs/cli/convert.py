@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from dyngs.cli.arguments import input_path, output_path, print_notes
+from dyngs.cli.arguments import Commands, add_command, input_path, output_path, print_notes, print_written
 from dyngs.cli.splats import add_axes, print_redrawn
 from dyngs.errors import counted
 
@@ -16,20 +16,15 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``convert`` to the commands."""
-    parser = commands.add_parser(
-        "convert",
-        help="write a file of Gaussians in another format",
-        description="Read a file of Gaussians, of dyngs or of any other program, and write it in another format; the "
-        "suffixes name the formats.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+def add_parser(commands: Commands) -> None:
+    about = (
+        "Read a file of Gaussians, of dyngs or of any other program, and write it in another format; the suffixes name "
+        "the formats."
     )
+    parser = add_command(commands, "convert", run, "write a file of Gaussians in another format", about, _EPILOG)
     parser.add_argument("source", type=input_path, metavar="IN", help="file to read, such as a .ply or .spz")
     parser.add_argument("target", type=output_path, metavar="OUT", help="file to write, such as a .glb or .sog")
     add_axes(parser)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -43,10 +38,10 @@ def run(arguments: argparse.Namespace) -> int:
     splat = read_splats(arguments.source, nonfinite="skip")
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
-    turned = upright(splat, arguments.up, arguments.target)
-    said = f"up is {turned.up} in the file" + (f", it was {splat.up}" if turned.up != splat.up else ", as it was")
+    rotated = upright(splat, arguments.up, arguments.target)
+    said = f"up is {rotated.up} in the file" + (f", it was {splat.up}" if rotated.up != splat.up else ", as it was")
     print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
-    written = write_splats(arguments.target, turned, sh_degree=arguments.sh_degree)
+    written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
     print_redrawn(written.notes, [compare_splats(splat, written)])
-    print(f"written: {written.path} ({written.path.stat().st_size / 1e6:.1f} MB)")
+    print_written(written.path)
     return 0

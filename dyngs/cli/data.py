@@ -1,4 +1,4 @@
-"""``dyngs data``: inspect a capture, estimate poses, convert a motion, write a synthetic capture."""
+"""``dyngs data``: inspect a capture, estimate poses, fit a body, convert a motion, write a synthetic capture."""
 
 from __future__ import annotations
 
@@ -6,141 +6,149 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli import data_fit
-from dyngs.cli.arguments import data_section, input_path, output_path, threads
+from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
-from dyngs.errors import DyngsError, counted
+from dyngs.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
+    from dyngs.human.fit.known_person import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "human")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
+_OF_A_FIT = {
+    "keypoints": ("PATH", "key points: a folder of OpenPose files, or a COCO file"),
+    "masks": ("DIR", "masks of the person (white), named as the images"),
+    "background": (
+        "PATH",
+        "an image of the scene without the person, or a folder of one for each camera: masks are made by it",
+    ),
+    "joints": (
+        "PATH",
+        "a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
+    ),
+    "body": ("FILE", "body file (SMPL, ...) that posed vertices belong to"),
+    "person": (
+        "PATH",
+        "a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found, by the "
+        "avatar's silhouette if there is one",
+    ),
+}
+"""Options of ``dyngs data fit``, which are fields of ``FitInputs``."""
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``data`` and its own commands to the commands."""
-    parser = commands.add_parser(
-        "data", help="inspect a capture, estimate poses, convert a motion, write a synthetic capture"
-    )
-    verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+def add_parser(commands: args.Commands) -> None:
+    about = "inspect a capture, estimate poses, fit a body, convert a motion, write a synthetic capture"
+    verbs = commands.add_parser("data", help=about).add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_inspect(verbs)
     _add_sfm(verbs)
-    data_fit.add_parser(verbs)
+    _add_fit(verbs)
     _add_motion(verbs)
     _add_synth(verbs)
 
 
-def _add_inspect(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = verbs.add_parser(
+def _add_inspect(verbs: args.Commands) -> None:
+    parser = args.add_command(
+        verbs,
         "inspect",
-        help="report what a capture or a video holds and what is suspicious about it",
-        description="Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos "
-        "without poses: size, rate, length, sound, sharpness, motion, and what to run next.",
+        run_inspect,
+        "report what a capture or a video holds and what is suspicious about it",
+        "Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos without poses: "
+        "size, rate, length, sound, sharpness, motion, and what to run next.",
     )
-    parser.add_argument("path", type=input_path, metavar="PATH", help="capture folder, video file, or folder of videos")
-    parser.add_argument(
-        "overrides",
-        nargs="*",
-        default=[],
-        metavar="data.key=value",
-        help="keys of data, such as data.follow_links=true",
-    )
+    parser.add_argument("path", type=args.input_path, metavar="PATH", help="capture folder, video, or folder of videos")
+    args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
     parser.add_argument("--format", default="auto", help="format of the capture (default: detected; docs/formats.md)")
-    parser.add_argument("--image", type=output_path, metavar="FILE", help="draw cameras and points to this image file")
+    parser.add_argument("--image", type=args.output_path, metavar="FILE", help="draw cameras and points to this image")
     parser.add_argument("--deep", action="store_true", help="decode every image in full (slow)")
-    parser.set_defaults(run=run_inspect)
 
 
-def _add_sfm(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = verbs.add_parser(
-        "sfm",
-        help="estimate camera poses of photos or a video",
-        description="Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`.",
-    )
-    parser.add_argument(
-        "images",
-        type=input_path,
-        metavar="IMAGES",
-        help="folder of photos, a video file, or folder of videos that ran at once",
-    )
-    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
+def _add_sfm(verbs: args.Commands) -> None:
+    about = "Estimate camera poses with COLMAP's structure from motion. OUT is a capture for `dyngs train`."
+    parser = args.add_command(verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about)
+    images = "folder of photos, a video file, or folder of videos that ran at once"
+    parser.add_argument("images", type=args.input_path, metavar="IMAGES", help=images)
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument("--mapper", choices=("auto", "global", "incremental"), default="auto", help="COLMAP's mapping")
-    parser.add_argument("--masks", type=input_path, metavar="DIR", help="masks of the photos, white = keep")
-    parser.add_argument(
-        "--frames", type=int, metavar="N", help="frames to take of a video (default 100; of each of several: up to 300)"
-    )
-    parser.add_argument(
-        "--start",
-        action="append",
-        default=[],
-        metavar="NAME=SECONDS",
-        help="when a video of several begins; once for each",
-    )
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    parser.add_argument(
-        "overrides", nargs="*", default=[], metavar="data.key=value", help="data.follow_links, data.max_megapixels"
-    )
-    parser.set_defaults(run=run_sfm)
+    parser.add_argument("--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep")
+    frames = "frames to take of a video (default 100; of each of several: up to 300)"
+    parser.add_argument("--frames", type=int, metavar="N", help=frames)
+    start = "when a video of several begins; once for each"
+    parser.add_argument("--start", action="append", default=[], metavar="NAME=SECONDS", help=start)
+    args.add_threads(parser)
+    args.add_overrides(parser, "data.key=value", "data.follow_links, data.max_megapixels")
 
 
-def _add_motion(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = verbs.add_parser(
+def _add_fit(verbs: args.Commands) -> None:
+    parser = args.add_command(
+        verbs,
+        "fit",
+        run_fit,
+        "fit the free body template to images of a person",
+        "Fit the free body template to the silhouettes of a person: one shape and skeleton, and the pose of every "
+        "frame. OUT is a capture for `dyngs train human`.",
+    )
+    about = "folder of a capture; or a video, or a folder of images, of one fixed camera"
+    parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help=about)
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
+    for name, (metavar, about) in _OF_A_FIT.items():
+        parser.add_argument(f"--{name}", type=args.input_path, metavar=metavar, help=about)
+    args.add_overrides(parser, "data.key=value", "keys of data")
+
+
+def _add_motion(verbs: args.Commands) -> None:
+    parser = args.add_command(
+        verbs,
         "motion",
-        help="convert an AMASS, BVH or glTF motion to the body template",
-        description="Read a motion, retarget it to the template if it has another skeleton, and write it as .npz in "
-        "the layout of AMASS SMPL-X, y up.",
+        run_motion,
+        "convert an AMASS, BVH or glTF motion to the body template",
+        "Read a motion, retarget it to the template if it has another skeleton, and write it as .npz in the layout of "
+        "AMASS SMPL-X, y up.",
     )
-    parser.add_argument("file", type=input_path, metavar="FILE", help="AMASS or SMPL-X .npz, .bvh, .glb, .gltf, .vrma")
-    parser.add_argument("out", type=output_path, metavar="OUT.npz", help="a new file")
+    parser.add_argument(
+        "file", type=args.input_path, metavar="FILE", help="AMASS, SMPL-X .npz, .bvh, .glb, .gltf, .vrma"
+    )
+    parser.add_argument("out", type=args.output_path, metavar="OUT.npz", help="a new file")
     parser.add_argument("--fps", type=float, metavar="F", help="resample to F frames per second (default: as in FILE)")
     parser.add_argument("--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)")
     parser.add_argument("--clip", metavar="NAME", help="name of the animation if a glTF file has several")
-    parser.add_argument(
-        "--body", type=input_path, metavar="BODY", help="body template file (default: the template of dyngs)"
-    )
-    parser.set_defaults(run=run_motion)
+    parser.add_argument("--body", type=args.input_path, metavar="BODY", help="body template (default: that of dyngs)")
 
 
-def _add_synth(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = verbs.add_parser(
+def _add_synth(verbs: args.Commands) -> None:
+    parser = args.add_command(
+        verbs,
         "synth",
-        help="write a small synthetic scene as a capture",
-        description="Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it "
-        "moves. still: a still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that "
-        "appear, merge and vanish. room: videos of a static room with one hopping ball, from fixed cameras. human: a "
-        "walking person from all around, with exact body parameters.",
+        run_synth,
+        "write a small synthetic scene as a capture",
+        "Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it moves. still: a "
+        "still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that appear, merge "
+        "and vanish. room: videos of a static room with one hopping ball, from fixed cameras. human: a walking person "
+        "from all around, with exact body parameters.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
-    parser.add_argument("out", type=output_path, metavar="OUT", help="a new folder")
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
-    parser.add_argument(
-        "--views", type=int, metavar="N", help="training views; for room and human: times (default 48, for human 12)"
-    )
+    views = "training views; for room and human: times (default 48, for human 12)"
+    parser.add_argument("--views", type=int, metavar="N", help=views)
     parser.add_argument("--cameras", type=int, metavar="N", help="training cameras for room and human (default 8)")
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="random seed of cameras, for human of the clothes (default 0)"
-    )
-    parser.add_argument(
-        "--varied", action="store_true", help="for human: the seed is also that of body shape, light and clip"
-    )
-    parser.add_argument(
-        "--usual-clothes",
-        action="store_true",
-        help="for human: left mostly as right, back as front, bare hands, instead of clothes that differ everywhere",
-    )
-    parser.set_defaults(run=run_synth)
+    seed = "random seed of cameras, for human of the clothes (default 0)"
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help=seed)
+    varied = "for human: the seed is also that of body shape, light and clip"
+    parser.add_argument("--varied", action="store_true", help=varied)
+    usual = "for human: left mostly as right, back as front, bare hands, instead of clothes that differ everywhere"
+    parser.add_argument("--usual-clothes", action="store_true", help=usual)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
-    """Print a report on a capture, and draw it if asked to."""
+    """Print a report on a capture, or on videos without poses."""
     from dyngs.capture.inspection.report import format_report, inspect_capture
     from dyngs.capture.unposed import is_videos
 
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
-    options = data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
+    options = args.data_section(arguments.overrides, arguments.format).model_copy(update={"root": arguments.path})
     report = inspect_capture(options, arguments.deep)
     if report.capture is None:
         for problem in report.problems[1:]:
@@ -156,13 +164,12 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _inspect_videos(arguments: argparse.Namespace) -> int:
-    """Print a report on a video, or a folder of videos, without poses."""
     from dyngs.capture.inspection.video_report import video_report
     from dyngs.files.containment import images_up_to
 
     if arguments.image is not None:
         raise DyngsError(f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first")
-    with images_up_to(data_section(arguments.overrides).max_megapixels):
+    with images_up_to(args.data_section(arguments.overrides).max_megapixels):
         print(video_report(arguments.path))
     return 0
 
@@ -174,7 +181,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     from dyngs.capture.sfm_work import SfmOptions
     from dyngs.capture.unposed import is_several_videos
 
-    limits, images, out = data_section(arguments.overrides), arguments.images, arguments.out
+    limits, images, out = args.data_section(arguments.overrides), arguments.images, arguments.out
     several = is_several_videos(images)
     if several:
         _require_options_of_videos(arguments)
@@ -195,23 +202,16 @@ def run_sfm(arguments: argparse.Namespace) -> int:
             said = poses_of_videos(images, out, options, report)
         else:
             said = estimate_poses(images, out, options, report).summary()
-    print(said)
-    print(f"next: dyngs data inspect {out} --image cameras.png")
-    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={out}")
+    print(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
+    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
     return 0
 
 
 def _require_options_of_videos(arguments: argparse.Namespace) -> None:
     """Refuse options that several videos do not have."""
-    for option, given in (
-        ("--matching", arguments.matching != "auto"),
-        ("--mapper", arguments.mapper != "auto"),
-        ("--masks", arguments.masks is not None),
-    ):
-        if given:
-            raise DyngsError(
-                f"{arguments.images}: {option} is for one video or photos; leave it out for several videos"
-            )
+    usual = {"matching": "auto", "mapper": "auto", "masks": None}
+    for option in (name for name, value in usual.items() if getattr(arguments, name) != value):
+        raise DyngsError(f"{arguments.images}: --{option} is for one video or photos; leave it out for several videos")
     if arguments.frames is not None and arguments.frames < 2:
         raise DyngsError("--frames must be at least 2")
 
@@ -228,6 +228,34 @@ def _starts(words: list[str]) -> dict[str, float] | None:
         if not name:
             raise DyngsError(f"--start {word!r}: give the name of a video without its suffix and seconds, as cam01=0.5")
     return starts or None
+
+
+def run_fit(arguments: argparse.Namespace) -> int:
+    """Fit a body and print how good the fit is, and the next command."""
+    from dyngs.human.fit.fitted_capture import FitInputs, write_fitted_capture
+
+    options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
+    passed = {name: getattr(arguments, name) for name in _OF_A_FIT}
+    with ProgressBar() as report:
+        inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person))
+        result = write_fitted_capture(options, arguments.out, report, inputs)
+    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    return 0
+
+
+def _avatar_in(person: Path | None) -> KnownAvatar | None:
+    """Return the avatar of a run, None of anything else."""
+    from dyngs.config.io import RESOLVED_NAME
+
+    if person is None or not (person / RESOLVED_NAME).is_file():
+        return None
+    from dyngs.human.avatar.scene import avatar_of
+    from dyngs.human.fit.known_person import KnownAvatar
+    from dyngs.runs.checkpoint import load_run
+
+    run = load_run(person)
+    scene = avatar_of(run.scene)
+    return None if scene is None else KnownAvatar(scene, run.config.data.longest_side)
 
 
 def run_motion(arguments: argparse.Namespace) -> int:
@@ -263,16 +291,15 @@ def run_synth(arguments: argparse.Namespace) -> int:
     from dyngs.data.synthetic import captures as synthetic
     from dyngs.files.outputs import require_new_folder
 
-    out: Path = arguments.out
-    scene, size, seed = arguments.scene, arguments.size, arguments.seed
+    out, scene, size, seed = arguments.out, arguments.scene, arguments.size, arguments.seed
     views = (12 if scene == "human" else 48) if arguments.views is None else arguments.views
+    cameras = 8 if arguments.cameras is None else arguments.cameras
     if size < 1 or views < 1 or seed < 0:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
-    if arguments.cameras is not None and (scene not in ("room", "human") or arguments.cameras < 1):
+    if arguments.cameras is not None and (scene not in ("room", "human") or cameras < 1):
         raise DyngsError("--cameras must be at least 1, and is for the scenes room and human only")
     if (arguments.varied or arguments.usual_clothes) and scene != "human":
         raise DyngsError("--varied and --usual-clothes are for the scene human only")
-    cameras = 8 if arguments.cameras is None else arguments.cameras
     require_new_folder(out)
     if scene == "human":
         from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
@@ -285,5 +312,5 @@ def run_synth(arguments: argparse.Namespace) -> int:
         moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed)
         synthetic.write_dynamic_capture(scene, out, moving)
     preset = {"still": "static", "human": "human"}.get(scene, "dynamic")
-    print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={out}")
+    print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")
     return 0

@@ -5,36 +5,29 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyngs.cli.arguments import output_path, threads
-from dyngs.errors import DyngsError, as_word
+from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
+from dyngs.errors import as_word
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``demo`` to the commands."""
-    parser = commands.add_parser(
-        "demo",
-        help="train, evaluate and render a built-in moving scene",
-        description="Ray trace a small moving scene, train on it, evaluate, render images and a video, write a .ply.",
-    )
-    parser.add_argument(
-        "--out", type=output_path, default=Path("dyngs-demo"), metavar="DIR", help="output folder (default dyngs-demo)"
-    )
-    parser.add_argument("--steps", type=int, default=3000, metavar="N", help="training steps (default 3000)")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    parser.set_defaults(run=run)
+def add_parser(commands: Commands) -> None:
+    about = "Ray trace a small moving scene, train on it, evaluate, render images and a video, write a .ply."
+    parser = add_command(commands, "demo", run, "train, evaluate and render a built-in moving scene", about)
+    out, default = "output folder (default dyngs-demo)", Path("dyngs-demo")
+    parser.add_argument("--out", type=output_path, default=default, metavar="DIR", help=out)
+    kind = whole("a number of steps", 1, 10**9)
+    parser.add_argument("--steps", type=kind, default=3000, metavar="N", help="training steps (default 3000)")
+    add_threads(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo and print the results and the paths of the files."""
-    if arguments.steps < 1 or arguments.threads < 0:
-        raise DyngsError("--steps must be at least 1, --threads at least 0")
     from rich.console import Console
 
     from dyngs.demo import DemoOptions, result_table, run_demo
 
     result = run_demo(arguments.out, DemoOptions(steps=arguments.steps, threads=arguments.threads))
     Console().print(result_table(result))
-    print(f"truth, render, error  {result.sheet}")
+    print(f"truth, render, error  {result.images / 'sheet.png'}")
     print(f"test views            {result.images}")
     print(f"orbit video           {result.video}")
     print(f"for other viewers     {result.ply}")

@@ -9,26 +9,21 @@ import sys
 from difflib import get_close_matches
 from pathlib import Path
 
+from dyngs.cli.arguments import Commands, add_command
 from dyngs.errors import DyngsError
 
 _LINK = re.compile(r"\[([^]]+)\]\(([^)#\s:]+)(?:#[^)\s]*)?\)")
 _FRONT = "README"
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``docs`` to the commands."""
-    parser = commands.add_parser(
-        "docs",
-        help="the documentation",
-        description="Show a page of the documentation (without a terminal: as Markdown), or the list of all pages.",
-    )
+def add_parser(commands: Commands) -> None:
+    about = "Show a page of the documentation (without a terminal: as Markdown), or the list of all pages."
+    parser = add_command(commands, "docs", run, "the documentation", about)
     parser.add_argument("topic", nargs="?", metavar="TOPIC", help="name of a page, for instance cli or photos")
     parser.add_argument("--path", action="store_true", help="print only where the page, or the folder, lies")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show a page, or print where it is."""
     folder = docs_folder()
     if arguments.path:
         print(folder if arguments.topic is None else page(folder, arguments.topic))
@@ -55,8 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 def docs_folder() -> Path:
     """Return the folder of the pages: in an installation that of the package, in a checkout that of the repository.
 
-    Raises:
-        DyngsError: it is not there.
+    Raises DyngsError: it is not there.
     """
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "docs", package.parent / "docs"):
@@ -66,11 +60,7 @@ def docs_folder() -> Path:
 
 
 def page(folder: Path, topic: str) -> Path:
-    """Return the page of a topic.
-
-    Raises:
-        DyngsError: there is none; names those that are similar.
-    """
+    """Return the page of a topic. Raises DyngsError: there is none; names those that are similar."""
     pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
     name = topic.removesuffix(".md")
     if name in pages:

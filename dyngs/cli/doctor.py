@@ -11,23 +11,12 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
+from dyngs.cli.arguments import Commands, add_command
 from dyngs.errors import DyngsError
 
-_REQUIRED = {
-    "torch": "torch",
-    "numpy": "numpy",
-    "pydantic": "pydantic",
-    "pyyaml": "yaml",
-    "safetensors": "safetensors",
-    "rich": "rich",
-    "pycolmap": "pycolmap",
-    "trimesh": "trimesh",
-    "kornia": "kornia",
-    "OpenImageIO": "OpenImageIO",
-    "scikit-image": "skimage",
-    "scipy": "scipy",
-    "av": "av",
-}
+_SAME = ("torch", "numpy", "pydantic", "safetensors", "rich", "pycolmap", "trimesh", "kornia", "OpenImageIO", "scipy")
+_REQUIRED = {name: name for name in (*_SAME, "av", "argcomplete")} | {"pyyaml": "yaml", "scikit-image": "skimage"}
+"""Packages, and the modules that they have."""
 _OPTIONAL = {
     "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install 'dyngs[metrics]'"),
     "lpips": ("lpips", "the LPIPS metric: pip install 'dyngs[metrics]'"),
@@ -45,14 +34,11 @@ class Finding:
     verdict: Literal["ok", "absent", "broken"] = "ok"
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``doctor`` to the commands."""
-    parser = commands.add_parser("doctor", help="report versions, cores, instruction set and optional packages")
-    parser.set_defaults(run=run)
+def add_parser(commands: Commands) -> None:
+    add_command(commands, "doctor", run, "report versions, cores, instruction set and optional packages")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the report."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -70,7 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def examine() -> Iterator[Finding]:
-    """Yield the rows of the report."""
     yield Finding("dyngs", _version("dyngs") or "not installed (run from a source folder)")
     yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
     yield Finding("cores", f"{_usable_cores()} usable of {os.cpu_count()}")
@@ -96,8 +81,7 @@ def _examine_core() -> Iterator[Finding]:
     yield Finding("native core", value)
     runtimes = openmp_runtimes()
     if runtimes is not None:
-        names = ", ".join(path.name for path in runtimes)
-        yield Finding("OpenMP runtimes", f"{len(runtimes)}: {names}" if runtimes else "0")
+        yield Finding("OpenMP runtimes", f"{len(runtimes)}: {', '.join(path.name for path in runtimes)}")
 
 
 def _examine_gpu() -> Iterator[Finding]:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_data_root, add_device, computing_device, data_root, input_path, threads
+from dyngs.cli import arguments as args
 from dyngs.errors import counted
 
 if TYPE_CHECKING:
@@ -18,26 +18,20 @@ _OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
 """Of the tested images, and on them."""
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``eval`` to the commands."""
-    parser = commands.add_parser(
-        "eval",
-        help="evaluate a run on held-out views",
-        description="Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split).",
-    )
-    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
-    parser.add_argument("--split", choices=("test", "val", "train", "pose"), default="test", help="default test")
+def add_parser(commands: args.Commands) -> None:
+    about = "Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split)."
+    parser = args.add_command(commands, "eval", run, "evaluate a run on held-out views", about)
+    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`")
+    args.add_split(parser)
     parser.add_argument("--lpips-net", choices=("alex", "vgg"), default="alex", help="backbone of LPIPS (default alex)")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    add_device(parser)
-    add_data_root(parser)
-    parser.add_argument(
-        "--refine",
-        action="store_true",
-        help="also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; "
-        "always done after camera.refine",
+    args.add_threads(parser)
+    args.add_device(parser)
+    args.add_data_root(parser)
+    about = (
+        "also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; always "
+        "done after camera.refine"
     )
-    parser.set_defaults(run=run)
+    parser.add_argument("--refine", action="store_true", help=about)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,12 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
         lpips_net=arguments.lpips_net,
         threads=arguments.threads,
         refine_poses=arguments.refine,
-        device=computing_device(arguments.device).type,
-        data_root=data_root(arguments),
+        device=args.computing_device(arguments.device).type,
+        data_root=args.data_root(arguments),
     )
     Console().print(report_table(report))
-    for note in report.notes:
-        print(f"note: {note}")
+    args.print_notes(report.notes)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 
@@ -79,14 +72,9 @@ def report_table(report: EvalReport) -> Table:
     if report.psnr_own_poses is not None:
         table.add_row(f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB")
     table.add_row("SSIM", f"{report.ssim:.4f}")
-    for label, value in _rows_of_person(report):
-        table.add_row(label, value)
-    for label, value in _rows_of_regions(report):
+    for label, value in (*_rows_of_person(report), *_rows_of_regions(report)):
         table.add_row(label, escape(value))
-    for label, name, value in (
-        ("FLIP", "flip", report.flip),
-        (f"LPIPS ({report.lpips_net})", "lpips", report.lpips),
-    ):
+    for label, name, value in (("FLIP", "flip", report.flip), (f"LPIPS ({report.lpips_net})", "lpips", report.lpips)):
         reason = escape(report.reasons.get(name, "not measured"))
         table.add_row(label, reason if value is None else f"{value:.4f}")
     for label, value in _rows_over_time(report):
@@ -122,14 +110,12 @@ def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the PSNR of parts of images; of a still capture only what is known."""
+    """Return labels and values of the PSNR of parts of images; of a static capture only what is known."""
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
-    for label, name, value in (
-        ("on what moves", "psnr_moving", report.psnr_moving),
-        ("on what does not", "psnr_static", report.psnr_static),
-    ):
+    moving, static = report.psnr_moving, report.psnr_static
+    for label, name, value in (("on what moves", "psnr_moving", moving), ("on what does not", "psnr_static", static)):
         if value is not None:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
         elif report.psnr_per_time:
@@ -138,7 +124,6 @@ def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the metrics over time."""
     if not report.psnr_per_time:
         return []
     values = [at.psnr for at in report.psnr_per_time]
@@ -146,10 +131,8 @@ def _rows_over_time(report: EvalReport) -> list[tuple[str, str]]:
     low, mean, high = min(values), sum(values) / len(values), max(values)
     spread = f"min {low:.2f}, mean {mean:.2f}, max {high:.2f} dB; worst at time {worst.time:g}"
     rows = [(f"PSNR at {counted(len(values), 'time')}", spread)]
-    for label, name, value in (
-        ("flicker", "flicker", report.flicker),
-        ("flicker error", "flicker_error", report.flicker_error),
-    ):
+    flickers = (("flicker", "flicker", report.flicker), ("flicker error", "flicker_error", report.flicker_error))
+    for label, name, value in flickers:
         reason = report.reasons.get(name, "not measured")
         known = "0 (nothing moves)" if name == "flicker" and not report.num_moving else f"{value or 0:.3f} of 255"
         rows.append((label, reason if value is None else known))

@@ -1,30 +1,21 @@
-"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, an avatar, cameras, or a .dyngs file."""
+"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, a person, cameras, or a .dyngs file."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    add_data_root,
-    data_root,
-    input_path,
-    is_avatar_file,
-    output_path,
-    print_notes,
-    run_of_scene_file,
-    scene_time,
-)
-from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, known_suffix, print_redrawn
-from dyngs.errors import DyngsError, counted
+from dyngs.cli import arguments as args
+from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_redrawn
+from dyngs.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
-    from dyngs.export.redrawn import Redrawn
+    from dyngs.data.capture import Split, View
     from dyngs.export.splat_files import Part
-    from dyngs.gaussians.scene import Scene
     from dyngs.runs.opened import Opened
-    from dyngs.splats.formats import Written
 
 _OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avatar", ".dyngs": "dyngs"}
 _OTHER_SUFFIXES |= {".html": "html", ".json": "cameras"}
@@ -67,133 +58,217 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``export`` to the commands."""
-    parser = commands.add_parser(
+def add_parser(commands: args.Commands) -> None:
+    parser = args.add_command(
+        commands,
         "export",
-        help="write a run as .ply, .spz, .glb and the like, tracks, avatar, mesh, small .dyngs file, page or cameras",
-        description="Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, "
-        "as one small .dyngs file, as a page that plays by itself, a person as an avatar or a mesh, or the cameras.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "write a run as .ply, .spz, .glb and the like, tracks, avatar, mesh, small .dyngs file, page or cameras",
+        "Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, as one small "
+        ".dyngs file, as a page that plays by itself, a person as an avatar or a mesh, or the cameras.",
+        _EPILOG,
     )
-    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder, or an avatar file (.safetensors)")
-    parser.add_argument(
-        "--format",
-        choices=(*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras"),
-        help="file format (default: what the suffix of --out names, else ply)",
-    )
-    parser.add_argument(
-        "--out", type=output_path, metavar="PATH", help="file, or folder of a sequence (default: splats... in RUN)"
-    )
+    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder, or an avatar (.safetensors)")
+    formats = (*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras")
+    about = "file format (default: what the suffix of --out names, else ply)"
+    parser.add_argument("--format", choices=formats, help=about)
+    about = "file, or folder of a sequence (default: splats... in RUN)"
+    parser.add_argument("--out", type=args.output_path, metavar="PATH", help=about)
     when = parser.add_mutually_exclusive_group()
-    when.add_argument("--time", type=scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
+    when.add_argument("--time", type=args.scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
-    parser.add_argument(
-        "--motion",
-        type=input_path,
-        metavar="FILE",
-        help="motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma",
+    args.add_motion(parser)
+    about = (
+        "--format dyngs: largest root-mean-square change of the images, in grey levels of 255 (default: what lowers "
+        "the PSNR of training views by 0.025 dB)"
     )
-    parser.add_argument(
-        "--max-change",
-        type=float,
-        metavar="X",
-        help="--format dyngs: largest root-mean-square change of the images, in grey levels of 255 "
-        "(default: what lowers the PSNR of training views by 0.025 dB)",
-    )
-    parser.add_argument(
-        "--joints", action="store_true", help="a person at rest, with joints and skinning weights: .ply, .glb"
-    )
+    parser.add_argument("--max-change", type=float, metavar="X", help=about)
+    about = "a person at rest, with joints and skinning weights: .ply, .glb"
+    parser.add_argument("--joints", action="store_true", help=about)
     add_axes(parser)
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
     part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
-    add_data_root(parser)
-    parser.set_defaults(run=run)
-
-
-def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
-    """Raise for the first option that does not go with a format, with the reason."""
-    wanted = "--joints" if arguments.joints else f"--format {kind}"
-    for name, reason in _UNFIT.get("mesh" if arguments.joints else kind, {}).items():
-        given = getattr(arguments, name)
-        if given is not None and given is not False:  # a time may be 0
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with {wanted}{reason and f': {reason}'}")
+    args.add_data_root(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print where they are and how large."""
-    from dyngs.cli.export_cameras import export_cameras
-    from dyngs.cli.export_html import export_page
-    from dyngs.cli.export_rigged import export_rigged
     from dyngs.runs.opened import open_scene
 
-    arguments.run_dir = run_of_scene_file(arguments.run_dir)
+    arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
     _require_fitting(arguments, kind)
+    writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
     if kind == "mesh" or arguments.joints:
-        return export_rigged(arguments, kind)
-    if kind == "html":
-        return export_page(arguments)
-    if kind == "cameras":
-        return export_cameras(arguments)
-    is_file = is_avatar_file(arguments.run_dir)
+        return _export_rigged(arguments, kind)
+    is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
-    if kind == "avatar":
-        return _export_avatar(arguments)
-    if kind == "dyngs":
-        return _export_dyngs(arguments)
+    if kind in writers:
+        return writers[kind](arguments)
     if arguments.max_change is not None:
         raise DyngsError("--max-change goes with --format dyngs")
     if kind == "tracks" and arguments.static:
         raise DyngsError("--static goes with --format ply; Gaussians that never move have no tracks")
     times = _times(arguments)
-    opened = open_scene(arguments.run_dir, data_root=data_root(arguments))
+    opened = _moved(arguments, open_scene(arguments.run_dir, data_root=args.data_root(arguments)))
     if arguments.motion is not None:
-        opened = opened.in_motion(arguments.motion)
         times = opened.scene.times if times is None else times
     if opened.scene.is_static and times is not None:
-        print_notes(("nothing moves in this run: it is the same at all times",))
+        args.print_notes(("nothing moves in this run: it is the same at all times",))
     if kind == "tracks":
         files = _export_tracks(arguments, opened, times)
     elif kind == MOVING:
         files = _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
     else:
         files = _export_splats(arguments, opened, times, kind)
-    size = sum(path.stat().st_size for path in files) / 1e6
-    where = files[0] if len(files) == 1 else f"{len(files)} files, {files[0]} to {files[-1].name}"
-    print(f"written: {where} ({size:.1f} MB)")
+    args.print_written(*files)
     return 0
+
+
+def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
+    """Raise for the first option that does not go with a format, with the reason."""
+    format = "--joints" if arguments.joints else f"--format {kind}"
+    for name, reason in _UNFIT.get("mesh" if arguments.joints else kind, {}).items():
+        passed = getattr(arguments, name)
+        if passed is not None and passed is not False:  # a time may be 0
+            raise DyngsError(f"--{name.replace('_', '-')} does not go with {format}{reason and f': {reason}'}")
 
 
 def _kind(arguments: argparse.Namespace) -> str:
     """Return the name of the format: what --format says, else what the suffix of --out names, else ply.
 
-    Raises:
-        DyngsError: an unknown suffix, or one of another format than --format.
+    Raises DyngsError: an unknown suffix, or one of another format than --format.
     """
     from dyngs.splats.formats import all_suffixes, known_format
 
-    out, given = arguments.out, arguments.format
+    out, stated = arguments.out, arguments.format
     if out is None or out.is_dir():
-        return given or "ply"
+        return stated or "ply"
     found = known_format(out)
     named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
-    if given == "mesh" and named == "glb":
-        return given
-    if given is None and named is None:
-        is_sequence = arguments.times is not None or (arguments.motion is not None and arguments.time is None)
-        if is_sequence and not out.suffix:
+    if stated == "mesh" and named == "glb":
+        return stated
+    if stated is None and named is None:
+        if _is_sequence(arguments) and not out.suffix:
             return "ply"
         known = f"{all_suffixes()}, {', '.join(_OTHER_SUFFIXES)}"
         raise DyngsError(f"{out}: which format? Give --format, or a name that ends in one of {known}")
-    if given is not None and named is not None and given != named:
-        raise DyngsError(f"{out}: --format {given} does not write files of that suffix, which is that of {named}")
-    if given is not None and named is None and out.suffix and given in SPLAT_FORMATS:
-        raise DyngsError(f"{out}: viewers do not know this suffix as {given}; use one of {all_suffixes()}")
-    return given or named or "ply"
+    if stated is not None and named is not None and stated != named:
+        raise DyngsError(f"{out}: --format {stated} does not write files of that suffix, which is that of {named}")
+    if stated is not None and named is None and out.suffix and stated in SPLAT_FORMATS:
+        raise DyngsError(f"{out}: viewers do not know this suffix as {stated}; use one of {all_suffixes()}")
+    return stated or named or "ply"
+
+
+def _is_sequence(arguments: argparse.Namespace) -> bool:
+    return arguments.times is not None or (arguments.motion is not None and arguments.time is None)
+
+
+def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
+    return opened if arguments.motion is None else opened.in_motion(arguments.motion)
+
+
+def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
+    """Return the requested times, clamped to [0, 1], or None."""
+    from dyngs.camera_paths.path import parse_times
+    from dyngs.evaluate.temporal import clamped_times
+
+    if arguments.times is None and arguments.time is None:
+        return None
+    inside, warnings = clamped_times((arguments.time,) if arguments.times is None else parse_times(arguments.times))
+    args.print_notes((), warnings)
+    return inside
+
+
+def _part(arguments: argparse.Namespace) -> Part:
+    return "still" if arguments.static else "moving" if arguments.dynamic else "all"
+
+
+# ---------------------------------------------------------------------------------------------------- Gaussians
+
+
+def _export_splats(
+    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None, kind: str
+) -> list[Path]:
+    """Write a sequence if several times of a moving scene are requested, else one file; return the paths."""
+    from dyngs.export.redrawn import compare_run
+    from dyngs.export.splat_files import scene_part, write_run_sequence, write_run_splats, writing_of
+    from dyngs.splats.formats import format_named, known_format, read_splats
+
+    own, part = format_named(kind), _part(arguments)
+    suffix, scene = own.suffixes[0], scene_part(opened.scene, part)
+    if opened.scene.colour is not None:
+        args.print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
+    how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
+    stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
+    out: Path | None = arguments.out
+    is_sequence = _is_sequence(arguments)
+    is_file = out is not None and known_format(out) is not None
+    if is_sequence and is_file and not arguments.static:
+        raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
+    args.print_notes((line,))
+    if is_sequence and not arguments.static:
+        moments = times or ()
+        written = write_run_sequence(opened, out or arguments.run_dir / stem, moments, part, how, suffix)
+    else:
+        if out is not None and not is_file and (out.is_dir() or is_sequence):
+            out = out / f"{stem}{suffix}"
+        if times is None and not arguments.static and not opened.scene.is_static:
+            args.print_notes(
+                ("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",)
+            )
+        moments = (0.0 if times is None else times[0],)
+        path = out or arguments.run_dir / f"{stem}{suffix}"
+        written = [write_run_splats(opened, path, moments[0], part, how)]
+    found = [
+        compare_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
+        for i in _shown(len(written))
+    ]
+    print_redrawn(written[0].notes, found)
+    return [one.path for one in written]
+
+
+def _shown(count: int) -> list[int]:
+    """Return which of several files or times are drawn, to be compared with the scene."""
+    return sorted({0, count // 2, count - 1})
+
+
+def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]) -> list[Path]:
+    """Write all times as one file of moving Gaussians."""
+    from dyngs.export.redrawn import compare_run
+    from dyngs.export.splat_files import SUFFIX, UP, read_moment, scene_part, write_moving, writing_of
+
+    if arguments.sh_degree is not None:
+        raise DyngsError(f"--sh-degree does not go with --format {MOVING}, which holds no harmonics")
+    how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
+    args.print_notes((line,))
+    part, scene = _part(arguments), scene_part(opened.scene, _part(arguments))
+    out = arguments.out or arguments.run_dir
+    if not out.is_dir() and out.suffix.lower() != SUFFIX:
+        raise DyngsError(f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}")
+    written = write_moving(opened, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how)
+    found = [
+        compare_run(opened, scene, times[i], written.splats[i], read_moment(written.path, i))
+        for i in _shown(len(times))
+    ]
+    print_redrawn(written.notes, found)
+    return [written.path]
+
+
+def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None) -> list[Path]:
+    from dyngs.export.splat_files import tracks_of, write_tracks
+
+    part = "moving" if arguments.dynamic else "all"
+    tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)
+    count, moments, _ = tracks.positions.shape
+    moving = f"{int(tracks.moving.sum()):,} of them moving"
+    args.print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
+    return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]
+
+
+# ---------------------------------------------------------------------------------------------------- other files
 
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
@@ -209,120 +284,106 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
         raise DyngsError(
             f"{out}: --format dyngs writes a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
         )
-    written = write_scene_file(arguments.run_dir, out, max_change, data_root=data_root(arguments))
+    written = write_scene_file(arguments.run_dir, out, max_change, data_root=args.data_root(arguments))
     change = written.precision.change
     if change is None:
         warning = (
             "the capture cannot be read: quantisation steps are fixed, and the change of images is not measured; if it "
             "was moved, add data.root=FOLDER"
         )
-        print_notes((), (warning,))
+        args.print_notes((), (warning,))
     else:
         note = f"images change by {change:.2f} grey levels of 255 (root mean square over some training views)"
-        print_notes((note,))
+        args.print_notes((note,))
     ratio = written.num_bytes_exact / written.num_bytes
     print(f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)")
     return 0
 
 
 def _export_avatar(arguments: argparse.Namespace) -> int:
-    """Write the person of a run as an avatar file."""
     from dyngs.runs.avatar import write_avatar
     from dyngs.runs.checkpoint import load_run
 
-    path = write_avatar(load_run(arguments.run_dir), arguments.out or arguments.run_dir / "avatar.safetensors")
-    print(f"written: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    path = arguments.out or arguments.run_dir / "avatar.safetensors"
+    args.print_written(write_avatar(load_run(arguments.run_dir), path))
     return 0
 
 
-def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
-    """Return the times asked for, clamped to [0, 1], or None."""
-    from dyngs.camera_paths.path import parse_times
-    from dyngs.evaluate.temporal import clamped_times
+def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
+    """Write a person as a skinned mesh, or as Gaussians with joints."""
+    from dyngs.export.rigged.mesh_file import Played, write_mesh
+    from dyngs.export.rigged.splat_files import write_rigged_splats
+    from dyngs.runs.opened import FRAME_RATE, open_scene
 
-    if arguments.times is None and arguments.time is None:
-        return None
-    inside, warnings = clamped_times((arguments.time,) if arguments.times is None else parse_times(arguments.times))
-    print_notes((), warnings)
-    return inside
+    option, stem = ("--joints", "rigged") if arguments.joints else ("--format mesh", "mesh")
+    if arguments.joints and kind not in ("ply", "glb"):
+        raise DyngsError(f"--joints goes with --format ply and glb, not with {kind}")
+    suffix = ".ply" if kind == "ply" else ".glb"
+    source: Path = arguments.run_dir
+    if args.is_avatar_file(source) and arguments.out is None:
+        raise DyngsError(f"{source}: where to? Give --out FILE{suffix}")
+    out: Path = arguments.out or source / f"{stem}{suffix}"
+    if out.is_dir() or out.suffix.lower() != suffix:
+        name = out / f"{stem}{suffix}" if out.is_dir() else f"{out.stem}{suffix}"
+        raise DyngsError(f"{out}: {option} writes one file; give --out {name}")
+    if suffix == ".ply" and arguments.motion is not None:
+        raise DyngsError("--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb")
+    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
+    played = Played(arguments.motion.stem, opened.fps or FRAME_RATE) if arguments.motion is not None else None
+    written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
+    args.print_notes(written.notes)
+    args.print_written(written.path)
+    return 0
 
 
-def _export_splats(
-    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None, kind: str
-) -> list[Path]:
-    """Write a sequence if several times of a moving scene are asked for, else one file; return the paths."""
-    from dyngs.export.splat_files import scene_part, write_run_sequence, write_run_splats, writing_of
-    from dyngs.splats.formats import format_named
+def _export_page(arguments: argparse.Namespace) -> int:
+    """Write a page that plays in a browser by itself."""
+    from dyngs.export.html.page import write_page
+    from dyngs.runs.opened import open_scene
 
-    own = format_named(kind)
-    suffix = own.suffixes[0]
-    if opened.scene.colour is not None:
-        print_notes(("the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",))
-    part = _part(arguments)
-    scene = scene_part(opened.scene, part)
-    how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
-    stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
-    out: Path | None = arguments.out
-    is_sequence = arguments.times is not None or (arguments.motion is not None and arguments.time is None)
-    is_file = out is not None and known_suffix(out)
-    if is_sequence and is_file and not arguments.static:
-        raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
-    print_notes((line,))
-    if is_sequence and not arguments.static:
-        moments = times or ()
-        written = write_run_sequence(opened, out or arguments.run_dir / stem, moments, part, how, suffix)
+    source: Path = arguments.run_dir
+    if arguments.out is None and args.is_avatar_file(source):
+        raise DyngsError(f"{source}: where to? Give --out FILE.html")
+    out: Path = arguments.out or source / "scene.html"
+    if out.suffix.lower() not in (".html", ".htm") or out.is_dir():
+        raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
+    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
+    if arguments.from_up is not None:
+        opened = replace(opened, stated_up=arguments.from_up)
+    written = write_page(opened, out, time=0.0 if arguments.time is None else arguments.time)
+    args.print_notes(written.notes)
+    print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); it plays in any browser with WebGL 2, offline")
+    return 0
+
+
+def _export_cameras(arguments: argparse.Namespace) -> int:
+    """Write the cameras of a run as a transforms.json, refined where training refined them."""
+    from dyngs.data.capture import all_views
+    from dyngs.data.read import read_capture
+    from dyngs.export.cameras import NAME, write_cameras
+    from dyngs.runs.checkpoint import found_corrections, load_run
+
+    source: Path = arguments.run_dir
+    if args.is_avatar_file(source):
+        raise DyngsError(f"{source}: an avatar file has no cameras; give a run")
+    out: Path = arguments.out or source / "cameras"
+    path = out if out.suffix.lower() == ".json" else out / NAME
+    run = load_run(source, args.data_root(arguments))
+    capture = read_capture(run.config.data)
+    if path.resolve().parent == capture.root.resolve():
+        raise DyngsError(f"{path}: would stand in for the cameras of the capture; give another folder")
+    found = found_corrections(source, run, capture.splits["train"])
+    if found is None and run.config.camera.refine == "always":
+        raise DyngsError(f"{source}: refined cameras lie in checkpoints, and there is none; restore one or train again")
+    splits: dict[Split, Sequence[View]] = {name: views for name, views in capture.splits.items() if name != "pose"}
+    if found is None:
+        args.print_notes(("camera.refine was not used in this run: these are the cameras of the capture",))
     else:
-        if out is not None and not is_file and (out.is_dir() or is_sequence):
-            out = out / f"{stem}{suffix}"
-        if times is None and not arguments.static and not opened.scene.is_static:
-            print_notes(("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",))
-        moments = (0.0 if times is None else times[0],)
-        path = out or arguments.run_dir / f"{stem}{suffix}"
-        written = [write_run_splats(opened, path, moments[0], part, how)]
-    shown = sorted({0, len(written) // 2, len(written) - 1})
-    print_redrawn(written[0].notes, [_redrawn(opened, scene, moments[i], written[i]) for i in shown])
-    return [one.path for one in written]
-
-
-def _part(arguments: argparse.Namespace) -> Part:
-    return "still" if arguments.static else "moving" if arguments.dynamic else "all"
-
-
-def _redrawn(opened: Opened, scene: Scene, time: float, written: Written) -> Redrawn:
-    """Return how a file differs from the scene."""
-    from dyngs.export.redrawn import compare_run
-    from dyngs.splats.formats import read_splats
-
-    return compare_run(opened, scene, time, written.splat, read_splats(written.path))
-
-
-def _export_moving(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]) -> list[Path]:
-    """Write all times as one file of moving Gaussians."""
-    from dyngs.export.redrawn import compare_run
-    from dyngs.export.splat_files import SUFFIX, UP, read_moment, scene_part, write_moving, writing_of
-
-    if arguments.sh_degree is not None:
-        raise DyngsError(f"--sh-degree does not go with --format {MOVING}, which holds no harmonics")
-    how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
-    print_notes((line,))
-    part, scene = _part(arguments), scene_part(opened.scene, _part(arguments))
-    out = arguments.out or arguments.run_dir
-    if not out.is_dir() and out.suffix.lower() != SUFFIX:
-        raise DyngsError(f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}")
-    written = write_moving(opened, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how)
-    shown = sorted({0, len(times) // 2, len(times) - 1})
-    found = [compare_run(opened, scene, times[i], written.splats[i], read_moment(written.path, i)) for i in shown]
-    print_redrawn(written.notes, found)
-    return [written.path]
-
-
-def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None) -> list[Path]:
-    from dyngs.export.splat_files import tracks_of, write_tracks
-
-    part = "moving" if arguments.dynamic else "all"
-    tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)
-    count, moments, _ = tracks.positions.shape
-    print_notes(
-        (f"{counted(count, 'Gaussian')}, {int(tracks.moving.sum()):,} of them moving, at {counted(moments, 'time')}",)
-    )
-    return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]
+        splits = {name: [found.corrected_view(view) for view in views] for name, views in splits.items()}
+        args.print_notes(
+            ("training cameras as training found them; others have the capture's poses, and known lenses",)
+        )
+    written = write_cameras(path, capture, splits)
+    count, root = counted(len(all_views(capture.splits)), "camera"), as_word(path.parent)
+    print(f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them")
+    return 0

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from dyngs.cli.arguments import input_path, output_path
+from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import as_word, counted
 
@@ -19,35 +18,23 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``predict`` to the commands."""
-    parser = commands.add_parser(
+def add_parser(commands: Commands) -> None:
+    parser = add_command(
+        commands,
         "predict",
-        help="predict a person from a few images, without training",
-        description="Predict an avatar from one or a few training views of a capture with silhouettes. Without body "
-        "parameters a body is fitted first, as by `dyngs data fit`. Writes a run folder (model.kind=human) for all "
-        "other commands.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "predict a person from a few images, without training",
+        "Predict an avatar from one or a few training views of a capture with silhouettes. Without body parameters a "
+        "body is fitted first, as by `dyngs data fit`. Writes a run folder (model.kind=human) for all other commands.",
+        _EPILOG,
     )
     parser.add_argument("network", type=input_path, metavar="NET_RUN", help="run folder of model.kind=human_predictor")
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument("--out", type=output_path, required=True, metavar="RUN", help="new run folder")
-    parser.add_argument(
-        "--views",
-        type=parse_views,
-        default=3,
-        metavar="N|NAME,..",
-        help="number or names of the views to predict from (default 3)",
-    )
-    parser.add_argument(
-        "--steps",
-        type=int,
-        default=10,
-        metavar="N",
-        help="first train the network on these images for so many steps (default 10)",
-    )
-    parser.set_defaults(run=run)
+    views = "number or names of the views to predict from (default 3)"
+    parser.add_argument("--views", type=parse_views, default=3, metavar="N|NAME,..", help=views)
+    steps = "first train the network on these images for so many steps (default 10)"
+    parser.add_argument("--steps", type=int, default=10, metavar="N", help=steps)
 
 
 def parse_views(text: str) -> int | tuple[str, ...]:
@@ -61,16 +48,18 @@ def run(arguments: argparse.Namespace) -> int:
     """Predict, and print timings and the next commands."""
     from dyngs.api.predict import predict_person
 
-    out: Path = arguments.out
+    out = arguments.out
     with ProgressBar() as report:
         made = predict_person(
             arguments.network, arguments.capture, out, arguments.views, steps=arguments.steps, report=report
         )
     seconds = made.seconds_steps + made.seconds_maps + made.seconds_network
-    print(f"predicted: {counted(made.num_gaussians, 'Gaussian')} from {', '.join(made.views)}")
     trained = f"{made.seconds_steps:.2f} s steps, " if arguments.steps else ""
     parts = f"{trained}{made.seconds_maps:.2f} s images, {made.seconds_network:.2f} s network"
-    print(f"time:      {seconds:.2f} s ({parts})")
     word = as_word(out)
-    print(f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it")
+    print(
+        f"predicted: {counted(made.num_gaussians, 'Gaussian')} from {', '.join(made.views)}\n"
+        f"time:      {seconds:.2f} s ({parts})\n"
+        f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it"
+    )
     return 0

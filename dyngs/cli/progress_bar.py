@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from types import TracebackType
 from typing import IO, Any
 
 SECONDS_BETWEEN_LINES = 10.0
@@ -16,9 +15,6 @@ class ProgressBar:
     """Context manager that shows how far work has come, to be called as a ``ReportProgress``.
 
     On a terminal, one bar for each kind of work; elsewhere plain lines, none for work that is soon done.
-
-    Args:
-        stream: where to; None: standard error.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
@@ -30,7 +26,6 @@ class ProgressBar:
         self._since = self._last_line = time.monotonic()
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` parts of ``what`` are done."""
         if self._is_terminal:
             if self._bars is None:  # not before: work that needs no bar leaves no line
                 self._bars = _rich_bars(self._stream)
@@ -51,9 +46,7 @@ class ProgressBar:
         self._since = self._last_line = time.monotonic()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bars is not None:
             self._bars.stop()
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_run_device, computing_device, input_path, output_path, run_device, threads
+from dyngs.cli import arguments as args
 from dyngs.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
@@ -28,45 +28,32 @@ As a stage of training: dyngs train CONFIG ... prune.fraction=0.8. All options a
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``prune`` to the commands."""
-    parser = commands.add_parser(
+def add_parser(commands: args.Commands) -> None:
+    parser = args.add_command(
+        commands,
         "prune",
-        help="take from a run as much as a loss of 0.2 dB allows: a smaller, faster run and its file",
-        description="Remove Gaussians, faint blending, control nodes, pieces of splines, harmonics and precision as "
-        "far as views that fine-tuning does not see lose no more than --max-loss. Every trial is fine-tuned. Writes a "
-        "new run folder with its file and prints quality, speed and size before and after.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "take from a run as much as a loss of 0.2 dB allows: a smaller, faster run and its file",
+        "Remove Gaussians, faint blending, control nodes, pieces of splines, harmonics and precision as far as views "
+        "that fine-tuning does not see lose no more than --max-loss. Every trial is fine-tuned. Writes a new run "
+        "folder with its file and prints quality, speed and size before and after.",
+        _EPILOG,
     )
-    parser.add_argument("run_dir", type=input_path, metavar="RUN", help="run folder written by `dyngs train`")
-    parser.add_argument("--out", type=output_path, required=True, metavar="RUN2", help="folder of the new run")
-    parser.add_argument(
-        "--max-loss",
-        type=_decibels,
-        metavar="DB",
-        help=f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})",
-    )
-    parser.add_argument(
-        "--prune",
-        metavar="R",
-        help="no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else",
-    )
-    parser.add_argument(
-        "--score",
-        choices=("variation", "sensitivity", "contribution", "temporal"),
-        help="importance score of a Gaussian (default sensitivity)",
-    )
-    parser.add_argument(
-        "--masks", metavar="K", help="no search: number of key times of visibility masks (default: no masks)"
-    )
+    parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`")
+    parser.add_argument("--out", type=args.output_path, required=True, metavar="RUN2", help="folder of the new run")
+    about = f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})"
+    parser.add_argument("--max-loss", type=_decibels, metavar="DB", help=about)
+    about = "no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else"
+    parser.add_argument("--prune", metavar="R", help=about)
+    scores = ("variation", "sensitivity", "contribution", "temporal")
+    parser.add_argument("--score", choices=scores, help="importance score of a Gaussian (default sensitivity)")
+    about = "no search: number of key times of visibility masks (default: no masks)"
+    parser.add_argument("--masks", metavar="K", help=about)
     parser.add_argument("--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000")
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    add_run_device(parser)
-    parser.add_argument(
-        "overrides", nargs="*", default=[], metavar="key=value", help="other config keys of the run (docs/cli.md)"
-    )
-    parser.set_defaults(run=run, takes_root=True)
+    args.add_threads(parser)
+    args.add_run_device(parser)
+    args.add_overrides(parser, "key=value", "other config keys of the run (docs/cli.md)")
+    parser.set_defaults(takes_root=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -81,10 +68,10 @@ def run(arguments: argparse.Namespace) -> int:
     keys = {"prune": "fraction", "score": "score", "masks": "mask_times", "steps": "steps"}
     asked = {key: getattr(arguments, option) for option, key in keys.items()}
     overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
-    overrides += [f"run.threads={arguments.threads}", *run_device(arguments), *arguments.overrides]
+    overrides += [f"run.threads={arguments.threads}", *args.run_device(arguments), *arguments.overrides]
     folder, promise = _pruned(arguments, overrides)
     pruned = load_run(folder)
-    device = computing_device(pruned.config.run.device)
+    device = args.computing_device(pruned.config.run.device)
     before, after = compared(
         [arguments.run_dir, file_of(folder)], arguments.threads or num_cores(), device, pruned.config.data.root
     )
@@ -100,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, Promise | None]:
-    """Prune as asked for; return the new folder, and what is promised of it where the share was searched for."""
+    """Prune as requested; return the new folder, and what is promised of it where the fraction was searched for."""
     from dyngs.api.prune import prune_run, prune_within
 
     chosen = any(text.startswith(("prune.fraction=", "prune.mask_times=")) for text in overrides)

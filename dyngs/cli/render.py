@@ -7,21 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import (
-    add_data_root,
-    add_device,
-    computing_device,
-    data_root,
-    frame_count,
-    image_size,
-    input_path,
-    input_word,
-    output_path,
-    print_notes,
-    run_of_scene_file,
-    scene_time,
-    threads,
-)
+from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
@@ -36,7 +22,7 @@ examples:
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
   dyngs render runs/street --path along --video along.mp4                  as it was filmed, smoothed
   dyngs render runs/dance --path orbit --time 0.5 --video frozen.mp4       moving camera, frozen scene
-  dyngs render runs/dance --times 0:1:60 --view 3 --video standing.mp4     fixed camera, moving scene
+  dyngs render runs/dance --times 0:1:60 --view 3 --video fixed.mp4        fixed camera, moving scene
   dyngs render runs/ann --motion walk.npz --video walk.mp4                 a person (model.kind=human) walks
   dyngs render runs/ann --pose rest --path orbit --video rest.mp4          the person in the rest pose of the template
   dyngs render ann.safetensors --motion walk.npz --video walk.mp4          an avatar file
@@ -45,82 +31,50 @@ examples:
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``render`` to the commands."""
-    parser = commands.add_parser(
-        "render",
-        help="render images and videos of a run, an avatar or a file of Gaussians",
-        description="Render the views of a split beside their ground truth, a camera path, or a fixed camera over "
-        "time.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    source_help = "run folder, avatar file (.safetensors), or any 3DGS .ply"
-    parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help=source_help)
-    parser.add_argument("--out", type=output_path, metavar="DIR", help="folder for the images")
+def add_parser(commands: args.Commands) -> None:
+    about = "Render the views of a split beside their ground truth, a camera path, or a fixed camera over time."
+    short = "render images and videos of a run, an avatar or a file of Gaussians"
+    parser = args.add_command(commands, "render", run, short, about, _EPILOG)
+    source = "run folder, avatar file (.safetensors), or any 3DGS .ply"
+    parser.add_argument("source", type=args.input_path, metavar="RUN_OR_FILE", help=source)
+    parser.add_argument("--out", type=args.output_path, metavar="DIR", help="folder for the images")
     cameras = parser.add_mutually_exclusive_group()
-    cameras.add_argument(
-        "--split", choices=("test", "val", "train", "pose"), help="render the views of this split (default: test)"
-    )
-    cameras.add_argument(
-        "--path",
-        type=input_word,
-        metavar="PATH",
-        help="camera path: orbit (default for a file), spiral, along (as the capture was filmed), or a .json file",
-    )
+    args.add_split(cameras, "render the views of this split (default: test)", None)
+    path = "camera path: orbit (default for a file), spiral, along (as the capture was filmed), or a .json file"
+    cameras.add_argument("--path", type=args.input_word, metavar="PATH", help=path)
     when = parser.add_mutually_exclusive_group()
-    when.add_argument("--time", type=scene_time, metavar="T", help="render the scene at this time, from 0 to 1")
+    when.add_argument("--time", type=args.scene_time, metavar="T", help="render the scene at this time, from 0 to 1")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B, one per frame")
-    parser.add_argument(
-        "--view", metavar="NAME|N", help="without --path: render from the camera of this view (default: the first one)"
-    )
-    _add_person(parser)
-    parser.add_argument("--video", type=output_path, metavar="FILE.mp4", help="write a video as well")
-    parser.add_argument(
-        "--frames", type=frame_count, metavar="N", help="number of frames of orbit, spiral and along (default 120)"
-    )
-    parser.add_argument(
-        "--fps", type=float, metavar="F", help="frames per second of the video (default 30, or as in the .json)"
-    )
-    parser.add_argument(
-        "--depth", action="store_true", help="write depth as well: coloured .png, and .exr in world units"
-    )
-    parser.add_argument("--alpha", action="store_true", help="write opacity as well")
-    parser.add_argument(
-        "--size", type=image_size, metavar="WxH", help="image size for a path or fixed camera, in pixels"
-    )
-    parser.add_argument(
-        "--background",
-        choices=("white", "black"),
-        help="background for a path or fixed camera (default: that of training)",
-    )
-    parser.add_argument(
-        "--up",
-        choices=("x", "y", "z", "-x", "-y", "-z"),
-        help="up axis of the path (default: up for the cameras of a run; of a file what it says, or what is usual for "
-        "its format)",
-    )
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    add_device(parser)
-    add_data_root(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_person(parser: argparse.ArgumentParser) -> None:
-    """Add the options of people."""
+    view = "without --path: render from the camera of this view (default: the first one)"
+    parser.add_argument("--view", metavar="NAME|N", help=view)
     person = parser.add_mutually_exclusive_group()
-    person.add_argument(
-        "--motion",
-        type=input_path,
-        metavar="FILE",
-        help="motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma",
-    )
+    args.add_motion(person)
     person.add_argument("--pose", choices=("rest",), help="show a person in the rest pose of the template")
+    parser.add_argument("--video", type=args.output_path, metavar="FILE.mp4", help="write a video as well")
+    frames, kind = (
+        "number of frames of orbit, spiral and along (default 120)",
+        args.whole("a number of frames", 1, 10**9),
+    )
+    parser.add_argument("--frames", type=kind, metavar="N", help=frames)
+    fps = "frames per second of the video (default 30, or as in the .json)"
+    parser.add_argument("--fps", type=float, metavar="F", help=fps)
+    depth = "write depth as well: coloured .png, and .exr in world units"
+    parser.add_argument("--depth", action="store_true", help=depth)
+    parser.add_argument("--alpha", action="store_true", help="write opacity as well")
+    size = "image size for a path or fixed camera, in pixels"
+    parser.add_argument("--size", type=args.image_size, metavar="WxH", help=size)
+    background = "background for a path or fixed camera (default: that of training)"
+    parser.add_argument("--background", choices=("white", "black"), help=background)
+    args.add_up(parser, " of the path")
+    args.add_threads(parser)
+    args.add_device(parser)
+    args.add_data_root(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Render and print which files were written."""
-    written = _render(_checked(arguments))
+    _check(arguments)
+    written = _render(arguments)
     folders = sorted({str(path.parent) for path in written})
     print(f"written: {counted(len(written), 'file')} in {', '.join(folders)}")
     for path in written:
@@ -129,16 +83,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
-    """Return the arguments if they go together.
-
-    Raises:
-        DyngsError: nothing to render, nowhere to write, or an option that does not apply.
-    """
+def _check(arguments: argparse.Namespace) -> None:
+    """Raise DyngsError for nothing to render, nowhere to write, or an option that does not apply."""
     known = command_for(arguments.source)
     if known is not None and not (arguments.source / "config.yaml").is_file():
         raise DyngsError(f"{arguments.source}: nothing that can be drawn; {known}")
-    arguments.source = run_of_scene_file(arguments.source)
+    arguments.source = args.run_of_scene_file(arguments.source)
     is_file = arguments.source.is_file()
     if is_file and arguments.split:
         raise DyngsError(f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json")
@@ -146,44 +96,46 @@ def _checked(arguments: argparse.Namespace) -> argparse.Namespace:
         raise DyngsError("--view renders from a fixed camera, --path from a moving one; give one of them")
     if arguments.times is not None and arguments.frames is not None:
         raise DyngsError("--times and --frames both set the number of frames; give one of them")
-    is_job = is_file or arguments.path or _has_fixed_camera(arguments)
-    if arguments.out is None and (arguments.video is None or not is_job):
+    if arguments.out is None and (arguments.video is None or not _is_path(arguments)):
         raise DyngsError("where to? Give --out DIR (or --video FILE.mp4 with --path, --time, --times or --view)")
     if not arguments.source.exists():
         raise DyngsError(f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a file")
     if arguments.up and not (is_file or arguments.path):
         raise DyngsError("--up goes with --path orbit, spiral or along")
-    unfit = [f"--{name}" for name in ("size", "background") if getattr(arguments, name)]
-    if unfit and not is_job:
-        raise DyngsError(f"{unfit[0]} goes with --path; the views of a split keep their size and background")
-    return arguments
+    for name in ("size", "background"):
+        if getattr(arguments, name) and not _is_path(arguments):
+            raise DyngsError(f"--{name} goes with --path; the views of a split keep their size and background")
+
+
+def _is_path(arguments: argparse.Namespace) -> bool:
+    """Whether a camera path or a fixed camera is requested, instead of the views of a split."""
+    return arguments.source.is_file() or bool(arguments.path) or _has_fixed_camera(arguments)
 
 
 def _has_fixed_camera(arguments: argparse.Namespace) -> bool:
-    """Whether one fixed camera is asked for, at one or many times."""
-    given = (arguments.time, arguments.times, arguments.view, arguments.motion, arguments.pose)
-    return not arguments.path and any(x is not None for x in given)
+    """Whether one fixed camera is requested, at one or many times."""
+    passed = (arguments.time, arguments.times, arguments.view, arguments.motion, arguments.pose)
+    return not arguments.path and any(x is not None for x in passed)
 
 
 def _render(arguments: argparse.Namespace) -> list[Path]:
-    """Render and return the paths of the written files."""
     import torch
 
     from dyngs.export.chosen_path import choose_path
     from dyngs.export.images import OutputOptions, write_path_images, write_split_images
     from dyngs.runs.opened import open_run
 
-    device = computing_device(arguments.device)
+    device = args.computing_device(arguments.device)
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
-    if not (arguments.source.is_file() or arguments.path or _has_fixed_camera(arguments)):
+    if not _is_path(arguments):
         with ProgressBar() as report:
-            opened = open_run(arguments.source, data_root=data_root(arguments))
+            opened = open_run(arguments.source, data_root=args.data_root(arguments))
             return write_split_images(opened, arguments.split or "test", arguments.out, output, report, device)
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
-    print_notes((*opened.notes, *path.notes), path.warnings)
+    args.print_notes((*opened.notes, *path.notes), path.warnings)
     if not arguments.fps:
         output = replace(output, fps=path.fps)
     with ProgressBar() as report:
@@ -194,7 +146,7 @@ def _opened(arguments: argparse.Namespace) -> Opened:
     """Return what is rendered, in the motion and before the background that are requested."""
     from dyngs.runs.opened import open_scene
 
-    opened = open_scene(arguments.source, nonfinite="skip", data_root=data_root(arguments))
+    opened = open_scene(arguments.source, nonfinite="skip", data_root=args.data_root(arguments))
     if arguments.motion is not None:
         opened = opened.in_motion(arguments.motion)
     elif arguments.pose == "rest":
@@ -210,8 +162,7 @@ def _path_options(arguments: argparse.Namespace) -> PathOptions:
     from dyngs.camera_paths.path import parse_times
     from dyngs.export.chosen_path import PathOptions
 
-    times = None if arguments.time is None else (arguments.time,)
-    num_frames = arguments.frames
+    times, num_frames = None if arguments.time is None else (arguments.time,), arguments.frames
     if arguments.times is not None:
         times = parse_times(arguments.times)
         num_frames = len(times)

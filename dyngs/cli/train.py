@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import add_run_device, computing_device, input_path, run_device
+from dyngs.cli import arguments as args
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.cli.view import add_serving_arguments
 from dyngs.errors import DyngsError, as_word, counted
@@ -33,45 +33,22 @@ CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap,
 human, human_predictor.
 All keys are listed in docs/cli.md.
 """
-
-WITH_RESUME = (
-    "train.steps",
-    "data.root",
-    "run.threads",
-    "run.device",
-    "run.deterministic",
-    "train.save_every",
-    "train.eval_every",
-    "train.log_every",
-    "train.tensorboard",
-    "data.cache_mb",
-)
-"""Keys that may be given with ``--resume``: the first changes the run, the second says where its capture was moved to,
-the others change nothing that it ends with."""
+_LOGGING = tuple(f"train.{name}" for name in ("save_every", "eval_every", "log_every", "tensorboard"))
+_FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
+"""Keys that change nothing that a run ends with."""
+WITH_RESUME = ("train.steps", "data.root", *_FOR_THIS_CALL)
+"""Keys that may be given with ``--resume``."""
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``train`` to the commands."""
-    parser = commands.add_parser(
-        "train",
-        help="train a model from a capture",
-        description="Train a model from a capture. Writes a run folder (default runs/NAME).",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "overrides", nargs="*", default=[], metavar="CONFIG key=value", help="preset or YAML file, and overrides"
-    )
-    parser.add_argument(
-        "--resume",
-        type=input_path,
-        metavar="RUN",
-        help="continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one",
-    )
+def add_parser(commands: args.Commands) -> None:
+    about = "Train a model from a capture. Writes a run folder (default runs/NAME)."
+    parser = args.add_command(commands, "train", run, "train a model from a capture", about, _EPILOG)
+    args.add_overrides(parser, "CONFIG key=value", "preset or YAML file, and overrides")
+    resume = "continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one"
+    parser.add_argument("--resume", type=args.input_path, metavar="RUN", help=resume)
     parser.add_argument("--view", action="store_true", help="show the scene in a browser while it trains")
     add_serving_arguments(parser)
-    add_run_device(parser)
-    parser.set_defaults(run=run)
+    args.add_run_device(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -85,9 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
     """Train as the first of ``processes``, or alone."""
-    given = run_device(arguments)
-    config = parse_config([*arguments.overrides, *given], arguments.resume)
-    computing_device(config.run.device)  # where none is, before anything else is done
+    config = parse_config([*arguments.overrides, *args.run_device(arguments)], arguments.resume)
+    args.computing_device(config.run.device)  # where none is, before anything else is done
     if arguments.port is not None and not arguments.view:
         raise DyngsError("--port goes with --view")
     from dyngs.api.train import train
@@ -99,7 +75,12 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
         )
     for line in _about_motion(folder, config):
         print(line)
-    print(f"trained: {folder}\n{_next(folder, config)}")
+    word = as_word(folder)
+    print(f"trained: {folder}")
+    if config.model.is_network:
+        print(f"next:    dyngs predict {word} CAPTURE --out RUN")
+    else:
+        print(f"next:    dyngs eval {word}\n         dyngs render {word} --out {as_word(folder / 'images')}")
     return 0
 
 
@@ -112,16 +93,6 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.training import TrainingView
 
     return TrainingView(config, Serving(arguments.host, arguments.port), lambda line: print(line, flush=True))
-
-
-def _next(folder: Path, config: Config) -> str:
-    """Return the next commands for a run."""
-    if config.model.is_network:
-        return f"next:    dyngs predict {as_word(folder)} CAPTURE --out RUN"
-    return (
-        f"next:    dyngs eval {as_word(folder)}\n"
-        f"         dyngs render {as_word(folder)} --out {as_word(folder / 'images')}"
-    )
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
@@ -143,11 +114,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
 
 
 def parse_config(words: Sequence[str], resume: Path | None) -> Config:
-    """Return the configuration for the words after ``dyngs train``.
-
-    Raises:
-        DyngsError: nothing to train, an override that a resumed run does not take, or a wrong key or value.
-    """
+    """Return the configuration for the words after ``dyngs train``. Raises DyngsError."""
     from dyngs.config.io import load_config, load_resolved
 
     has_preset = bool(words) and "=" not in words[0]
@@ -163,7 +130,7 @@ def parse_config(words: Sequence[str], resume: Path | None) -> Config:
     if other:
         raise DyngsError(
             f"{other[0]!r}: a resumed run keeps its own config; train.steps=N goes on to N steps, data.root=FOLDER "
-            f"names a capture that was moved, and for this call alone may be given {', '.join(WITH_RESUME[2:])}"
+            f"names a capture that was moved, and for this call alone may be given {', '.join(_FOR_THIS_CALL)}"
         )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

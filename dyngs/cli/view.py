@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import threading
 
-from dyngs.cli.arguments import add_data_root, add_device, computing_device, data_root, input_path, threads
+from dyngs.cli import arguments as args
 from dyngs.errors import DyngsError
 
 _EPILOG = """\
@@ -21,52 +21,27 @@ Needs viser: pip install 'dyngs[view]'. All controls are in docs/viewer.md.
 """
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add ``view`` to the commands."""
-    parser = commands.add_parser(
-        "view",
-        help="look at a run or a file in a browser",
-        description="Serve a page that shows a scene from anywhere at any time, beside the truth of its capture.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("source", type=input_path, metavar="RUN_OR_FILE", help="run folder, file, or a folder of runs")
+def add_parser(commands: args.Commands) -> None:
+    about = "Serve a page that shows a scene from anywhere at any time, next to the truth of its capture."
+    parser = args.add_command(commands, "view", run, "look at a run or a file in a browser", about, _EPILOG)
+    parser.add_argument("source", type=args.input_path, metavar="RUN_OR_FILE", help="run, file, or a folder of runs")
     add_serving_arguments(parser)
-    parser.add_argument(
-        "--motion", type=input_path, metavar="PATH", help="motion file for a person, or a folder of them"
-    )
-    parser.add_argument(
-        "--capture",
-        type=input_path,
-        metavar="PATH",
-        help="for a network of people: whom to predict, or a folder of people",
-    )
-    parser.add_argument(
-        "--up",
-        choices=("x", "y", "z", "-x", "-y", "-z"),
-        help="up axis (default: up for the cameras of a run; of a file what it says, or what is usual for its format)",
-    )
-    parser.add_argument("--threads", type=threads, default=0, metavar="N", help="number of threads, 0 = all cores")
-    add_device(parser)
-    add_data_root(parser)
-    parser.set_defaults(run=run)
+    about = "motion file for a person, or a folder of them"
+    parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
+    about = "for a network of people: whom to predict, or a folder of people"
+    parser.add_argument("--capture", type=args.input_path, metavar="PATH", help=about)
+    args.add_up(parser)
+    args.add_threads(parser)
+    args.add_device(parser)
+    args.add_data_root(parser)
 
 
 def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of how the page is served."""
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on (default: this machine only); others get a link with a token",
-    )
-    parser.add_argument("--port", type=port, metavar="N", help="port (default: 8080, or the next that is free)")
-
-
-def port(text: str) -> int:
-    """Return the number of a port."""
-    if not (text.isascii() and text.isdigit() and len(text) < 6 and 1 <= int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port; write a whole number from 1 to 65535")
-    return int(text)
+    about = "address to listen on (default: this machine only); others get a link with a token"
+    parser.add_argument("--host", default="127.0.0.1", help=about)
+    kind = args.whole("a port", 1, 65535)
+    parser.add_argument("--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -83,13 +58,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
     motions = motion_files(arguments.motion)
-    device = computing_device(arguments.device)
-    source = open_source(arguments.source, arguments.up, arguments.capture, device, data_root(arguments))
+    device = args.computing_device(arguments.device)
+    source = open_source(arguments.source, arguments.up, arguments.capture, device, args.data_root(arguments))
     first = first_of(source)
     if motions and first.person is None:
         raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")
-    for note in first.notes:
-        print(f"note: {note}")
+    args.print_notes(first.notes)
     serving = Serving(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
         print(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it", flush=True)

@@ -41,9 +41,6 @@ MAX_WHOLE = 2**63 - 1
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
 
-# ---------------------------------------------------------------------------------------------------- loading
-
-
 def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
     """Return the configuration of a preset with overrides laid over it.
 
@@ -86,12 +83,9 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
     """Return the configuration of a finished or interrupted run.
 
     Args:
-        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one beside the file.
+        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one next to the file.
         overrides: as in ``load_config``.
         data_root: where the capture lies by now, if it was moved.
-
-    Raises:
-        DyngsError: if there is none, or it is broken.
     """
     file = path / RESOLVED_NAME if path.is_dir() else path
     if not file.is_file():
@@ -171,11 +165,7 @@ def _instead(path: Path) -> str:
 
 
 def packaged_preset(name: str) -> Path:
-    """Return the file of the preset ``name`` that comes with dyngs, for instance ``static``.
-
-    Raises:
-        DyngsError: there is none of that name.
-    """
+    """Return the file of the preset ``name`` that comes with dyngs. Raises DyngsError where there is none."""
     packaged = packaged_presets()
     if name not in packaged:
         raise DyngsError(f"no packaged preset {name!r}; there are {', '.join(sorted(packaged))}")
@@ -186,9 +176,6 @@ def packaged_presets() -> dict[str, Path]:
     package = Path(__file__).resolve().parents[1]
     folder = next((f for f in (package / "configs", package.parent / "configs") if f.is_dir()), None)
     return {f.stem: f for f in sorted(folder.glob("*.yaml"))} if folder else {}
-
-
-# ---------------------------------------------------------------------------------------------------- layers
 
 
 @dataclass
@@ -249,9 +236,6 @@ class _Layers:
         """Where the value at ``keys``, or else the first one below it, was written; "" if nowhere."""
         below = (origin for k, origin in self.origins.items() if k[: len(keys)] == keys)
         return self.origins.get(keys) or next(below, "")
-
-
-# ---------------------------------------------------------------------------------------------------- checking
 
 
 def _fill_in_kinds(section: type[BaseModel], node: dict[str, Any]) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import yaml
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
@@ -19,8 +18,6 @@ from dyngs.config.yaml_reader import read_file, read_override
 
 WIDTH = 118
 _NO_ROOT = "FOLDER"
-_END = "...\n"
-"""What YAML writes after a single value."""
 
 
 def listing(source: Path, overrides: list[str]) -> str:
@@ -41,32 +38,25 @@ def listing(source: Path, overrides: list[str]) -> str:
 
 def _text(config: Config, has_root: bool, source: str) -> str:
     head = f"# {source!r} with every key; train with it: dyngs train THIS_FILE.yaml data.root=FOLDER"
-    lines = [head.encode("unicode_escape").decode("ascii")]
-    for line in _section(config, config.model_dump(mode="json"), 0):
-        lines.append(line)
+    lines = [head.encode("unicode_escape").decode("ascii"), *_section(config, config.model_dump(mode="json"), 0)]
     text = "\n".join(lines) + "\n"
     return text if has_root else re.sub(r"\n  root: .*", f"\n  # root: {_NO_ROOT}", text, count=1)
 
 
 def _section(section: BaseModel, values: dict[str, Any], depth: int) -> Iterator[str]:
-    """Yield the lines of a section with its ``values``."""
     space = "  " * depth
     for name, info in type(section).model_fields.items():
-        value, inner = values[name], getattr(section, name)
-        if section_classes(info):
+        is_section, about = bool(section_classes(info)), info.description or ""
+        if is_section:
             yield "" if depth == 0 else f"{space}#"
-            if kinds_of(info):
-                about = f"{info.description}; kind is one of {', '.join(kinds_of(info))}"
-                yield from (f"{space}# {line}" for line in textwrap.wrap(about, WIDTH - 2 - len(space)))
-            yield f"{space}{name}:"
-            yield from _section(inner, value, depth + 1)
-            continue
-        about = f"{info.description}" if name == "kind" else f"{info.description} ({allowed_values(info)})"
+            about = f"{about}; kind is one of {', '.join(kinds_of(info))}" if kinds_of(info) else ""
+        elif name != "kind":
+            about += f" ({allowed_values(info)})"
         yield from (f"{space}# {line}" for line in textwrap.wrap(about, WIDTH - 2 - len(space)))
-        dumped = yaml.safe_dump(value, default_flow_style=True, width=10**6, allow_unicode=False)
-        yield f"{space}{name}: {dumped.removesuffix(_END).strip()}  # {_default(info)}"
-
-
-def _default(info: FieldInfo) -> str:
-    text = default_text(info)
-    return f"default {text}" if text else "required"
+        if is_section:
+            yield f"{space}{name}:"
+            yield from _section(getattr(section, name), values[name], depth + 1)
+            continue
+        dumped = yaml.safe_dump(values[name], default_flow_style=True, width=10**6, allow_unicode=False)
+        shown, default = dumped.removesuffix("...\n").strip(), default_text(info)
+        yield f"{space}{name}: {shown}  # {f'default {default}' if default else 'required'}"

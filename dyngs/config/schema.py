@@ -131,9 +131,6 @@ def default_text(info: FieldInfo) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-# ---------------------------------------------------------------------------------------------------- sections
-
-
 def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
     """Return the section classes that a field may hold: several for a section with a ``kind``, none for a value."""
     options = get_args(info.annotation) or (info.annotation,)

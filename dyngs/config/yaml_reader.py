@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,11 +43,7 @@ class Leaf:
 
 
 def read_file(path: Path) -> list[Leaf]:
-    """Read the values of a file in its order; an empty section is a leaf of value None.
-
-    Raises:
-        DyngsError: names the file, the line and what is wrong there.
-    """
+    """Read the values of a file in its order; an empty section is a leaf of value None."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -59,7 +56,7 @@ def read_file(path: Path) -> list[Leaf]:
     except UnicodeDecodeError:
         raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
     origin = str(path)
-    with _Text(text, origin) as loader:
+    with _loaded(text, origin) as loader:
         root = loader.get_single_node()
         if root is None:
             return []
@@ -69,11 +66,7 @@ def read_file(path: Path) -> list[Leaf]:
 
 
 def read_override(text: str) -> list[Leaf]:
-    """Read the values that ``section.key=value`` sets: one, or several where a whole section is given.
-
-    Raises:
-        DyngsError: it is no override, or its value holds the same key twice and the like.
-    """
+    """Read the values that ``section.key=value`` sets: one, or several where it sets a full section."""
     key, equals, written = (part.strip() for part in text.partition("="))
     keys, origin = tuple(key.split(".")), printable(text, _SHOWN)
     if not equals or not all(re.fullmatch(r"\w+", k) for k in keys):
@@ -82,7 +75,7 @@ def read_override(text: str) -> list[Leaf]:
     if len(written) > MAX_BYTES:
         raise DyngsError(f"{origin}: has {len(written)} characters; no value is as long")
     try:
-        with _Text(written, origin) as loader:
+        with _loaded(written, origin) as loader:
             node = loader.get_single_node()
             if isinstance(node, yaml.MappingNode) and not node.flow_style:
                 return [Leaf(keys, written, written, origin)]  # "10:", which only looks like a mapping
@@ -136,42 +129,36 @@ class _PresetLoader(yaml.SafeLoader):
 _PresetLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, list("-+.0123456789"))
 
 
-class _Text:
-    """A block that reads ``text`` with a loader; whatever YAML raises there is one line."""
+@contextmanager
+def _loaded(text: str, origin: str) -> Iterator[_PresetLoader]:
+    """Yield a loader of ``text``; whatever YAML raises in the block is one line."""
+    loader: _PresetLoader | None = None
+    try:
+        loader = _PresetLoader(text)
+        yield loader
+    except DyngsError:
+        raise
+    except Exception as error:
+        raise _NotYaml(f"{origin}{_problem(error, text)}") from error
+    finally:
+        if loader is not None:
+            loader.dispose()
 
-    def __init__(self, text: str, origin: str) -> None:
-        self._text, self._origin = text, origin
-        self._loader: _PresetLoader | None = None
 
-    def __enter__(self) -> _PresetLoader:
-        try:
-            self._loader = _PresetLoader(self._text)
-        except yaml.YAMLError as error:
-            raise self._told(error) from None
-        return self._loader
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if self._loader is not None:
-            self._loader.dispose()
-        if isinstance(error, Exception) and not isinstance(error, DyngsError):
-            raise self._told(error) from error
-
-    def _told(self, error: Exception) -> _NotYaml:
-        if isinstance(error, RecursionError):
-            return _NotYaml(f"{self._origin}: nested too deeply for a configuration")
-        if isinstance(error, ReaderError):
-            line = self._text.count("\n", 0, error.position) + 1
-            return _NotYaml(
-                f"{self._origin}:{line}: not valid YAML: the control character {chr(error.character)!r}; remove it"
-            )
-        if isinstance(error, yaml.MarkedYAMLError):
-            mark = error.problem_mark or error.context_mark
-            problem = printable(error.problem or error.context or "not valid YAML", 2 * _SHOWN)
-            if "'\\t'" in problem:
-                problem = "a tab where YAML wants spaces; indent with spaces"
-            where = f":{mark.line + 1}" if mark is not None else ""
-            return _NotYaml(f"{self._origin}{where}: not valid YAML: {problem}")
-        return _NotYaml(f"{self._origin}: not valid YAML: {reason(error)}")
+def _problem(error: Exception, text: str) -> str:
+    """Return the line and what is wrong there, after the origin."""
+    if isinstance(error, RecursionError):
+        return ": nested too deeply for a configuration"
+    if isinstance(error, ReaderError):
+        line = text.count("\n", 0, error.position) + 1
+        return f":{line}: not valid YAML: the control character {chr(error.character)!r}; remove it"
+    if isinstance(error, yaml.MarkedYAMLError):
+        mark = error.problem_mark or error.context_mark
+        problem = printable(error.problem or error.context or "not valid YAML", 2 * _SHOWN)
+        if "'\\t'" in problem:
+            problem = "a tab where YAML wants spaces; indent with spaces"
+        return f"{f':{mark.line + 1}' if mark is not None else ''}: not valid YAML: {problem}"
+    return f": not valid YAML: {reason(error)}"
 
 
 def _walk(

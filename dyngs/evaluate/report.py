@@ -29,8 +29,7 @@ from dyngs.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
-from dyngs.runs.cameras import found_corrections
-from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, has_only_scene_file, load_run
+from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, found_corrections, has_only_scene_file, load_run
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_fit import fitted_to_image

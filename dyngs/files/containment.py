@@ -66,20 +66,14 @@ def images_up_to(megapixels: float) -> Iterator[None]:
 def inside(path: Path) -> Path:
     """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
     boundary = _boundary.get()
-    if boundary is not None:
-        _require_below(boundary, path)
-    require_regular(path)
-    return path
-
-
-def _require_below(boundary: _Boundary, path: Path) -> None:
-    place = boundary.resolved(path)
-    if not _is_below(place, boundary.real):
-        leads = "" if place == str(path) else f" leads to {place}, which"
+    if boundary is not None and not _is_below(real := boundary.resolved(path), boundary.real):
+        leads = "" if real == str(path) else f" leads to {real}, which"
         raise DyngsError(
             f"{path}:{leads} lies outside the capture {boundary.root}; copy the file into the capture, or, if you "
             "trust it to name files of yours, set data.follow_links=true"
         )
+    require_regular(path)
+    return path
 
 
 def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
@@ -113,5 +107,5 @@ def leaving_links(root: Path) -> list[tuple[Path, str]]:
     return found
 
 
-def _is_below(place: str, real_root: str) -> bool:
-    return place == real_root or place.startswith(real_root.rstrip(os.sep) + os.sep)
+def _is_below(real: str, root: str) -> bool:
+    return real == root or real.startswith(root.rstrip(os.sep) + os.sep)

@@ -18,11 +18,7 @@ LARGEST = 1e30
 
 
 def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
-    """Read the JSON object in ``path``; a byte order mark is allowed.
-
-    Args:
-        what: text of the error for a file that holds anything else than an object.
-    """
+    """Read the JSON object in ``path``; a byte order mark is allowed. ``what``: the error for anything else."""
     with reading(path, "it must be a JSON file; copy or export it again"):
         try:
             fields = json.loads(inside(path).read_text(encoding="utf-8-sig"))

@@ -157,11 +157,7 @@ class _Document(_Part):
 
 
 class GltfFile:
-    """The document of a file, and access to the numbers in its buffers.
-
-    Raises:
-        DyngsError: not glTF 2.0, or damaged.
-    """
+    """The document of a file, and access to the numbers in its buffers. Raises DyngsError: not glTF 2.0, or damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -183,8 +179,7 @@ class GltfFile:
     def numbers(self, index: int, kind: str, dtype: type[np.floating] = np.float64) -> np.ndarray:
         """Return the numbers (K, D) of an accessor, normalised integers in [-1, 1] or [0, 1]; NaN and infinities stay.
 
-        Raises:
-            DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
+        Raises DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
         """
         document = self.document
         if index >= len(document.accessors):
@@ -248,13 +243,13 @@ class GltfFile:
 
 
 def _chunks(path: Path) -> tuple[bytes, bytes]:
-    """Return the JSON chunk and the binary chunk of a ``.glb``; a ``.gltf`` is all JSON."""
+    """Return the JSON chunk and the binary chunk of a file."""
     require_regular(path)
     try:
         content = path.read_bytes()
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({error.strerror})") from error
-    if content[:4] != b"glTF":
+    if content[:4] != b"glTF":  # a .gltf
         return content.removeprefix(b"\xef\xbb\xbf"), b""
     found: dict[bytes, bytes] = {}
     start = 12
@@ -288,8 +283,7 @@ class GlbDocument:
         """Add an accessor of (K, D) or (K,) numbers; return its index.
 
         Args:
-            values: float32, uint8, uint16 or uint32, which stay as they are until the file is written; rows of several
-                numbers take a multiple of four bytes.
+            values: float32, uint8, uint16 or uint32; rows of several numbers take a multiple of four bytes.
             use: ``VERTICES`` or ``INDICES`` for those of a mesh.
             limits: whether the smallest and the largest number of each column are stated.
         """
@@ -323,7 +317,6 @@ class GlbDocument:
             out.write(struct.pack("<I4s", len(text), b"JSON") + text)
             out.write(struct.pack("<I4s", self._size, b"BIN\0"))
             for part in self._data:
-                content = (
-                    part if isinstance(part, bytes) else part.astype(part.dtype.newbyteorder("<"), copy=False).tobytes()
-                )
-                out.write(content + b"\0" * (-len(content) % 4))
+                if not isinstance(part, bytes):
+                    part = part.astype(part.dtype.newbyteorder("<"), copy=False).tobytes()
+                out.write(part + b"\0" * (-len(part) % 4))

@@ -18,7 +18,7 @@ SOURCES_NAME = "sources.json"
 _RUN_MARK = "config.yaml"
 """In a run folder, which is no part of the capture that it lies in."""
 _MAX_SOURCES_BYTES = 2**20
-Identity = tuple[int | str, int | str]
+_Identity = tuple[int | str, int | str]
 
 
 class Inputs:
@@ -36,10 +36,9 @@ class Inputs:
     def require_output(self, out: Path) -> None:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
-        Raises:
-            DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is read;
-                or it is a folder that holds a link to an input. A run folder in a capture, an empty folder, and a
-                folder around a capture may be written to.
+        Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in a folder that is
+        read; or it is a folder that holds a link to an input. A run folder in a capture, an empty folder, and a folder
+        around a capture may be written to.
         """
         if not os.path.lexists(out):
             return
@@ -65,14 +64,11 @@ class Inputs:
         return tuple(path for path in (*self.paths, *_sources(self.paths)) if path.is_dir())
 
     @cached_property
-    def _files(self) -> dict[Identity, Path]:
+    def _files(self) -> dict[_Identity, Path]:
         """All files that are read, also below folders and through links, by what tells them from others."""
         single = (path for path in (*self.paths, *_sources(self.paths), *self.elsewhere()) if not path.is_dir())
         paths = (*single, *(path for folder in self._folders for path in _files_below(folder, set())))
         return {identity: path for path in paths if (identity := _identity(path)) is not None}
-
-
-NOTHING_READ = Inputs(())
 
 
 def require_new_folder(out: Path) -> None:
@@ -82,21 +78,22 @@ def require_new_folder(out: Path) -> None:
 
 
 @contextmanager
-def new_capture(out: Path) -> Iterator[Path]:
+def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) -> Iterator[Path]:
     """Yield a hidden folder beside ``out`` that gets its name when the block ends well, and is removed otherwise.
 
-    Raises:
-        DyngsError: ``out`` holds something, or cannot be written.
+    Raises DyngsError: by ``require``, before and after; ``out`` cannot be written.
     """
-    require_new_folder(out)
+    require(out)
     started = temporary_folder_beside(out)
     try:
         yield started
-        if out.is_dir():
-            out.rmdir()
-        started.rename(out)
-    except OSError as error:
-        raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
+        try:
+            if out.is_dir():
+                out.rmdir()
+            started.rename(out)
+        except OSError as error:
+            require(out)
+            raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
     finally:
         remove_quietly(started)
 
@@ -110,11 +107,7 @@ def note_sources(capture: Path, *sources: Path) -> None:
 
 
 def _require_outside(out: Path, folder: Path) -> None:
-    """Check that an existing ``out`` is not ``folder`` and does not lie in it; it may hold it.
-
-    Raises:
-        DyngsError: see ``Inputs.require_output``.
-    """
+    """Check that an existing ``out`` is not ``folder`` and does not lie in it; it may hold it."""
     own, root = _identity(out), _identity(folder)
     if own == root:
         raise DyngsError(f"{out}: is the folder that is read; give another output")
@@ -145,7 +138,7 @@ def _read_sources(capture: Path) -> list[str]:
         return []
 
 
-def _files_below(folder: Path, seen: set[Identity]) -> Iterator[Path]:
+def _files_below(folder: Path, seen: set[_Identity]) -> Iterator[Path]:
     """Yield all files below a folder, also through links to folders, each folder once; those of runs are left out."""
     identity = _identity(folder)
     if identity is None or identity in seen:
@@ -169,7 +162,7 @@ def _ways(path: Path) -> tuple[Path, Path]:
     return (real if path.name in ("", "..") else Path(os.path.realpath(path.parent), path.name)), real
 
 
-def _identity(path: Path) -> Identity | None:
+def _identity(path: Path) -> _Identity | None:
     """Return what two names of one file have in common; None where there is no file."""
     try:
         status = os.stat(path)

@@ -33,8 +33,8 @@ _ARRAYS = {
     **{f"scipy.sparse.csc_{kind}": "columns" for kind in ("matrix", "array")},
     **{f"scipy.sparse.csr_{kind}": "rows" for kind in ("matrix", "array")},
 }
-CONTAINERS = ("builtins.set", "builtins.frozenset", "collections.OrderedDict")
-"""Names of containers with keys; calls of these are left to the unpickler, which checks keys."""
+ORDERED = "collections.OrderedDict"
+"""A container with keys; its calls are left to the unpickler, which checks them."""
 _OLD_NAMES = (
     (r"numpy\._core\.", "numpy.core."),
     (r"scipy\.sparse\..*\.(cs[cr]_)", r"scipy.sparse.\1"),
@@ -83,21 +83,13 @@ def shown(value: object) -> str:
 
 
 class Arrays:
-    """Interpretation of the names in one pickle.
-
-    Args:
-        path: the file, for messages.
-        size: bytes of it.
-        read: returns the next bytes of the file, as many as it is told.
-
-    Attributes:
-        sparse_entries: of the sparse matrices so far, zeros included.
-    """
+    """Interpretation of the names in one pickle, a file of ``size`` bytes; ``read`` returns the next bytes of it."""
 
     def __init__(self, path: Path, size: int, read: Callable[[int], bytes]) -> None:
         self._path, self._read = path, read
         self._bytes_left = _BYTES_PER_BYTE * size + (1 << 16)
         self.sparse_entries = 0
+        """Entries of the sparse matrices so far, zeros included."""
 
     def named(self, module: object, name: object) -> Name:
         """Return the name ``module.name``; raises ValueError for unknown ones."""
@@ -107,7 +99,7 @@ class Arrays:
         for old, new in _OLD_NAMES:
             key = re.sub(rf"\A{old}", new, key)
         found = Name(key)
-        if found.array is None and key not in (*_CALLS, *CONTAINERS, "numpy.dtype", "builtins.object"):
+        if found.array is None and key not in (*_CALLS, ORDERED, "numpy.dtype", "builtins.object"):
             raise ValueError(f"it holds {key!r:.80}, but only numbers, text and arrays are read")
         return found
 
@@ -248,11 +240,11 @@ def _set_order(dtype: Dtype, state: Any) -> None:
 
 def _count(shape: object) -> int:
     """Number of entries of an array of that shape."""
-    if not isinstance(shape, (tuple, list)) or len(shape) > _MOST_AXES:
+    fits = isinstance(shape, (tuple, list)) and len(shape) <= _MOST_AXES
+    axes: list[Any] = list(shape) if fits else [None]  # type: ignore[call-overload]
+    if not all(isinstance(n, (int, np.integer)) and 0 <= n < _LARGEST_AXIS for n in axes):
         raise ValueError("an array in it has no proper type and shape")
-    if not all(isinstance(n, (int, np.integer)) and 0 <= n < _LARGEST_AXIS for n in shape):
-        raise ValueError("an array in it has no proper type and shape")
-    return math.prod(int(n) for n in shape)
+    return math.prod(int(n) for n in axes)
 
 
 def _levels(items: list[object]) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 
 from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
-from dyngs.files.pickled_arrays import CONTAINERS, Array, Arrays, Name
+from dyngs.files.pickled_arrays import ORDERED, Array, Arrays, Name
 
 _MOST_CONTAINERS = 1 << 20
 _MOST_REMEMBERED = 1 << 20
@@ -103,8 +103,6 @@ class Unpickler:
         require_tree(self._path, found, 2 * self._size + self._arrays.sparse_entries)
         return found
 
-    # --- the file -----------------------------------------------------------------------------------------------------
-
     def read(self, count: int) -> bytes:
         """Read the next bytes; raises ValueError at the end of the file."""
         if not 0 <= count <= self._left:
@@ -128,10 +126,7 @@ class Unpickler:
         """Read a line that is a number or a name."""
         return self.line(_LONGEST_LINE).decode("utf-8")
 
-    # --- the stack ----------------------------------------------------------------------------------------------------
-
     def push(self, value: object) -> None:
-        """Push a value."""
         self._stack.append(value)
 
     def pop(self) -> Any:
@@ -140,12 +135,10 @@ class Unpickler:
         return self._stack.pop()
 
     def top(self) -> Any:
-        """Return the topmost value."""
         self._require(1)
         return self._stack[-1]
 
     def mark(self) -> None:
-        """Mark the height of the stack."""
         if len(self._marks) >= _MOST_MARKS:
             raise ValueError("it is nested too deeply")
         self._marks.append(len(self._stack))
@@ -168,8 +161,6 @@ class Unpickler:
         if len(self._stack) - (self._marks[-1] if self._marks else 0) < count:
             raise ValueError("it takes from an empty stack")
 
-    # --- the memo -----------------------------------------------------------------------------------------------------
-
     def remember(self, index: int) -> None:
         """Store the topmost value in the memo under a number."""
         require_at_most(self._path, len(self._memo) + 1, _MOST_REMEMBERED, "remembered values")
@@ -179,10 +170,7 @@ class Unpickler:
         """Push the memo's value of that number."""
         self.push(self._memo[str(index)])
 
-    # --- containers ---------------------------------------------------------------------------------------------------
-
     def push_container(self, value: Any) -> None:
-        """Push a new container."""
         self._containers += 1
         require_at_most(self._path, self._containers, _MOST_CONTAINERS, "containers")
         self.push(value)
@@ -201,13 +189,6 @@ class Unpickler:
             raise ValueError("it appends to what is no list")
         target += items
 
-    def add(self, items: list[Any]) -> None:
-        """Add to the set on top."""
-        target = self.top()
-        if type(target) is not set:
-            raise ValueError("it adds to what is no set")
-        target.update(self.checked_keys(items))
-
     def set_items(self, items: list[Any]) -> None:
         """Put keys and values in turn into the dictionary on top."""
         target = self.top()
@@ -225,44 +206,22 @@ class Unpickler:
         require_at_most(self._path, self._number_keys, _MOST_NUMBER_KEYS, "keys that are no text")
         return keys
 
-    # --- objects ------------------------------------------------------------------------------------------------------
-
     def call(self, name: object, arguments: object) -> None:
         """Push the object that a call stands for."""
-        if not isinstance(name, Name) or name.text not in CONTAINERS:
+        if not isinstance(name, Name) or name.text != ORDERED:
             self.push_container(self._arrays.called(name, arguments))
             return
         (items,) = arguments if arguments else ((),)  # type: ignore[misc]
         if not isinstance(items, (list, tuple)):
             raise ValueError("a container in it is made of what is no list")
-        if name.text == "collections.OrderedDict":
-            pairs = [(key, value) for key, value in items]
-            keys = self.checked_keys([key for key, _ in pairs])
-            self.push_container(dict(zip(keys, (value for _, value in pairs), strict=True)))
-        else:
-            keys = self.checked_keys(list(items))
-            self.push_container(set(keys) if name.text == "builtins.set" else frozenset(keys))
+        pairs = [(key, value) for key, value in items]
+        keys = self.checked_keys([key for key, _ in pairs])
+        self.push_container(dict(zip(keys, (value for _, value in pairs), strict=True)))
 
     def call_top(self) -> None:
         """REDUCE and NEWOBJ: the arguments are on top, the callee below."""
         arguments = self.pop()
         self.call(self.pop(), arguments)
-
-    def call_with_keywords(self) -> None:
-        """NEWOBJ_EX."""
-        if self.pop() != {}:
-            raise ValueError("it calls with keywords")
-        self.call_top()
-
-    def call_above_mark(self) -> None:
-        """OBJ: above the mark are the callee and its arguments."""
-        name, *arguments = self.above_mark()
-        self.call(name, tuple(arguments))
-
-    def call_line(self) -> None:
-        """INST: the callee is in two lines of text, its arguments are above the mark."""
-        name = self._arrays.named(self.word(), self.word())
-        self.call(name, tuple(self.above_mark()))
 
     def name(self) -> None:
         """GLOBAL."""
@@ -318,10 +277,9 @@ def require_tree(where: Path, found: object, more: int = 0) -> None:
 
 
 def _items(value: Any) -> list[Any] | None:
-    """Return the items of a container, None for other values."""
     if isinstance(value, dict):
         return [*value.keys(), *value.values()]
-    if isinstance(value, (list, tuple, set, frozenset)):
+    if isinstance(value, (list, tuple)):
         return list(value)
     return value.ravel(order="K").tolist() if isinstance(value, Array) and value.dtype.kind == "O" else None
 
@@ -386,13 +344,7 @@ def _set_pairs(unpickler: Unpickler) -> None:
     unpickler.set_items(items)
 
 
-def _frozen(unpickler: Unpickler) -> None:
-    """FROZENSET."""
-    unpickler.push_container(frozenset(unpickler.checked_keys(unpickler.above_mark())))
-
-
 def _set_item(unpickler: Unpickler) -> None:
-    """SETITEM."""
     value = unpickler.pop()
     unpickler.set_items([unpickler.pop(), value])
 
@@ -424,7 +376,6 @@ _STEPS: dict[bytes, Callable[[Unpickler], object]] = {
     b"]": lambda m: m.push_container([]),
     b"}": lambda m: m.push_container({}),
     b")": lambda m: m.push(()),
-    b"\x8f": lambda m: m.push_container(set()),
     b"(": Unpickler.mark,
     b"0": Unpickler.pop_or_unmark,
     b"1": Unpickler.above_mark,
@@ -439,8 +390,6 @@ _STEPS: dict[bytes, Callable[[Unpickler], object]] = {
     b"e": lambda m: m.extend(m.above_mark()),
     b"s": _set_item,
     b"u": lambda m: m.set_items(m.above_mark()),
-    b"\x90": lambda m: m.add(m.above_mark()),
-    b"\x91": _frozen,
     b"p": lambda m: m.remember(int(m.word())),
     b"q": lambda m: m.remember(m.number("<B")),
     b"r": lambda m: m.remember(m.number("<I")),
@@ -450,11 +399,8 @@ _STEPS: dict[bytes, Callable[[Unpickler], object]] = {
     b"j": lambda m: m.recall(m.number("<I")),
     b"c": Unpickler.name,
     b"\x93": Unpickler.name_of_top,
-    b"i": Unpickler.call_line,
-    b"o": Unpickler.call_above_mark,
     b"R": Unpickler.call_top,
     b"\x81": Unpickler.call_top,
-    b"\x92": Unpickler.call_with_keywords,
     b"b": Unpickler.build,
     b"\x80": Unpickler.check_protocol,
     b"\x95": lambda m: m.read(8),

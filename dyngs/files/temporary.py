@@ -8,6 +8,7 @@ import platform
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -42,12 +43,8 @@ def temporary_folder_beside(path: Path) -> Path:
 def remove_leftovers(folder: Path, only_ours: Callable[[str], bool] | None = None) -> None:
     """Remove the temporary files and folders directly in ``folder`` whose processes have ended; never through links.
 
-    Processes are known to have ended where they ran under the same operating system as this one.
-
-    Args:
-        folder: where to look.
-        only_ours: whether no other process is writing a file of this name at present; its temporary files are then
-            removed whatever process they are of.
+    Processes are known to have ended where they ran under the same operating system as this one. ``only_ours``: whether
+    no other process writes a file of this name at present; then they go whatever process they are of.
     """
     try:
         entries = list(os.scandir(folder))
@@ -57,9 +54,9 @@ def remove_leftovers(folder: Path, only_ours: Callable[[str], bool] | None = Non
         match = _NAME.fullmatch(entry.name)
         if match is None or entry.is_symlink():
             continue
-        wanted = match["stem"] + (match["suffix"] or "")
+        name = match["stem"] + (match["suffix"] or "")
         ended = match["home"] == _home() and not _is_alive(int(match["pid"]))
-        if ended or (only_ours is not None and only_ours(wanted)):
+        if ended or (only_ours is not None and only_ours(name)):
             remove_quietly(Path(entry.path))
 
 
@@ -70,10 +67,8 @@ def remove_quietly(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     elif path.is_file():
-        try:
+        with suppress(OSError):
             path.unlink()
-        except OSError:
-            return
 
 
 @lru_cache(maxsize=4096)

@@ -22,13 +22,7 @@ from dyngs.files.write import atomic_file
 
 @dataclass(frozen=True)
 class FileKind:
-    """Kind of a tensor file.
-
-    Attributes:
-        key: key of the metadata that holds the header.
-        what: name of the kind with its article, for messages.
-        version: version of the format; files of others are refused.
-    """
+    """Key of the metadata that holds the header, name with its article, and the one version that is read."""
 
     key: str
     what: str
@@ -38,14 +32,9 @@ class FileKind:
 def write_tensors(
     path: Path, kind: FileKind, tensors: Mapping[str, Tensor], header: Mapping[str, object], advice: str = ""
 ) -> None:
-    """Write the file, atomically; equal tensors and headers give equal bytes.
+    """Write contiguous tensors and values that JSON can hold, atomically; equal ones give equal bytes.
 
-    Args:
-        path: file to write.
-        kind: kind of the file.
-        tensors: contiguous tensors by name.
-        header: values that JSON can hold.
-        advice: end of the message for a full disk.
+    ``advice`` is the end of the message for a full disk.
     """
     full = {"format": kind.version, **header}
     full["digest"] = _digest(tensors, full)
@@ -63,11 +52,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path, kind: FileKind, advice: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Read header and tensors of a file.
-
-    Raises:
-        DyngsError: a file that is missing, truncated, altered, of another kind or version.
-    """
+    """Read header and tensors of a file. Raises DyngsError."""
     require_regular(path)
     try:
         with safe_open(path, framework="pt") as file:

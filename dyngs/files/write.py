@@ -19,10 +19,7 @@ def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; it replaces ``path`` if the block succeeds and is removed otherwise.
 
     The folder is created if missing; the temporary name keeps the suffix, by which writers choose the format.
-
-    Args:
-        path: file to write.
-        durable: also wait until it is on disk, so that a power cut leaves the old file or the new one, complete.
+    ``durable``: wait until it is on disk, so that a power cut leaves the old file or the new one, complete.
     """
     try:
         temporary = temporary_beside(path)
@@ -109,7 +106,7 @@ def image_error(source: _HasErrors) -> str:
 
 
 def any_text(ask: Callable[[], str]) -> str:
-    """Return the text of ``ask``, with escapes for bytes that are not UTF-8, where OpenImageIO's binding raises."""
+    """Return the text of ``ask``; bytes that are not UTF-8, at which OpenImageIO's binding raises, as escapes."""
     try:
         return ask()
     except UnicodeDecodeError as error:

@@ -12,14 +12,7 @@ PHOTO_SUFFIXES = frozenset(
 )
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 _MOST_ENTRIES = 2000
-_OF_CAPTURES = (
-    "transforms.json",
-    "transforms_train.json",
-    "cameras.json",
-    "poses_bounds.npy",
-    "sparse",
-    "dataset.json",
-)
+_CAPTURE = ("transforms.json", "transforms_train.json", "cameras.json", "poses_bounds.npy", "sparse", "dataset.json")
 
 
 def command_for(path: Path, *, captures: bool = True) -> str | None:
@@ -38,7 +31,7 @@ def command_for(path: Path, *, captures: bool = True) -> str | None:
             return None
         if (path / "config.yaml").is_file():
             return f"it is a run, for `dyngs eval {where}`, `dyngs render {where}` or `dyngs train --resume {where}`"
-        if captures and any((path / name).exists() for name in _OF_CAPTURES):
+        if captures and any((path / name).exists() for name in _CAPTURE):
             return f"it is a capture, make a scene of it with {static}, or {dynamic} if things move"
         suffixes = [_suffix(entry) for folder in (path, path / "images") for entry in _entries(folder)]
     except OSError:

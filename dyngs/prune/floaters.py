@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import StaticModel
+from dyngs.errors import counted
 from dyngs.gaussians.rendering import contributions
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.views import background_colour
@@ -56,7 +57,7 @@ class FloaterRemoval:
         before, count = len(trainer.model.scene), int(found.sum())
         if not count:
             return
-        fraction = f"{count:,} of {before:,} Gaussians hang close before single cameras"
+        fraction = f"{count:,} of {counted(before, 'Gaussian')} hang close before single cameras"
         if count > MOST * before:
             self._loop.tell(Message(f"{fraction}: too many to be floaters, none is removed"))
             return

@@ -22,7 +22,7 @@ import torch
 from dyngs.config import Config
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.scene import Scene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.checkpoint import Checkpoint
@@ -147,7 +147,7 @@ class Search:
         self._truths = list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         self.views = f"{len(self._truths)} training views held out" if self.held_out else "its only training view"
         if unseen:
-            self.views = f"{len(self._truths)} views never trained on"
+            self.views = f"{counted(len(self._truths), 'view')} never trained on"
         self._is_fair, self._reference, self._exact_trained = bool(unseen), 0.0, 0.0
 
     def run(self, max_loss: float) -> Found:
@@ -158,7 +158,7 @@ class Search:
         accepted, limits = [Candidate(Cut(), config, self.start, self.trainer.num_gaussians, exact, 0.0)], []
         self._reference = exact if self._is_fair else self._fine_tuned()
         how = "" if self._is_fair else ", fine-tuned on the others"
-        self.tell(f"as it is{how}: {len(self._scores):,} Gaussians, {self._reference:.2f} dB on {self.views}")
+        self.tell(f"as it is{how}: {counted(len(self._scores), 'Gaussian')}, {self._reference:.2f} dB on {self.views}")
         for kind, knob in self._knobs().items():
             levels = knob(accepted[-1].cut)
             if not levels:
@@ -221,8 +221,8 @@ class Search:
             tried = self._tried(cut)
             keeps = tried.worst <= allowed
             self.tell(
-                f"trial {self.trials}: without {cut}: {tried.num_gaussians:,} Gaussians, {-tried.loss:+.2f} dB, "
-                f"{-tried.trained_loss:+.2f} on views trained on, "
+                f"trial {self.trials}: without {cut}: {counted(tried.num_gaussians, 'Gaussian')}, "
+                f"{-tried.loss:+.2f} dB, {-tried.trained_loss:+.2f} on views trained on, "
                 f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
             )
             if keeps:

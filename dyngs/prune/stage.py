@@ -19,6 +19,7 @@ from dyngs.camera import Cameras
 from dyngs.config import PruneConfig
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
+from dyngs.errors import counted
 from dyngs.gaussians.scene import Scene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.kinds import GaussianTrainer
@@ -56,7 +57,8 @@ class Pruned:
     def __str__(self) -> str:
         masks = "" if self.active == 1 else f"; masks let {self.active:.0%} of them through"
         return (
-            f"pruned: {self.before:,} -> {self.after:,} Gaussians, {1 - self.after / max(self.before, 1):.1%} removed, "
+            f"pruned: {self.before:,} -> {counted(self.after, 'Gaussian')}, "
+            f"{1 - self.after / max(self.before, 1):.1%} removed, "
             f"{-self.loss:+.2f} dB before it is trained again{masks}"
         )
 

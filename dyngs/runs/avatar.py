@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel
 from dyngs.conventions import RasterizeMode
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, printable
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
@@ -36,8 +36,6 @@ SUFFIX = ".safetensors"
 
 _KIND = FileKind("dyngs avatar", "an avatar", 1)
 _ADVICE = "; export it again with `dyngs export RUN --format avatar`"
-_MOST_FACES = 2**31 - 1
-"""All that an int32 can number: the faces of a template without blend shapes are not in the file."""
 _LONGEST_NAME = 200
 """Characters of the name of a file, which must have its place in every file system."""
 _WEIGHT_SUM = 1e-3
@@ -46,12 +44,9 @@ _WEIGHT_SUM = 1e-3
 
 @dataclass(frozen=True)
 class TemplateRef:
-    """The body template of an avatar; it is needed only to retarget motions of other skeletons.
+    """File and SHA-256 of the body template of an avatar, and whether it is the free one that comes with dyngs.
 
-    Attributes:
-        file: name of the template's file, without folders.
-        sha256: of the file.
-        packaged: whether it is the free template that comes with dyngs.
+    It is needed only to retarget motions of other skeletons.
     """
 
     file: str
@@ -62,8 +57,7 @@ class TemplateRef:
 def write_avatar(run: LoadedRun, path: Path) -> Path:
     """Write the person of a run, upright and at rest at the place of the capture (docs/formats.md); return ``path``.
 
-    Raises:
-        DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
+    Raises DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
     """
     scene, model = avatar_of(run.scene), run.config.model
     if scene is None or not isinstance(model, HumanModel):
@@ -96,7 +90,9 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
         tensors |= {"shapes.directions": scene.shapes.directions.half(), "shapes.faces": scene.shapes.faces.int()}
     if scene.light is not None:
         tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
-    header = {**asdict(run.info), "near": model.near, "eps2d": model.eps2d, "template": asdict(_template_ref(model))}
+    file = template_path(model)
+    template = TemplateRef(file.name, _sha256(file), model.body is None)
+    header = {**asdict(run.info), "near": model.near, "eps2d": model.eps2d, "template": asdict(template)}
     write_tensors(path, _KIND, {name: x.detach().contiguous() for name, x in tensors.items()}, header)
     return path
 
@@ -122,15 +118,10 @@ def read_avatar(path: Path) -> LoadedRun:
             sh_degree={1: 0, 4: 1}[scene.gaussians.sh.shape[1]],
         )
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise DyngsError(f"{path}: not a valid avatar ({_reason(error)}){_ADVICE}") from None
+        why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else printable(str(error), 120)
+        raise DyngsError(f"{path}: not a valid avatar ({why}){_ADVICE}") from None
     scene = replace(scene, options=render_options(model), background=background_colour(info.background))
     return LoadedRun(Config(data=DataConfig(root=path), model=model), scene, info.step, 0.0, info)
-
-
-def _template_ref(model: HumanModel) -> TemplateRef:
-    """Return the reference to the template of ``model``."""
-    file = template_path(model)
-    return TemplateRef(file.name, _sha256(file), model.body is None)
 
 
 def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
@@ -145,7 +136,6 @@ def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
 
 
 def _sha256(file: Path) -> str:
-    """Return the SHA-256 of a template's file, in hexadecimal."""
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
@@ -155,7 +145,7 @@ def _sha256(file: Path) -> str:
 def _check(tensors: Mapping[str, Tensor]) -> None:
     """Raises KeyError for a missing tensor, ValueError for a wrong type, shape or range."""
     n, j, terms = len(tensors["gaussians.means"]), len(tensors["skeleton.joints"]), tensors["gaussians.sh"].shape[1]
-    k, count = tensors["anchors.joints"].shape[1], _MOST_FACES
+    k, count = tensors["anchors.joints"].shape[1], 2**31 - 1  # the faces of a template without shapes are not there
     gaussians = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "sh": (n, terms, 3)}
     shapes: dict[str, tuple[int, ...]] = {f"gaussians.{name}": shape for name, shape in gaussians.items()}
     anchors = {"points": (n, 3), "size": (n,), "barycentric": (n, 3), "uv": (n, 2), "height": (n,), "weights": (n, k)}
@@ -181,7 +171,6 @@ def _check(tensors: Mapping[str, Tensor]) -> None:
 
 
 def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
-    """Return the scene of checked tensors."""
 
     def part(prefix: str) -> dict[str, Any]:
         return {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
@@ -215,8 +204,3 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
         learned=new_corrections(reference, skeleton, anchors, tensors.get("normals")).restored(values),
         shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long()) if shapes else None,
     )
-
-
-def _reason(error: Exception) -> str:
-    """Return what is wrong, in at most 120 characters."""
-    return f"{error.args[0]} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())[:120]

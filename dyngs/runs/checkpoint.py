@@ -10,7 +10,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,16 @@ import torch
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.conventions import RasterizeMode
+from dyngs.data.capture import View
 from dyngs.errors import DyngsError, as_word, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
 from dyngs.gaussians.scene import Scene, require_gaussians
 from dyngs.kinds import restored_model
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.models.renderable import Renderable
 from dyngs.storage.file import read_scene
+from dyngs.training.corrections.camera_refinement import CameraCorrections, CameraRefinement
 
 KEEP_CHECKPOINTS = 2
 TIMING_NAME = "timing.json"
@@ -40,12 +42,7 @@ BACKGROUNDS = ("white", "black", "random")
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A trained model, ready to be drawn.
-
-    Attributes:
-        renderable: what is drawn at any time.
-        step, seconds_train: how far and how long it was trained (0 s where ``timing.json`` is lost).
-    """
+    """A trained model, ready to be drawn; ``seconds_train`` is 0 where ``timing.json`` is lost."""
 
     config: Config
     renderable: Renderable
@@ -55,11 +52,7 @@ class LoadedRun:
 
     @property
     def scene(self) -> Scene:
-        """Its scene of Gaussians.
-
-        Raises:
-            DyngsError: it is made of something else.
-        """
+        """Its scene of Gaussians. Raises DyngsError: it is made of something else."""
         return require_gaussians(self.renderable, f"a run of model.kind={self.config.model.kind}")
 
 
@@ -83,8 +76,7 @@ def step_of(path: Path) -> int:
 def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float) -> Path:
     """Write a checkpoint atomically, remove all but the newest ``KEEP_CHECKPOINTS``, and return its path.
 
-    Raises:
-        DyngsError: a model with values that are not finite (earlier checkpoints stay), a full disk, and the like.
+    Raises DyngsError: a model with values that are not finite (earlier checkpoints stay), a full disk, and the like.
     """
     tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
     for name, x in tensors.items():
@@ -100,23 +92,14 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Return the checkpoint in ``path``.
-
-    Raises:
-        DyngsError: a file that is missing, truncated, altered, or of another version; names an older one if there is.
-    """
+    """Return the checkpoint in ``path``. Raises DyngsError, which names an older one if there is."""
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
     with reading(path, _instead_of(path).removeprefix("; ")):
         return Checkpoint(info_of(header), tensors, path)
 
 
 def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
-    """Return the metadata in the header of a file.
-
-    Raises:
-        KeyError: something lacks.
-        ValueError, TypeError, OverflowError: a value is of another kind or out of range.
-    """
+    """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or OverflowError."""
     step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
     extent, background, mode = float(header["extent"]), header["background"], header["rasterize_mode"]
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= MAX_STEP:
@@ -142,10 +125,7 @@ def latest_checkpoint(run_dir: Path) -> Checkpoint:
 
 
 def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
-    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file where it has no checkpoints.
-
-    ``data_root`` is where its capture lies by now, if that was moved.
-    """
+    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has none."""
     config = load_resolved(run_dir, data_root=data_root)
     if config.model.is_network:
         raise DyngsError(
@@ -155,6 +135,17 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
     scene = restored_model(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
+
+
+def found_corrections(run_dir: Path, run: LoadedRun, trained_on: Sequence[View]) -> CameraCorrections | None:
+    """Return the corrections of a run's cameras; None where it refined none, or has no checkpoint."""
+    if run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
+        return None
+    checkpoint = latest_checkpoint(run_dir)
+    refinement = CameraRefinement(trained_on, run.info.extent, run.config.train.steps)
+    with reading(checkpoint.name, OTHER_CONFIG):
+        refinement.load_state(checkpoint.part("cameras"))
+    return refinement.corrections
 
 
 def has_only_scene_file(run_dir: Path) -> bool:

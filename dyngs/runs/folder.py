@@ -11,7 +11,8 @@ from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, as_word
-from dyngs.files.temporary import remove_leftovers, remove_quietly, temporary_folder_beside
+from dyngs.files.outputs import new_folder
+from dyngs.files.temporary import remove_leftovers
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
 from dyngs.runs.lock import LOCK_NAME, writing
@@ -62,28 +63,10 @@ def require_empty(folder: Path) -> None:
 
 
 @contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
-    """Yield a hidden folder beside ``out`` that gets its name when the block ends well, and is removed otherwise."""
-    require_empty(out)
-    started = temporary_folder_beside(out)
-    try:
-        yield started
-        try:
-            if out.is_dir():
-                out.rmdir()
-            started.rename(out)
-        except OSError as error:
-            require_empty(out)
-            raise DyngsError(f"cannot write {out}: {error.strerror or error}") from error
-    finally:
-        remove_quietly(started)
-
-
-@contextmanager
 def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
     """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one that becomes it."""
     if not out.exists():
-        with new_folder(out) as started:
+        with new_folder(out, require_empty) as started:
             yield started
         return
     with writing(out):
@@ -106,9 +89,7 @@ def _require_export_of(config: Config, folder: Path) -> None:
 
 
 def require_startable(folder: Path, config: Config) -> None:
-    """Raise unless the run of ``config`` can begin in ``folder``: it would replace nothing there, or only what
-    the very same run left that was stopped before its first checkpoint.
-    """
+    """Raise unless the run of ``config`` would replace nothing in ``folder`` but what the same run has only begun."""
     begun = _config_of_begun(folder)
     if begun is None:
         if checkpoint_paths(folder):
@@ -139,11 +120,7 @@ def note_asked(folder: Path, asked: Config) -> None:
 
 
 def note_root(folder: Path, data: DataConfig) -> None:
-    """Write into the configuration of a run where its capture lies by now, if that differs.
-
-    Raises:
-        DyngsError: no capture is there; the configuration stays as it was.
-    """
+    """Write into the configuration of a run where its capture lies by now, if that differs and there is a capture."""
     for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:
@@ -210,7 +187,7 @@ def was_only_begun(folder: Path) -> bool:
 
 
 def begin(folder: Path, config: Config) -> None:
-    """Write the configuration of a run, unless the same one is there already, which may be a person's own file."""
+    """Write the configuration of a run, unless the same one is there already."""
     begun = _config_of_begun(folder)
     if begun is None or not _is_same_run(begun, config):
         write_config(config, folder)
@@ -219,12 +196,9 @@ def begin(folder: Path, config: Config) -> None:
 def tidy(folder: Path, *, sole_writer: bool) -> None:
     """Remove what killed processes left half written in a run folder; its owner calls this before it writes.
 
-    Args:
-        folder: of a run.
-        sole_writer: no other process writes into it, so that checkpoints that nobody goes on writing can be told.
+    ``sole_writer``: no other process writes into it, so that checkpoints that nobody goes on writing can be told.
     """
-    ours = set(_BEGUN)
-    remove_leftovers(folder, ours.__contains__ if sole_writer else None)
+    remove_leftovers(folder, _BEGUN.__contains__ if sole_writer else None)
     for inner in (folder / "checkpoints", folder / EXPORT_FOLDER):
         if not inner.is_symlink():
             remove_leftovers(inner, (lambda _: True) if sole_writer else None)

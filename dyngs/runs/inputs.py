@@ -26,8 +26,8 @@ _FILES_OF_VIEWS = ("image_path", "mask_path", "depth_path", "motion_mask_path", 
 def inputs_of(*read: Read) -> Inputs:
     """Return what is read of files, folders, runs, configurations and captures, with all that these name.
 
-    Of a run, given as its folder or its ``scene.dyngs``, these are its own files and what its configuration names:
-    other files in its folder are outputs.
+    Of a run, its folder or its ``scene.dyngs``, these are its own files and what its configuration names: other files
+    in its folder are outputs.
     """
     found = list(chain.from_iterable(_named_by(one) for one in read))
     return Inputs((one for one in found if isinstance(one, Path)), lambda: _outside_captures(found))

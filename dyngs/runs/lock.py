@@ -34,11 +34,7 @@ class InUseError(DyngsError):
 
 
 class Held:
-    """A folder that this process writes into.
-
-    Attributes:
-        alone: no other process writes into it; false where there are no locks.
-    """
+    """A folder that this process writes into; ``alone``: no other does, which is not known where there are no locks."""
 
     def __init__(self, folder: Path, *, alone: bool) -> None:
         self._folder, self.alone = folder, alone
@@ -55,7 +51,6 @@ class Held:
         return path
 
     def close(self) -> None:
-        """Forget the folder."""
         if self._opened is not None:
             os.close(self._opened)
 
@@ -64,9 +59,8 @@ class Held:
 def writing(folder: Path) -> Iterator[Held]:
     """Yield the folder, into which no other process writes in the block, if its file system has locks.
 
-    The folder is made where it is missing, and removed where nothing came of it. The lock holds for as long as the
-    process lives; the file ``run.lock`` says who it is. A file system that has no locks (some network file systems) is
-    told of in a line on stderr.
+    The folder is made where it is missing, and removed where nothing came of it. The file ``run.lock`` says who writes.
+    A file system that has no locks (some network file systems) is told of in a line on stderr.
 
     Raises:
         InUseError: another process writes there.

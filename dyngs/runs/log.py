@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 from dyngs.errors import DyngsError
@@ -21,10 +21,8 @@ class LogRecord:
     """One line of ``log.jsonl``.
 
     Attributes:
-        loss: of this step, regularizers included.
-        psnr: of this step's image, dB; None where its mask leaves nothing.
-        num_gaussians: after the step.
-        num_moving: those of them that depend on time.
+        loss, psnr: of this step; of its image, dB, None where its mask leaves nothing.
+        num_gaussians, num_moving: after the step, and those of them that depend on time.
         bad_gradients: how often so far a Gaussian was left out of a step because its gradient was not finite.
         seconds: training time so far, over all resumes.
     """
@@ -42,7 +40,6 @@ class RunLog:
     """Listener that writes a run's log; a context manager.
 
     Args:
-        run_dir: run folder.
         after_step: lines beyond this step, left by an interrupted run, are dropped (0: all).
         every: steps between lines; the last step has one, too.
         tensorboard: also write event files to ``run_dir/tensorboard``.
@@ -63,36 +60,31 @@ class RunLog:
                 self.write_scores(event.step, event.split, event.psnr, event.ssim)
 
     def write(self, record: LogRecord) -> None:
-        """Append ``record`` and flush, so that a crash loses nothing."""
-        self._file.write(json.dumps(asdict(record)) + "\n")
-        self._file.flush()
-        if self._board is not None:
-            self._board.add_scalar("train/loss", record.loss, record.step)
-            if record.psnr is not None:
-                self._board.add_scalar("train/psnr", record.psnr, record.step)
-            self._board.add_scalar("train/num_gaussians", record.num_gaussians, record.step)
+        """Append the line of a step."""
+        self._append(asdict(record), "train", ("loss", "psnr", "num_gaussians"))
 
     def write_scores(self, step: int, split: str, psnr: float, ssim: float) -> None:
         """Append the scores of an evaluation during training."""
-        self._file.write(json.dumps({"step": step, "split": split, "psnr": psnr, "ssim": ssim}) + "\n")
+        self._append({"step": step, "split": split, "psnr": psnr, "ssim": ssim}, split, ("psnr", "ssim"))
+
+    def _append(self, values: dict[str, Any], group: str, plotted: Sequence[str]) -> None:
+        """Append a line and flush, so that a crash loses nothing."""
+        self._file.write(json.dumps(values) + "\n")
         self._file.flush()
-        if self._board is not None:
-            self._board.add_scalar(f"{split}/psnr", psnr, step)
-            self._board.add_scalar(f"{split}/ssim", ssim, step)
+        for name in plotted:
+            if self._board is not None and values[name] is not None:
+                self._board.add_scalar(f"{group}/{name}", values[name], values["step"])
 
     def __enter__(self) -> RunLog:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
         if self._board is not None:
             self._board.close()
 
 
 def record_of(event: StepDone) -> LogRecord:
-    """Return the line of a step."""
     quality = event.report.psnr
     return LogRecord(
         step=event.step,

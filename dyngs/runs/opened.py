@@ -16,7 +16,7 @@ from dyngs.camera_paths.aim import up_direction
 from dyngs.config import Config, DataConfig, HumanModel, StaticModel
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.read import read_capture
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import Scene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
@@ -31,7 +31,7 @@ from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.splats.formats import all_suffixes, known_format, read_splats
 from dyngs.splats.rotation import AXES
-from dyngs.splats.splat_file import Nonfinite, SplatFile, splat_options
+from dyngs.splats.splat_file import Nonfinite, splat_options
 from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
@@ -44,12 +44,7 @@ T = TypeVar("T")
 
 
 class Captured:
-    """The capture that a scene was trained on; read when it is first needed, and only once.
-
-    Args:
-        data: where it is.
-        capture: what was read from there already.
-    """
+    """The capture that a scene was trained on; read when it is first needed, and only once, if not ``capture``."""
 
     def __init__(self, data: DataConfig, capture: Capture | None = None) -> None:
         self.data = data
@@ -81,9 +76,7 @@ class Captured:
 
     def once(self, name: str, compute: Callable[[], T]) -> T:
         """Return what ``compute`` returned when first asked for ``name``."""
-        if name not in self._kept:
-            self._kept[name] = compute()
-        return self._kept[name]
+        return _once(self._kept, name, compute)
 
 
 @dataclass(frozen=True)
@@ -113,7 +106,7 @@ class Opened(LoadedRun):
 
     @property
     def capture(self) -> Capture:
-        """The capture. Raises DyngsError where there is none, or it cannot be read."""
+        """As of ``Captured``. Raises DyngsError where there is none, or it cannot be read."""
         if self.captured is None:
             raise DyngsError(f"{self.config.data.root}: a file, without the capture that it was trained on")
         return self.captured.capture
@@ -129,7 +122,7 @@ class Opened(LoadedRun):
 
     @property
     def cameras(self) -> Cameras | None:
-        """The V training cameras, all with size and intrinsics of the first; None where no capture can be read."""
+        """As of ``Captured``; None where no capture can be read."""
         return None if self.captured is None else self.captured.cameras
 
     @property
@@ -169,9 +162,7 @@ class Opened(LoadedRun):
 
     def once(self, name: str, compute: Callable[[], T]) -> T:
         """Return what ``compute`` returned when first asked for ``name`` of this scene."""
-        if name not in self._kept:
-            self._kept[name] = compute()
-        return self._kept[name]
+        return _once(self._kept, name, compute)
 
     def showing(self, scene: Renderable) -> Opened:
         """Return the same with another scene."""
@@ -218,11 +209,7 @@ class Opened(LoadedRun):
         return replace(self, renderable=playing, fps=motion.fps, as_captured=False)
 
     def at_rest(self) -> Opened:
-        """Return the same with its person in the rest pose of the template, upright on the floor.
-
-        Raises:
-            DyngsError: it is no person.
-        """
+        """Return the same with its person in the rest pose of the template, upright on the floor. Raises DyngsError."""
         scene, _ = self._person_for("--pose rest")
         rest = placement.rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         return replace(self, renderable=scene.playing(rest), as_captured=False)
@@ -235,11 +222,16 @@ class Opened(LoadedRun):
         return self.person, model
 
 
+def _once(kept: dict[str, Any], name: str, compute: Callable[[], T]) -> T:
+    if name not in kept:
+        kept[name] = compute()
+    return kept[name]
+
+
 def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | None = None) -> Opened:
     """Open a run folder, a ``scene.dyngs`` with the ``config.yaml`` of its run, an avatar, or a file of Gaussians.
 
     Args:
-        path: of it. A capture is read later, when something of it is needed.
         nonfinite: of a file of Gaussians, as ``dyngs.splats.formats.read_splats``.
         data_root: where the capture of a run lies by now, if it was moved.
 
@@ -258,7 +250,10 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
         known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
         other = command_for(path)
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
-    return _of_splats(path, read_splats(path, nonfinite=nonfinite))
+    splat = read_splats(path, nonfinite=nonfinite)
+    opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), path)
+    info = replace(opened.info, world_offset=splat.world_offset)
+    return replace(opened, info=info, turned=splat.turned, stated_up=splat.up, notes=splat.notes)
 
 
 def open_run(folder: Path, capture: Capture | None = None, data_root: Path | None = None) -> Opened:
@@ -274,12 +269,6 @@ def opened_scene(scene: Scene, file: Path = Path("scene")) -> Opened:
     return Opened(config, scene, 0, 0.0, info, name=file.name)
 
 
-def _of_splats(path: Path, splat: SplatFile) -> Opened:
-    opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), path)
-    info = replace(opened.info, world_offset=splat.world_offset)
-    return replace(opened, info=info, turned=splat.turned, stated_up=splat.up, notes=splat.notes)
-
-
 def cameras_for_paths(views: Sequence[View], data: DataConfig) -> Cameras:
     """Return the cameras of V views, all with size and intrinsics of the first (downscaled, undistorted)."""
     (first,) = training_cameras(views[:1], data)
@@ -289,11 +278,10 @@ def cameras_for_paths(views: Sequence[View], data: DataConfig) -> Cameras:
 
 def split_views(capture: Capture, split: str) -> Sequence[View]:
     """Return the views of a split, at least one. Raises DyngsError that lists the splits there are."""
-    views = {name: views for name, views in capture.splits.items() if views}
-    for name, found in views.items():
-        if name == split:
-            return found
-    there = ", ".join(f"{name} ({len(found)} views)" for name, found in views.items())
+    views = {str(name): views for name, views in capture.splits.items() if views}
+    if split in views:
+        return views[split]
+    there = ", ".join(f"{name} ({counted(len(found), 'view')})" for name, found in views.items())
     raise DyngsError(f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}")
 
 

@@ -6,7 +6,6 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import IO, Any
 
 from dyngs.config import Config
@@ -19,15 +18,11 @@ PLAIN_LINES = 10
 
 
 class Progress:
-    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left.
+    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; a context manager.
 
-    Where there is no terminal, plain lines.
-
-    A context manager; tells nothing where ``total`` steps are already done.
+    Where there is no terminal, plain lines. Tells nothing where ``total`` steps are already done.
 
     Args:
-        total: steps that there will be.
-        done: steps done.
         every: steps between updates; the last step has one, too.
         stream: where to; None: standard error.
         config: returns the configuration as it is now, whose schedule decides the time left; None: steps all alike.
@@ -52,7 +47,6 @@ class Progress:
         self._task: Any = None
 
     def __call__(self, event: Event) -> None:
-        """Show ``event``."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
                 self.update(record_of(event), event.report.truth.shape[0] * event.report.truth.shape[1])
@@ -85,7 +79,6 @@ class Progress:
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 
     def expect(self, total: int) -> None:
-        """Set the total number of steps to ``total``."""
         self._total = total
         if self._bar is not None:
             self._bar.update(self._task, total=total)
@@ -110,9 +103,7 @@ class Progress:
         self._forecast.restart(self._start, self._since)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 

@@ -1,42 +1,116 @@
-"""Quality and speed of variants, measured by rendering them."""
+"""Quality and speed of variants, measured by rendering them, and files of that, so that nothing is measured twice."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from statistics import fmean, median
+from typing import Annotated
 
 import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter
 
 from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
+from dyngs.files.write import write_text
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
 from dyngs.metrics import Lpips, psnr, ssim
-from dyngs.tradeoff.measurements import Quartiles, Speed
 from dyngs.tradeoff.variants import Variant
+
+_Measured = Annotated[float, Field(gt=1e-9)]
+"""Milliseconds, or a gain: a smaller number is none that was measured."""
+_AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 @dataclass(frozen=True)
-class Quality:
-    """Means over images; LPIPS is None where it cannot be computed."""
+class Quartiles:
+    """Median, lower and upper quartile."""
 
+    __pydantic_config__ = _AS_STORED
+    median: _Measured
+    low: _Measured
+    high: _Measured
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Rendering speed, with deformation and upscaling.
+
+    Attributes:
+        ms: milliseconds per image.
+        gain: speed relative to the run itself, over pairs of renders taken right after each other.
+    """
+
+    ms: Quartiles
+    gain: Quartiles
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Quality, size and speed of a variant.
+
+    Attributes:
+        psnr, ssim, lpips: means over the views; LPIPS is None where it cannot be computed.
+        mb: 1e6 bytes on disk: the .dyngs file, or 4 bytes per value needed for rendering where nothing is quantised.
+        memory_mb: largest growth of a process that loads and renders the variant, 1e6 bytes; None where unknown.
+        speed: None until it is measured.
+    """
+
+    __pydantic_config__ = _AS_STORED
+    variant: Variant
+    num_views: int
     psnr: float
     ssim: float
     lpips: float | None
+    num_gaussians: int
+    mb: float
+    memory_mb: float | None
+    speed: Speed | None = None
+
+    @property
+    def gain(self) -> float:
+        """Median speed relative to the run itself; 1 until it is measured."""
+        return 1.0 if self.speed is None else self.speed.gain.median
+
+
+_STORED = TypeAdapter(Measurement)
+
+
+def read_measurement(path: Path) -> Measurement:
+    with reading(path, "it is no measurement of a variant: remove it to have it measured again"):
+        require_regular(path)
+        return _STORED.validate_json(path.read_bytes())
+
+
+def write_measurement(path: Path, measurement: Measurement) -> None:
+    values = asdict(measurement) | {"variant": measurement.variant.changes}
+    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+
+
+def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
+    """Return which points are on the Pareto front: no other is as good in all goals and better in one."""
+    return [not any(_dominates(other, own) for other in goals) for own in goals]
+
+
+def on_front(measurements: Sequence[Measurement]) -> list[bool]:
+    """Return which variants are on the Pareto front of PSNR, speed and size."""
+    return pareto_mask([(m.psnr, m.gain, -m.mb) for m in measurements])
+
+
+def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
+    return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))
 
 
 def with_render_settings(variant: Variant, model: SceneModel) -> SceneModel:
     """Return the ``model`` section of a run with the render settings of a variant."""
-    mode = None if variant.mode is None else RasterizeMode(variant.mode)
-    changes = {
-        "rasterize_mode": mode,
-        "alpha_min": variant.alpha_min,
-        "transmittance_min": variant.transmittance_min,
-    }
+    changes = {"alpha_min": variant.alpha_min, "transmittance_min": variant.transmittance_min}
+    changes |= {"rasterize_mode": None if variant.mode is None else RasterizeMode(variant.mode)}
     return model.model_copy(update={name: value for name, value in changes.items() if value is not None})
 
 
@@ -45,8 +119,8 @@ def render_options_of(variant: Variant, model: SceneModel) -> RenderOptions:
     return render_options(with_render_settings(variant, model))
 
 
-def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> Quality:
-    """Return mean metrics over images, each rendered at its own time."""
+def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> tuple[float, float, float | None]:
+    """Return mean PSNR, SSIM and LPIPS (None where unknown) over images, each rendered at its own time."""
     psnrs, ssims, distances = [], [], []
     for image in images:
         rendered, truth = drawing.image(image.cameras, image.time), image.composite(drawing.background)
@@ -56,7 +130,7 @@ def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> 
         ssims.append(ssim(rendered, truth, image.mask))
         distances.append(lpips(rendered, truth, image.mask).value)
     known = [x for x in distances if x is not None]
-    return Quality(fmean(psnrs), fmean(ssims), fmean(known) if len(known) == len(distances) else None)
+    return fmean(psnrs), fmean(ssims), fmean(known) if len(known) == len(distances) else None
 
 
 def time_interleaved(drawings: Sequence[Drawing], images: Sequence[Image], rounds: int) -> list[Speed]:
@@ -66,6 +140,5 @@ def time_interleaved(drawings: Sequence[Drawing], images: Sequence[Image], round
 
 
 def quartiles(values: np.ndarray) -> Quartiles:
-    """Return median and quartiles."""
     low, high = np.percentile(values, [25, 75])
     return Quartiles(float(median(values)), float(low), float(high))

@@ -51,7 +51,6 @@ class MemoryMeter:
         Counted from the loaded program, before any file is read. None where it cannot be measured.
 
         Args:
-            folder: run folder.
             variant: its render settings are used.
             images: their cameras and times are rendered; a person shows the training motion.
             background: (3,) colour.

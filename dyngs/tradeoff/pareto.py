@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from dyngs.tradeoff.measurements import Measurement
+from dyngs.tradeoff.measure import Measurement
 from dyngs.tradeoff.variants import SEVERAL, Variant
 
 MIN_DOUBLINGS = 0.05
@@ -66,13 +66,9 @@ def exchange_rates(base: Measurement, measurements: Iterable[Measurement]) -> li
 def combinations(base: Measurement, singles: Sequence[Measurement], count: int) -> list[Variant]:
     """Return combinations of single changes worth measuring next.
 
-    There are three greedy sequences: for speed, for size, and for both. Each starts at the run and adds the change that
-    loses the least PSNR per factor 2, then the next; a stronger value of a setting replaces a weaker one.
-
-    Args:
-        base: the run itself.
-        singles: variants that change one setting each; stronger values of a setting come later.
-        count: combinations per sequence.
+    There are three greedy sequences, of ``count`` each: for speed, for size, and for both. Each starts at the run and
+    adds the change that loses the least PSNR per factor 2, then the next; a stronger value of a setting, which comes
+    later in ``singles``, replaces a weaker one.
     """
     sequences: list[list[tuple[float, Measurement]]] = [[], [], []]
     for m in singles:

@@ -8,7 +8,7 @@ from html import escape
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from dyngs.tradeoff.measurements import pareto_mask
+from dyngs.tradeoff.measure import pareto_mask
 from dyngs.tradeoff.table import TableRow
 from dyngs.tradeoff.variants import SEVERAL
 
@@ -20,7 +20,6 @@ MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'
 
 
 def can_plot() -> bool:
-    """Return whether matplotlib is installed."""
     return find_spec("matplotlib") is not None
 
 
@@ -71,7 +70,6 @@ def svg_of(figure: Figure) -> str:
 
 
 def png_of(figure: Figure) -> bytes:
-    """Return a figure as the bytes of a PNG file."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=200, metadata={"Software": None})
     return file.getvalue()

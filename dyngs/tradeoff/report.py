@@ -11,7 +11,7 @@ from html import escape
 from pathlib import Path
 
 from dyngs.files.write import atomic_file, write_text
-from dyngs.tradeoff.measurements import Measurement
+from dyngs.tradeoff.measure import Measurement
 from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates
 from dyngs.tradeoff.plot import can_plot, plot, png_of, svg_of
 from dyngs.tradeoff.table import TableRow, table_rows
@@ -28,24 +28,9 @@ _UNDER_PLOT = (
     "<p>Thick lines: Pareto fronts of the two axes. Thin lines: the values of one setting in their order. "
     "Hover over a point for its name.</p>"
 )
-_HEAD = (
-    "changed",
-    "PSNR dB",
-    "SSIM",
-    "LPIPS",
-    "fps",
-    "times as fast (quartiles)",
-    "MB",
-    "memory MB",
-    "Gaussians",
-)
-EXCHANGE_HEAD = (
-    "setting",
-    "dB lost per doubled speed",
-    "dB lost per halved size",
-    "most speed, times",
-    "most size, times",
-)
+_HEAD = ("changed", "PSNR dB", "SSIM", "LPIPS", "fps", "times as fast (quartiles)", "MB", "memory MB", "Gaussians")
+_COSTS = ("dB lost per doubled speed", "dB lost per halved size")
+EXCHANGE_HEAD = ("setting", *_COSTS, "most speed, times", "most size, times")
 
 
 def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
@@ -81,18 +66,11 @@ def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
 
 
 def exchange_cells(rate: ExchangeRate) -> tuple[str, ...]:
-    """Return the cells of an exchange rate below ``EXCHANGE_HEAD``."""
-    costs = (rate.db_per_speed, rate.db_per_size)
-    return (
-        rate.setting,
-        *("no gain" if cost is None else f"{cost:+.2f}" for cost in costs),
-        f"{rate.speed:.2f}",
-        f"{rate.size:.2f}",
-    )
+    costs = ("no gain" if cost is None else f"{cost:+.2f}" for cost in (rate.db_per_speed, rate.db_per_size))
+    return rate.setting, *costs, f"{rate.speed:.2f}", f"{rate.size:.2f}"
 
 
 def _cells(row: TableRow) -> tuple[str, ...]:
-    """Return the cells of a row below ``_HEAD``."""
     return (
         row.name,
         f"{row.psnr:.2f}",

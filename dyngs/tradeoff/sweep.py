@@ -1,8 +1,4 @@
-"""Measure a run and its variants: one setting at a time, then combinations. Finished measurements are kept.
-
-The processes that ``torchrun`` starts share a sweep, on one machine or several with a common file system: they exchange
-results through files.
-"""
+"""Measure a run and its variants: one setting at a time, then combinations. Finished measurements are kept."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import timedelta
 from pathlib import Path
 from typing import cast
 
@@ -32,13 +27,18 @@ from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.inputs import inputs_of
-from dyngs.tradeoff.measure import measure_quality, render_options_of, time_interleaved
-from dyngs.tradeoff.measurements import Measurement, read_measurement, write_measurement
+from dyngs.tradeoff.measure import (
+    Measurement,
+    measure_quality,
+    read_measurement,
+    render_options_of,
+    time_interleaved,
+    write_measurement,
+)
 from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
-from dyngs.tradeoff.variants import Variant, Variation, single_changes
-from dyngs.training.processes import numbers_of_torchrun
+from dyngs.tradeoff.variants import Variant, Varied, single_changes
 
 TIMED_VIEWS = 8
 """Number of views for timing, evenly spread over the split; quality is measured on all."""
@@ -46,8 +46,6 @@ SERIES = 12
 """Number of variants timed together with the run; bounds the memory needed."""
 MEMORY_VIEWS = 2
 SOURCE_NAME = "source.json"
-TIMEOUT = timedelta(days=30)
-"""A process may have to wait while others train."""
 
 
 @dataclass(frozen=True)
@@ -59,75 +57,18 @@ class Plan:
         combine: combinations in each of three directions, see ``pareto.combinations``.
         split: "test", "val", "train" or "pose".
         rounds: renders of each timed view.
-        threads: for timing; 0 = all cores.
+        device: draws what is measured.
     """
 
-    variations: tuple[Variation, ...]
+    settings: tuple[Varied, ...]
     finetune: int = 0
     combine: int = 4
     split: str = "test"
     rounds: int = 5
-    threads: int = 0
     device: torch.device = CPU
 
 
-@dataclass(frozen=True)
-class ProcessGroup:
-    """This process and the number of the others.
-
-    Attributes:
-        rank: number of this process; rank 0 also measures speed and writes the report.
-        local_size: number of processes on this machine.
-    """
-
-    rank: int = 0
-    size: int = 1
-    local_size: int = 1
-
-    @staticmethod
-    def from_environment() -> ProcessGroup:
-        """Return the group that ``torchrun`` describes in environment variables; a single process without it."""
-        numbers = numbers_of_torchrun()
-        return SINGLE_PROCESS if numbers is None else ProcessGroup(*numbers)
-
-    @property
-    def is_first(self) -> bool:
-        """Whether this process has rank 0."""
-        return self.rank == 0
-
-    @property
-    def cores(self) -> int:
-        """Cores for this process if all on this machine get the same number, at least 1."""
-        return max(1, num_cores() // self.local_size)
-
-    def share(self, variants: Sequence[Variant]) -> list[Variant]:
-        """Return the variants for this process; variants that are made from one another stay together."""
-        owners: dict[Variant, int] = {}
-        for variant in variants:
-            owners.setdefault(_longest_stage(variant), len(owners) % self.size)
-        return [variant for variant in variants if owners[_longest_stage(variant)] == self.rank]
-
-    def wait(self) -> None:
-        """Block until all processes are here."""
-        if self.size == 1:
-            return
-        if not torch.distributed.is_initialized():
-            torch.distributed.init_process_group("gloo", timeout=TIMEOUT)
-        torch.distributed.barrier()
-
-
-SINGLE_PROCESS = ProcessGroup()
-
-
-def _longest_stage(variant: Variant) -> Variant:
-    """Return the part of a variant that takes longest to make: training, else pruning and masking, else the rest."""
-    pruned = replace(variant.stored, storage=None, field_step=1.0, sh_degree=None)
-    return next((part for part in (variant.trained, pruned, variant.stored) if part != Variant()), variant)
-
-
-def sweep(
-    runs: VariantRuns, plan: Plan, log: Callable[[str], None], group: ProcessGroup = SINGLE_PROCESS
-) -> list[Measurement]:
+def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Measurement]:
     """Return the measurements of all variants, the run itself first.
 
     Each is kept as a file in ``runs.out / "points"`` and not made again; ``log`` is called with a line per measurement.
@@ -137,17 +78,16 @@ def sweep(
     """
     load_resolved(runs.run_dir)  # what is no run is refused before anything else
     inputs_of(runs.run_dir).require_output(runs.out)
-    with MemoryMeter() as meter:
+    with MemoryMeter() as meter, kernel_threads(runs.threads or num_cores()):
         own = run_settings(runs.run_dir)  # refuses what cannot be varied before anything is written
         session = _Session(runs, plan, meter, log)
-        _require_same_source(runs, plan, is_first=group.is_first)
-        idle = [v.setting.name for v in plan.variations if not any(own.allows(v.setting, value) for value in v.values)]
-        if idle and group.is_first:
+        _require_same_source(runs, plan)
+        idle = [s.name for s in plan.settings if not any(own.allows(s, value) for value in s.values)]
+        if idle:
             log(f"nothing to vary in this run: {', '.join(idle)}")
-        singles = [Variant(), *single_changes(plan.variations, own, plan.finetune)]
-        measured = session.measured(singles, group)
-        combined = combinations(measured[0], measured[1:], plan.combine)
-        return session.measured([*singles, *combined], group)
+        singles = [Variant(), *single_changes(plan.settings, own, plan.finetune)]
+        measured = session.measured(singles)
+        return session.measured([*singles, *combinations(measured[0], measured[1:], plan.combine)])
 
 
 class _Session:
@@ -162,16 +102,9 @@ class _Session:
         self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1].to(plan.device)
         self._lpips = load_lpips("alex", plan.device)
 
-    def measured(self, variants: Sequence[Variant], group: ProcessGroup) -> list[Measurement]:
-        """Return measurements: each process makes its share, then the first one times all."""
-        with kernel_threads(self._runs.threads or num_cores()):
-            for variant in group.share(variants):
-                self._measurement(variant)
-        group.wait()
-        if group.is_first:
-            with kernel_threads(self._plan.threads or num_cores()):
-                self._time([self._measurement(variant) for variant in variants])
-        group.wait()
+    def measured(self, variants: Sequence[Variant]) -> list[Measurement]:
+        """Return measurements of all: first without their speeds, which are then measured in turn."""
+        self._time([self._measurement(variant) for variant in variants])
         return [self._measurement(variant) for variant in variants]
 
     def _measurement(self, variant: Variant) -> Measurement:
@@ -180,19 +113,19 @@ class _Session:
         if path.is_file():
             return read_measurement(path)
         folder, drawing = self._runs.folder(variant), self._drawing(variant)
-        quality = measure_quality(drawing, (self._loader[i] for i in range(len(self._loader))), self._lpips)
+        images = (self._loader[i] for i in range(len(self._loader)))
+        psnr, ssim, lpips = measure_quality(drawing, images, self._lpips)
         shown = self._images(MEMORY_VIEWS)
+        on_cpu = self._plan.device == CPU
         measurement = Measurement(
             variant=variant,
             num_views=len(self._loader),
-            psnr=quality.psnr,
-            ssim=quality.ssim,
-            lpips=quality.lpips,
+            psnr=psnr,
+            ssim=ssim,
+            lpips=lpips,
             num_gaussians=len(require_gaussians(drawing.scene, variant.slug)),
             mb=megabytes_on_disk(folder),
-            memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background)
-            if self._plan.device == CPU
-            else None,
+            memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background) if on_cpu else None,
         )
         write_measurement(path, measurement)
         counts = f"{counted(measurement.num_gaussians, 'Gaussian')}, {measurement.mb:.2f} MB"
@@ -201,14 +134,13 @@ class _Session:
 
     def _time(self, measurements: Sequence[Measurement]) -> None:
         """Measure and store the missing speeds, interleaved with the first variant."""
-        missing = [m for m in measurements[1:] if m.speed is None]
-        first = measurements[0]
+        first, missing = measurements[0], [m for m in measurements[1:] if m.speed is None]
         groups = [missing[i : i + SERIES] for i in range(0, len(missing), SERIES)]
         if first.speed is None and not groups:
             groups = [[]]
         images = self._images(TIMED_VIEWS)
         for group in groups:
-            self._log(f"timing {len(group) + 1} variants in turn")
+            self._log(f"timing {counted(len(group) + 1, 'variant')} in turn")
             together = [first, *group]
             speeds = time_interleaved([self._drawing(m.variant) for m in together], images, self._plan.rounds)
             for m, speed in zip(together, speeds, strict=True):
@@ -229,8 +161,8 @@ class _Session:
         return self._runs.out / "points" / f"{variant.slug}.json"
 
 
-def _require_same_source(runs: VariantRuns, plan: Plan, *, is_first: bool) -> None:
-    """Compare the checkpoint and split with those of earlier measurements in the folder; rank 0 notes them."""
+def _require_same_source(runs: VariantRuns, plan: Plan) -> None:
+    """Compare checkpoint, split and device with those of earlier measurements in the folder, or note them there."""
     newest = checkpoint_paths(runs.run_dir)[-1]
     source = {
         "run": str(runs.run_dir.absolute()),
@@ -241,15 +173,13 @@ def _require_same_source(runs: VariantRuns, plan: Plan, *, is_first: bool) -> No
     }
     path = runs.out / SOURCE_NAME
     if not path.is_file():
-        if is_first:
-            write_text(path, json.dumps(source, indent=2) + "\n")
+        write_text(path, json.dumps(source, indent=2) + "\n")
         return
     try:
         known = cast(object, json.loads(path.read_text(encoding="utf-8")))
     except ValueError:
         known = None
-    same = {"sha256": None, "split": None, "device": "cpu"}  # folders of old do not name the device
-    if not isinstance(known, dict) or any(known.get(key, default) != source[key] for key, default in same.items()):
+    if not isinstance(known, dict) or any(known.get(key) != source[key] for key in ("sha256", "split", "device")):
         raise DyngsError(
             f"{runs.out}: holds measurements of another run, checkpoint, split or device; give another --out"
         )

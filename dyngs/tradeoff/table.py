@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from dyngs.errors import DyngsError, printable
-from dyngs.tradeoff.measurements import Measurement, on_front
+from dyngs.tradeoff.measure import Measurement, on_front
 from dyngs.tradeoff.variants import Variant
 
 METRICS = ("psnr", "ssim", "lpips", "fps", "mb", "memory_mb", "gaussians")
@@ -18,14 +18,12 @@ _CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
 
 @dataclass(frozen=True)
 class TableRow:
-    """A measured variant. The fields but ``variant``, after its name, are the columns of the .csv.
+    """A measured variant, see ``Measurement``. The fields but ``variant``, after its name, are the columns of the .csv.
 
     Attributes:
-        psnr, ssim, lpips: means over the split; LPIPS is None where it cannot be computed.
         fps: frames per second of the run itself times ``gain``, so that variants timed at another hour compare.
         gain, gain_low, gain_high: speed relative to the run: median and quartiles of interleaved pairs.
         ms: median time of one image as measured.
-        mb, memory_mb, gaussians: see ``Measurement``.
         on_front: on the Pareto front of PSNR, speed and size.
     """
 
@@ -45,7 +43,6 @@ class TableRow:
 
     @property
     def name(self) -> str:
-        """Name of the variant."""
         return self.variant.name
 
     @property
@@ -120,10 +117,13 @@ def parse_requirements(text: str) -> tuple[Requirement, ...]:
 
 def parse_goal(name: str, *, smallest: bool) -> Goal:
     """Return the goal of ``--minimize`` or ``--maximize``."""
-    if name not in METRICS:
-        option = "--minimize" if smallest else "--maximize"
-        raise DyngsError(f"{option} {name}: no such metric; there are {', '.join(METRICS)}")
+    _require_metric(name, f"--{'minimize' if smallest else 'maximize'} {name}")
     return Goal(name, smallest)
+
+
+def _require_metric(name: str, option: str) -> None:
+    if name not in METRICS:
+        raise DyngsError(f"{option}: no such metric; there are {', '.join(METRICS)}")
 
 
 def choose(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: Goal) -> TableRow:
@@ -139,8 +139,7 @@ def _requirement(part: str) -> Requirement:
     if match is None:
         raise DyngsError(f"--require {shown!r} is no condition; write for instance psnr>=30,fps>=20,mb<=5")
     name, sign, number = match.groups()
-    if name not in METRICS:
-        raise DyngsError(f"--require {shown}: no such metric; there are {', '.join(METRICS)}")
+    _require_metric(name, f"--require {shown}")
     try:
         bound = float(number)
     except ValueError:
@@ -152,25 +151,18 @@ def _requirement(part: str) -> Requirement:
 
 def _explanation(rows: Sequence[TableRow], requirements: Sequence[Requirement], goal: Goal) -> str:
     """Return one line: the best value per requirement with the others met, or, if there is none, on its own."""
-    asked = ", ".join(str(r) for r in requirements)
     relaxed = []
     for binding in requirements:
         others = [r for r in requirements if r is not binding]
         fitting = [row for row in rows if all(r.is_met(row) for r in others) and row.metric(binding.name) is not None]
         if fitting:
-            nearest = min(fitting, key=lambda row: (_violation(binding, row), goal.cost(row)))
+            own = Goal(binding.name, binding.at_most)
+            nearest = min(fitting, key=lambda row: (own.cost(row), goal.cost(row)))
             best = f"with the others met the best is {nearest.metric(binding.name):.5g} ({nearest.name})"
             relaxed.append(f"{binding} is too strict: {best}")
     if not relaxed:
         relaxed = [f"{r} alone: {_best_value(rows, r)}" for r in requirements]
-    return f"no measured variant has {asked}; {'; '.join(relaxed)}"
-
-
-def _violation(requirement: Requirement, row: TableRow) -> float:
-    """Return by how much a row misses the bound."""
-    value = row.metric(requirement.name)
-    assert value is not None
-    return value - requirement.bound if requirement.at_most else requirement.bound - value
+    return f"no measured variant has {', '.join(map(str, requirements))}; {'; '.join(relaxed)}"
 
 
 def _best_value(rows: Sequence[TableRow], requirement: Requirement) -> str:

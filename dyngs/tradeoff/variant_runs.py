@@ -42,13 +42,7 @@ NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)
 
 @dataclass(frozen=True)
 class VariantRuns:
-    """The run folders of a run and of its variants.
-
-    Attributes:
-        run_dir: the run, with a checkpoint.
-        threads: for training, rendering and pruning; 0 = all cores.
-        device: trains and prunes: "auto", "cpu" or "cuda".
-    """
+    """The run folders of a run and of its variants; ``threads`` 0: all cores; ``device`` trains and prunes."""
 
     run_dir: Path
     out: Path
@@ -63,9 +57,7 @@ class VariantRuns:
     def folder(self, variant: Variant) -> Path:
         """Return the run folder of a variant without its render settings; it is made if it does not exist.
 
-        Raises:
-            DyngsError: training or pruning fails.
-            KeyboardInterrupt: after Ctrl-C while training; the next call continues.
+        After Ctrl-C while training, the next call continues.
         """
         wanted = variant.stored
         if wanted == Variant():
@@ -130,7 +122,6 @@ def finished(config: Config, out: Path) -> Path:
 
 
 def run_settings(run_dir: Path) -> RunSettings:
-    """Return the settings of a run."""
     if has_only_scene_file(run_dir):
         raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from")
     config = load_resolved(run_dir)
@@ -178,8 +169,7 @@ def write_chosen(models: VariantRuns, variant: Variant) -> Path:
 
 def _pruning_overrides(wanted: Variant, own: PruneConfig) -> Sequence[str]:
     """Return overrides of the pruning stage; masks are those of the run where the variant has none."""
-    masks = (f"prune.mask_times={wanted.mask_times or own.mask_times}",)
-    return (f"prune.fraction={wanted.prune}", *masks)
+    return f"prune.fraction={wanted.prune}", f"prune.mask_times={wanted.mask_times or own.mask_times}"
 
 
 def field_changes(config: Config, wanted: Variant) -> Iterator[str]:

@@ -6,6 +6,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 
+from pydantic import ConfigDict
+
 from dyngs.config import Config, DynamicModel
 from dyngs.config.schema import kinds_of
 from dyngs.conventions import RasterizeMode
@@ -23,8 +25,7 @@ class Variant:
     """Changes of a run; the defaults change nothing.
 
     Attributes:
-        colour: ``colour.kind`` to train with.
-        field: ``model.deform.kind`` to train with.
+        colour, field: ``colour.kind`` and ``model.deform.kind`` to train with.
         field_size: factor on the nodes, channels, neurons or frequencies of the field to train with.
         prune: fraction of the Gaussians removed, by ``sensitivity``.
         mask_times: key times of visibility masks.
@@ -36,6 +37,7 @@ class Variant:
         scale: width and height rendered, relative to those shown.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
     colour: str | None = None
     field: str | None = None
     field_size: float = 1.0
@@ -57,7 +59,6 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """Name for tables and plots."""
         words = (f"{k}={value:g}" if isinstance(value, float) else f"{k}={value}" for k, value in self.changes.items())
         return " ".join(words) or "as it is"
 
@@ -93,7 +94,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Setting:
+class Varied:
     """A setting that can be varied.
 
     Attributes:
@@ -101,7 +102,7 @@ class Setting:
         values: tried by default, stronger ones later.
         low, high: range of numbers, inclusive; no numbers if ``low > high``.
         words: allowed beside numbers.
-        whole: numbers are integers.
+        integers: no other numbers.
         trains: every value but that of the run needs training from scratch.
     """
 
@@ -110,22 +111,21 @@ class Setting:
     low: float = 1.0
     high: float = 0.0
     words: tuple[str, ...] = ()
-    whole: bool = False
+    integers: bool = False
     trains: bool = False
 
     @property
     def allowed(self) -> str:
         """The allowed values, for messages."""
-        kind = "a whole number" if self.whole else "a number"
+        kind = "a whole number" if self.integers else "a number"
         number = [f"{kind} from {self.low:g} to {self.high:g}"] if self.low <= self.high else []
         return " or ".join([*number, *self.words])
 
     def parsed(self, text: str) -> Value:
-        """Return the value of a text."""
         if text in self.words:
             return text
         try:
-            value = int(text) if self.whole else float(text)
+            value = int(text) if self.integers else float(text)
         except ValueError:
             value = float("nan")
         if not self.low <= value <= self.high:
@@ -137,39 +137,24 @@ _FIELDS = tuple(kinds_of(DynamicModel.model_fields["deform"]))
 _COLOURS = tuple(kinds_of(Config.model_fields["colour"]))
 _MODES = tuple(mode.value for mode in RasterizeMode)
 SETTINGS = (
-    Setting("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
-    Setting("mask_times", (6, 16), low=2, high=1000, whole=True),
-    Setting("sh_degree", (2, 1, 0), low=0, high=3, whole=True),
-    Setting("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
-    Setting("mode", _MODES, words=_MODES),
-    Setting("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
-    Setting("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
-    Setting("scale", (0.75, 0.5), low=0.05, high=1.0),
-    Setting("field_step", (4.0, 16.0), low=1 / 64, high=1024),
-    Setting("colour", _COLOURS, words=_COLOURS, trains=True),
-    Setting("field", _FIELDS, words=_FIELDS, trains=True),
-    Setting("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
+    Varied("prune", (0.3, 0.5, 0.7, 0.85), low=0.01, high=0.99),
+    Varied("mask_times", (6, 16), low=2, high=1000, integers=True),
+    Varied("sh_degree", (2, 1, 0), low=0, high=3, integers=True),
+    Varied("storage", (AUTO, 1.0, 3.0), low=0.01, high=64, words=(AUTO,)),
+    Varied("mode", _MODES, words=_MODES),
+    Varied("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
+    Varied("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
+    Varied("scale", (0.75, 0.5), low=0.05, high=1.0),
+    Varied("field_step", (4.0, 16.0), low=1 / 64, high=1024),
+    Varied("colour", _COLOURS, words=_COLOURS, trains=True),
+    Varied("field", _FIELDS, words=_FIELDS, trains=True),
+    Varied("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
 )
 
 
 @dataclass(frozen=True)
-class Variation:
-    """A setting and the values to try."""
-
-    setting: Setting
-    values: tuple[Value, ...]
-
-
-@dataclass(frozen=True)
 class RunSettings:
-    """The settings of the run that is varied.
-
-    Attributes:
-        sh_degree: degree of its spherical harmonics, 0 if a network colours it.
-        mode, alpha_min, transmittance_min: it is rendered with.
-        mask_times: number of key times of its visibility masks.
-        field: kind of the deformation field; None: nothing moves.
-    """
+    """The settings of the run that is varied, as in ``Variant``; ``field`` None: nothing moves."""
 
     sh_degree: int
     mode: str
@@ -179,7 +164,7 @@ class RunSettings:
     colour: str
     field: str | None
 
-    def allows(self, setting: Setting, value: Value) -> bool:
+    def allows(self, setting: Varied, value: Value) -> bool:
         """Whether a value applies to the run and differs from its own."""
         if setting.name == "sh_degree":
             return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
@@ -189,16 +174,14 @@ class RunSettings:
         return own.get(setting.name) != value
 
 
-def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, ...]:
+def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Varied, ...]:
     """Return the variations of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE``; without any, all with defaults.
 
-    Args:
-        words: one per ``--vary``.
-        trains: settings that need training from scratch are allowed.
+    ``trains``: settings that need training from scratch are allowed.
     """
     if not words:
-        return tuple(Variation(setting, setting.values) for setting in SETTINGS if trains or not setting.trains)
-    found: dict[str, Variation] = {}
+        return tuple(setting for setting in SETTINGS if trains or not setting.trains)
+    found: dict[str, Varied] = {}
     for word in words:
         name, equals, listed = word.partition("=")
         setting = next((s for s in SETTINGS if s.name == name), None)
@@ -211,17 +194,17 @@ def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Variation, 
             raise DyngsError(f"--vary {name} is given twice; write --vary {name}=VALUE,VALUE")
         texts = re.split(r"\s*,\s*", listed.strip())
         values = tuple(setting.parsed(text) for text in texts) if equals else setting.values
-        found[name] = Variation(setting, tuple(dict.fromkeys(values)))
+        found[name] = replace(setting, values=tuple(dict.fromkeys(values)))
     return tuple(found.values())
 
 
-def single_changes(variations: Sequence[Variation], run: RunSettings, finetune: int) -> list[Variant]:
+def single_changes(settings: Sequence[Varied], run: RunSettings, finetune: int) -> list[Variant]:
     """Return one variant per setting and value that applies to a run; pruned and masked ones also with fine-tuning."""
     variants = []
-    for variation in variations:
-        name = variation.setting.name
-        for value in variation.values:
-            if run.allows(variation.setting, value):
+    for setting in settings:
+        name = setting.name
+        for value in setting.values:
+            if run.allows(setting, value):
                 variant = Variant(**{name: value})  # pyright: ignore[reportArgumentType]
                 if name == "field_step":
                     variant = replace(variant, storage=AUTO)

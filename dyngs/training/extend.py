@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from dyngs.config import Config, DynamicModel, HumanModel, TrainConfig
 from dyngs.deform.schedule import deform_schedule, motion_begins_after
 from dyngs.deform.training import DeformSchedule
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.schedule import Rates, means_rate, rates_of
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 from dyngs.training.corrections.exposure import WARM_UP
@@ -61,7 +61,7 @@ def with_length(config: Config, done: int, steps: int) -> Config:
             "longer; go on with the run before that, and prune again"
         )
     if steps <= done:
-        raise DyngsError(f"train.steps={steps}: {done:,} steps are done already; give more than that")
+        raise DyngsError(f"train.steps={steps}: {counted(done, 'step')} are done already; give more than that")
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
     match config.model:
@@ -88,7 +88,7 @@ def _require_exposures_stay(config: Config, length: Length) -> None:
 def told(before: Config, after: Config, done: int) -> str:
     """Return the line that says how a run goes on after ``done`` steps."""
     was, steps = before.train.steps, after.train.steps
-    line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {steps:,} steps"
+    line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {counted(steps, 'step')}"
     if not after.model.made_of_gaussians:
         return line
     then, now = (means_rate(c.optim, rates_of(c).progress(done), 1.0) for c in (before, after))

@@ -23,13 +23,9 @@ THUMBNAIL = 96
 
 @dataclass(frozen=True)
 class CapturedViews:
-    """Cameras of a capture, and their images.
+    """V views of a capture, each with a camera of the size of training, and their images, also small ones.
 
-    Attributes:
-        views: V views.
-        cameras: one camera each, of the size of training.
-        images: of the views, composited on demand; None where there are none that show what the scene plays.
-        thumbnails: the same, small.
+    There are no images where those of the capture do not show what the scene plays.
     """
 
     views: tuple[View, ...] = ()
@@ -42,12 +38,10 @@ class CapturedViews:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the views, each once."""
         return tuple(view.name for view in self.views)
 
     @property
     def times(self) -> tuple[float | None, ...]:
-        """Times of the views."""
         return tuple(view.time for view in self.views)
 
     @property
@@ -58,14 +52,7 @@ class CapturedViews:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where a scene is looked at first.
-
-    Attributes:
-        start: the first camera.
-        center: (3,) point to orbit around.
-        extent: rough size of what is looked at, world units.
-        up: (3,) unit vector.
-    """
+    """The camera from which a scene is looked at first, the point (3,) to orbit around, its rough size, and up (3,)."""
 
     start: Cameras
     center: np.ndarray

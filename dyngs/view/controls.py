@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from dyngs.errors import counted
 from dyngs.gaussians.scene import Scene
@@ -38,13 +37,7 @@ HELP = """\
 
 
 class Controls:
-    """Controls of one browser; ``show`` makes them anew for another scene.
-
-    Args:
-        browsing: the browser.
-        source: scenes to choose from.
-        serving: how the page is served.
-    """
+    """Controls of one browser; ``show`` makes them anew for another scene."""
 
     def __init__(self, browsing: Browsing, source: Source, serving: Serving) -> None:
         self._browsing, self._source, self._serving = browsing, source, serving
@@ -64,49 +57,32 @@ class Controls:
             handle.remove()
         self._frusta.remove()
         gui, browsing = self._browsing.client.gui, self._browsing
-        look = gui.add_folder("Show")
-        with look:
-            self._add_look(gui, opened)
-        folders = [look]
         browsing.time_slider = None
+        network, parts = self._source.network, dict[str, Callable[[], None]]()
+        parts["Show"] = lambda: self._add_display(gui, opened)
         if has_timeline(opened):
-            folders.append(gui.add_folder("Time"))
-            with folders[-1]:
-                self._add_time(gui)
+            parts["Time"] = lambda: self._add_time(gui)
         if len(views_of(opened)):
-            folders.append(gui.add_folder("Capture"))
-            with folders[-1]:
-                self._add_capture(gui, opened)
+            parts["Capture"] = lambda: self._add_capture(gui, opened)
         if opened.person is not None and not opened.in_training:
-            folders.append(gui.add_folder("Person"))
-            with folders[-1]:
-                add_person_controls(browsing, self._serving.motions)
-        if self._source.network is not None:
-            folders.append(gui.add_folder("Predict from"))
-            with folders[-1]:
-                add_image_controls(browsing, self._source.network, self._predicted)
-        folders.append(gui.add_folder("Camera path", expand_by_default=False))
-        with folders[-1]:
-            add_path_controls(browsing)
-        folders.append(gui.add_folder("Help", expand_by_default=False))
-        with folders[-1]:
-            gui.add_markdown(HELP)
-            for note in opened.notes:
-                gui.add_markdown(f"*{note}*")
-        self._of_scene = folders
+            parts["Person"] = lambda: add_person_controls(browsing, self._serving.motions)
+        if network is not None:
+            parts["Predict from"] = lambda: add_image_controls(browsing, network)
+        parts |= {"Camera path": lambda: add_path_controls(browsing), "Help": lambda: _add_help(gui, opened)}
+        self._of_scene = []
+        for name, add in parts.items():
+            self._of_scene.append(gui.add_folder(name, expand_by_default=name not in ("Camera path", "Help")))
+            with self._of_scene[-1]:
+                add()
 
-    def _add_look(self, gui: viser.GuiApi, opened: Opened) -> None:
+    def _add_display(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
         layers = [name for name in LAYERS if len(views_of(opened)) or name != "error"]
         layers = [name for name in layers if isinstance(opened.renderable, Scene) or name != "motion"]
         if session.look.layer not in layers:
             session.change(layer="colour")
-        layer = gui.add_dropdown(
-            "What",
-            layers,
-            initial_value=session.look.layer,
-            hint="error: against the truth, at a camera of the capture",
-        )
+        hint = "error: against the truth, at a camera of the capture"
+        layer = gui.add_dropdown("What", layers, initial_value=session.look.layer, hint=hint)
         layer.on_update(lambda _: self._change(layer=layer.value))
         scene = opened.renderable if isinstance(opened.renderable, Scene) else None
         has_parts = scene is not None and 0 < scene.num_moving < len(scene)
@@ -115,13 +91,11 @@ class Controls:
             part.on_update(lambda _: session.change(part=part.value))
         else:
             session.change(part="all")
-        longest = gui.add_slider(
-            "Sharpness", 200, 2400, 100, session.look.longest, hint="most pixels of the longer side, when all is still"
-        )
+        hint = "most pixels of the longer side, when all is still"
+        longest = gui.add_slider("Sharpness", 200, 2400, 100, session.look.longest, hint=hint)
         longest.on_update(lambda _: session.change(longest=int(longest.value)))
-        gui.add_button("Screenshot", hint="as .png, of the size of the window").on_click(
-            lambda _: session.ask(self._screenshot)
-        )
+        screenshot = gui.add_button("Screenshot", hint="as .png, of the size of the window")
+        screenshot.on_click(lambda _: session.ask(self._screenshot))
         gui.add_button("Back to start").on_click(lambda _: self._browsing.go_to(None))
 
     def _add_time(self, gui: viser.GuiApi) -> None:
@@ -129,17 +103,12 @@ class Controls:
         slider = gui.add_slider("Time", 0.0, 1.0, 0.001, round(session.time, 3))
         slider.on_update(lambda event: None if event.client_id is None else session.set_time(float(slider.value)))
         play = gui.add_button("Pause" if session.timeline.playing else "Play")
-
-        def toggle(_: Any) -> None:
-            session.change_timeline(playing=not session.timeline.playing)
-
-        play.on_click(toggle)
+        play.on_click(lambda _: session.change_timeline(playing=not session.timeline.playing))
         session.on_play = lambda playing: setattr(play, "label", "Pause" if playing else "Play")
         loop = gui.add_checkbox("Loop", session.timeline.loops)
         loop.on_update(lambda _: session.change_timeline(loops=bool(loop.value)))
-        speed = gui.add_dropdown(
-            "Speed", SPEEDS, initial_value=f"{session.timeline.speed:g}", hint="1: as it was filmed"
-        )
+        shown = f"{session.timeline.speed:g}"
+        speed = gui.add_dropdown("Speed", SPEEDS, initial_value=shown, hint="1: as it was filmed")
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
         self._browsing.time_slider = slider
 
@@ -185,29 +154,26 @@ class Controls:
 
         browsing.session.ask(load, "scene")
 
-    def _predicted(self, opened: Opened) -> None:
-        """Show the person as predicted from other images, from the same camera."""
-        browsing = self._browsing
-        browsing.session.show(opened)
-        browsing.client.add_notification("Predicted", opened.notes[-1], auto_close_seconds=8.0)
-
     def _screenshot(self) -> None:
         """Send what is shown as a .png, in the thread that draws."""
-        browsing = self._browsing
-        if browsing.session.eye is None:
+        from PIL import Image
+
+        session, stream = self._browsing.session, io.BytesIO()
+        if session.eye is None:
             return
-        image = draw(browsing.session.opened, browsing.session.shot())
-        name = f"{browsing.session.opened.name}_{browsing.session.time:.3f}.png"
-        browsing.client.send_file_download(name, png_of(image), save_immediately=True)
+        Image.fromarray(draw(session.opened, session.shot())).save(stream, "png")
+        name = f"{session.opened.name}_{session.time:.3f}.png"
+        self._browsing.client.send_file_download(name, stream.getvalue(), save_immediately=True)
+
+
+def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
+    gui.add_markdown(HELP)
+    for note in opened.notes:
+        gui.add_markdown(f"*{note}*")
 
 
 def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None:
-    """Add the motion picker and the sliders of the pose.
-
-    Args:
-        browsing: the browser, which has loaded a person.
-        motions: motion files by name.
-    """
+    """Add the motion picker, for files by name, and the sliders of the pose."""
     gui, session = browsing.client.gui, browsing.session
     angles: dict[str, tuple[float, float, float]] = {}
     motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *motions))
@@ -245,14 +211,8 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
     gui.add_button("All joints at rest").on_click(reset)
 
 
-def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callable[[Opened], None]) -> None:
-    """Add the choice of the images that a network predicts the person from.
-
-    Args:
-        browsing: the browser, which has loaded a person of the network.
-        network: the network.
-        show: is given what was predicted.
-    """
+def add_image_controls(browsing: Browsing, network: PeopleNetwork) -> None:
+    """Add the choice of the images that a network predicts the person from."""
     gui, session, person = browsing.client.gui, browsing.session, browsing.loaded.name
     names = (_NONE, *network.images_of(person))
     hint = f"none: {network.num_images} that see much of the person"
@@ -268,7 +228,8 @@ def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callabl
             finally:
                 note.remove()
             browsing.loaded = opened
-            show(opened)
+            session.show(opened)  # from the same camera
+            browsing.client.add_notification("Predicted", opened.notes[-1], auto_close_seconds=8.0)
 
         session.ask(work)
 
@@ -276,7 +237,6 @@ def add_image_controls(browsing: Browsing, network: PeopleNetwork, show: Callabl
 
 
 def add_path_controls(browsing: Browsing) -> None:
-    """Add the controls of the path that this browser records."""
     gui, session = browsing.client.gui, browsing.session
     recorded = [Recording()]
     status = gui.add_markdown("no keyframes yet")
@@ -290,29 +250,21 @@ def add_path_controls(browsing: Browsing) -> None:
     def add(_: Any) -> None:
         if session.eye is not None:
             time = None if session.opened.renderable.is_static else session.time
-            record(recorded[0].added(Keyframe(session.eye.camera(), time, float(seconds.value))))
+            keyframe = Keyframe(session.eye.camera(), time, float(seconds.value))
+            record(replace(recorded[0], keyframes=(*recorded[0].keyframes, keyframe)))
 
     def save(_: Any) -> None:
         if not len(recorded[0]):
             browsing.client.add_notification("No path", "Add a keyframe first.", auto_close_seconds=5.0)
             return
-        width, height = (2 * (side // 2) for side in recorded[0].keyframes[0].camera_size)  # as videos need it
-        opened = session.opened
+        opened, first = session.opened, recorded[0].keyframes[0].camera
+        width, height = (2 * (side // 2) for side in (first.width, first.height))  # as videos need it
         text = recorded[0].turned_back(opened.turned).document((width, height), FPS, opened.world_offset)
         browsing.client.send_file_download(FILE_NAME, text.encode(), save_immediately=True)
 
     gui.add_button("Add keyframe", hint="this camera, at this time").on_click(add)
-    gui.add_button("Remove last").on_click(lambda _: record(recorded[0].without_last()))
+    gui.add_button("Remove last").on_click(lambda _: record(replace(recorded[0], keyframes=recorded[0].keyframes[:-1])))
     loop = gui.add_checkbox("Back to the first", False)
-    loop.on_update(lambda _: record(Recording(recorded[0].keyframes, bool(loop.value))))
+    loop.on_update(lambda _: record(replace(recorded[0], loops=bool(loop.value))))
     gui.add_button("Preview").on_click(lambda _: session.preview(recorded[0]))
     gui.add_button("Save path", hint=f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}").on_click(save)
-
-
-def png_of(image: np.ndarray) -> bytes:
-    """Return an image (H, W, 3) uint8 as the bytes of a .png file."""
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "png")
-    return stream.getvalue()

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dyngs.data.times import evenly_spaced
 from dyngs.files.write import to_uint8
 from dyngs.runs.opened import Opened
-from dyngs.view.cameras import pose_of
+from dyngs.view.cameras import centers_of, fov_of, pose_of
 from dyngs.view.captured_views import viewpoint_of, views_of
-from dyngs.view.recording import fov_of
 
 if TYPE_CHECKING:
     from dyngs.view.server import Browsing
@@ -19,10 +19,9 @@ _COVERS = 1.5
 """Distance, in depths of a frustum, within which its image would cover what is behind."""
 MOST = 120
 """Frusta that are shown at most, spread evenly over the cameras."""
-_SIZE = 0.05
-"""Depth of a frustum relative to the distance of the cameras from what they see, at most."""
-_OF_SPREAD = 0.15
-"""The same relative to the distance of the cameras from their middle: those of a video stand close together."""
+_SIZE, _OF_SPREAD = 0.05, 0.15
+"""Depth of a frustum at most, relative to the distance of the cameras from what they see, and from their middle: those
+of a video stand close together."""
 
 
 class Frusta:
@@ -38,12 +37,11 @@ class Frusta:
         """Add the frusta, image by image, as the thread that draws finds time."""
         self.remove()
         generation = self._generation
-        places = distinct(views_of(opened).poses)
-        for index in (places[i] for i in spread(len(places), MOST)):
+        views = distinct(views_of(opened).poses)
+        for index in (views[i] for i in evenly_spaced(len(views), MOST)):
             self._browsing.session.ask(lambda index=index: self._add(opened, index, generation))
 
     def remove(self) -> None:
-        """Remove all frusta."""
         self._generation += 1
         handles, self._handles = self._handles, []
         for handle, _, _ in handles:
@@ -73,7 +71,7 @@ class Frusta:
             scale=size,
             thickness=0.03 * size,
             color=(230, 160, 30),
-            image=thumbnail(opened, index),
+            image=_thumbnail(opened, index),
             format="jpeg",
             wxyz=wxyz,
             position=position,
@@ -93,11 +91,6 @@ class Frusta:
                 self._browsing.time_slider.value = round(time, 3)
 
 
-def spread(count: int, most: int) -> list[int]:
-    """Return at most ``most`` indices, evenly spread over ``count``."""
-    return sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist())) if count else []
-
-
 def distinct(poses: np.ndarray) -> list[int]:
     """Return the indices of the first view from each pose of (V, 4, 4), ascending: a fixed camera is shown once."""
     _, first = np.unique(poses.round(6).reshape(len(poses), -1), axis=0, return_index=True)
@@ -106,12 +99,12 @@ def distinct(poses: np.ndarray) -> list[int]:
 
 def frustum_size(poses: np.ndarray, extent: float) -> float:
     """Return the depth of the frusta of poses (V, 4, 4), world units; ``extent`` is the distance of what they see."""
-    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    centers = centers_of(poses)
     spread_out = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
     return min(_SIZE * extent, _OF_SPREAD * spread_out) if spread_out > 1e-4 * extent else _SIZE * extent
 
 
-def thumbnail(opened: Opened, index: int) -> np.ndarray | None:
+def _thumbnail(opened: Opened, index: int) -> np.ndarray | None:
     """Return the small image (h, w, 3) uint8 of a view, None where there is none."""
     loader = views_of(opened).thumbnails
     return None if loader is None else to_uint8(loader[index].composite(opened.background).clamp(0, 1).numpy())

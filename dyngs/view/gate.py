@@ -23,7 +23,7 @@ COOKIE = "dyngs_view"
 
 @dataclass(frozen=True)
 class Gate:
-    """Decision on requests by their headers.
+    """Decision on requests, of HTTP or of a websocket, by their paths with the query and their headers.
 
     Attributes:
         token: that a request has to bring, in the link or as the cookie that the link gives; None: requests must be
@@ -33,12 +33,7 @@ class Gate:
     token: str | None = None
 
     def refusal(self, path: str, headers: Mapping[str, str]) -> str | None:
-        """Return why a request is refused, or None.
-
-        Args:
-            path: of the request, with its query.
-            headers: of the request, of HTTP or of a websocket.
-        """
+        """Return why a request is refused, or None."""
         host = headers.get("Host", "")
         origin = headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
@@ -82,28 +77,24 @@ def link_to(host: str, port: int, token: str | None = None) -> str:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return the port to listen on.
-
-    Args:
-        host: address to listen on.
-        port: that is wanted; None: 8080, or the next that is free.
-
-    Raises:
-        DyngsError: the port is taken or not allowed, or ``host`` is not an address of this machine.
-    """
-    tried = [port] if port is not None else [*range(DEFAULT_PORT, DEFAULT_PORT + 50), 0]
-    for candidate in tried:
+    """Return the port to listen on: ``port``; None: 8080, or the next that is free. Raises DyngsError."""
+    for candidate in [port] if port is not None else [*range(DEFAULT_PORT, DEFAULT_PORT + 50), 0]:
         try:
             return _bound(host, candidate)
         except OSError as error:
-            if error.errno == errno.EADDRINUSE and candidate != tried[-1]:
-                continue
             if error.errno == errno.EADDRINUSE:
-                raise DyngsError(f"--port {port}: taken; choose another, or leave it out to get a free one") from error
+                if port is None:
+                    continue
+                raise port_taken(port) from error
             if error.errno == errno.EACCES:
                 raise DyngsError(f"--port {port}: not allowed for this user; choose one above 1023") from error
             raise DyngsError(f"--host {host}: cannot listen there ({error.strerror or error})") from error
-    raise AssertionError("the last candidate returns or raises")
+    raise AssertionError("the last candidate is never taken")
+
+
+def port_taken(port: int) -> DyngsError:
+    """Return the error for a port that another program listens on."""
+    return DyngsError(f"--port {port}: taken; choose another, or leave it out to get a free one")
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from dyngs.conventions import SH_C0
 from dyngs.export.contact_sheet import color_map, depth_to_rgb
 from dyngs.files.write import to_uint8
 from dyngs.gaussians.scene import GaussianTimeStep, Scene
-from dyngs.models.renderable import Renderable, Rendering, TimeStep
+from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import views_of
 
@@ -38,9 +38,7 @@ class Shot:
 
     Attributes:
         camera: one camera, of the size of the image.
-        time: of the scene; None: the first.
         layer: what is shown; "error" needs ``view``.
-        part: which Gaussians are drawn.
         view: the view of the capture whose camera, time and truth are shown instead; None: no truth.
         divide: fraction of the width that shows the render; the truth is on the right of it.
     """
@@ -74,13 +72,7 @@ def draw(opened: Opened, shot: Shot) -> np.ndarray:
 
 
 def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the true image of a view as large as it fits into a window, (H, W, 3), NaN beside it; None without one.
-
-    Args:
-        opened: with a capture.
-        view: index of the view.
-        size: width and height of the window, px.
-    """
+    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 3), NaN next to it."""
     images = views_of(opened).images
     if images is None:
         return None
@@ -124,21 +116,12 @@ def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> n
 
 def _rendering(opened: Opened, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
-    scene = _part(opened, part)
+    scene = opened.renderable if part == "all" else opened.once(part, lambda: opened.scene.part(part))
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)
     if part not in kept or kept[part][0] != time:
         kept[part] = time, scene.time_step(time)
     options = replace(scene.options, depth="expected") if with_depth else None
     return scene.render(camera, kept[part][1], options=options).to(device="cpu")
-
-
-def _part(opened: Opened, part: Part) -> Renderable:
-    """Return the scene, or only what moves of it, or only what does not."""
-    match part:
-        case "all":
-            return opened.renderable
-        case "moving" | "still":
-            return opened.once(part, lambda: opened.scene.part(part))
 
 
 def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> np.ndarray:

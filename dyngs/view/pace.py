@@ -1,4 +1,4 @@
-"""How large images are drawn: small while something moves, so that they come often; whole when all is still."""
+"""How large images are drawn: small while something moves, so that they come often; full when all is still."""
 
 from __future__ import annotations
 
@@ -39,37 +39,29 @@ class _Mean:
 class Pace:
     """Number of pixels that can be drawn within ``target`` seconds, by how long the last images took.
 
-    Seconds are taken to be a + b * pixels: a is for the Gaussians, whatever the size of the image.
-
-    Args:
-        target: seconds that drawing and sending an image may take while something moves.
-        longest: seconds that any image may take.
+    Seconds are taken to be a + b * pixels: a is for the Gaussians, whatever the size of the image. Refined images may
+    take ``longest`` seconds. ``area``: pixels of an image while something moves.
     """
 
     def __init__(self, target: float, longest: float = math.inf) -> None:
         self._target, self._longest = target, longest
-        self._area = float(FIRST_AREA)
+        self.area = float(FIRST_AREA)
         self._moving, self._refined = _Mean(), _Mean()
-
-    @property
-    def area(self) -> float:
-        """Pixels of an image while something moves."""
-        return self._area
 
     @property
     def largest(self) -> float:
         """Most pixels of a refined image."""
         if not self._moving.count or math.isinf(self._longest):
             return math.inf
-        return max(self._area_within(self._longest), self._area)
+        return max(self._area_within(self._longest), self.area)
 
     def observe(self, pixels: float, seconds: float, *, is_refined: bool) -> None:
         """Note how long an image took: a small one while something moves, or a refined one."""
         (self._refined if is_refined else self._moving).add(pixels, seconds)
         if not self._moving.count:
             return
-        factor = min(max(self._area_within(self._target) / self._area, 0.5), 2.0)
-        self._area = max(self._area * math.sqrt(factor), SMALLEST_AREA)
+        factor = min(max(self._area_within(self._target) / self.area, 0.5), 2.0)
+        self.area = max(self.area * math.sqrt(factor), SMALLEST_AREA)
 
     def _area_within(self, seconds: float) -> float:
         """Return the pixels that can be drawn within ``seconds``."""
@@ -86,13 +78,8 @@ class Pace:
         return max(slope, least * small.seconds / small.pixels, 1e-12)
 
     def next_area(self, full: int, drawn: float | None) -> float:
-        """Return the pixels to draw next, at most ``full``.
-
-        Args:
-            full: pixels of the window.
-            drawn: of the image that is shown, if nothing has changed since; None: something moves.
-        """
-        return min(float(full), self._area if drawn is None else max(_REFINES_BY * drawn, self._area))
+        """Return the pixels to draw next, of ``full``; ``drawn``: of what is shown, None where something moves."""
+        return min(float(full), self.area if drawn is None else max(_REFINES_BY * drawn, self.area))
 
 
 def size_within(size: tuple[int, int], area: float) -> tuple[int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,11 +27,7 @@ Angles = Mapping[str, tuple[float, float, float]]
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:
-    """Return the motion files in a folder, or the file itself, by name; empty for None.
-
-    Raises:
-        DyngsError: no such file or folder, or none in it.
-    """
+    """Return the motion files in a folder, or the file itself, by name; empty for None. Raises DyngsError."""
     if path is None:
         return {}
     if path.is_file():
@@ -46,16 +41,9 @@ def motion_files(path: Path | None) -> dict[str, Path]:
 
 
 def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles) -> Opened:
-    """Return the person of ``opened``, as it was loaded, in one of the motions.
+    """Return the person of ``opened`` in a motion: as captured, at rest, by the ``angles`` of sliders, or of a file.
 
-    Args:
-        opened: a person in the motion of the capture.
-        choice: ``AS_CAPTURED``, ``AT_REST``, ``BY_SLIDERS`` or the name of a file.
-        files: by name.
-        angles: of the sliders.
-
-    Raises:
-        DyngsError: the file cannot be read.
+    Raises DyngsError: the file cannot be read.
     """
     if choice == AS_CAPTURED:
         return opened
@@ -65,7 +53,9 @@ def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: An
 
 
 def posed(opened: Opened, angles: Angles) -> Opened:
-    """Return the person of ``opened`` in the rest pose with joints turned by ``angles``."""
+    """Return the person of ``opened`` in the rest pose with joints rotated by ``angles``."""
+    from scipy.spatial.transform import Rotation
+
     person = opened.person
     if person is None:
         raise ValueError("only a person can be posed")
@@ -73,19 +63,10 @@ def posed(opened: Opened, angles: Angles) -> Opened:
     poses = clip.poses.clone()
     for name, turns in angles.items():
         row = joint_row(name, poses.shape[1])
-        poses[0, row] = _composed(poses[0, row], turns)
+        rest = Rotation.from_rotvec(poses[0, row].double().cpu().numpy())
+        poses[0, row] = torch.from_numpy((rest * Rotation.from_euler("xyz", turns, degrees=True)).as_rotvec()).to(poses)
     return replace(opened, renderable=person.playing(replace(clip, poses=poses)), as_captured=False)
 
 
 def joint_row(name: str, count: int) -> int:
-    """Return the row of a joint of a body with ``count`` joints."""
     return SMPLX_ROWS[count].index(JOINT_NAMES.index(name))
-
-
-def _composed(rest: torch.Tensor, degrees: tuple[float, float, float]) -> torch.Tensor:
-    """Return the axis-angle (3,) of ``rest`` (3,) after turns about x, y and z."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_euler("xyz", [math.radians(value) for value in degrees])
-    whole = Rotation.from_rotvec(rest.double().cpu().numpy()) * turn
-    return torch.from_numpy(whole.as_rotvec()).to(rest)

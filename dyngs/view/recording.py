@@ -11,7 +11,6 @@ import numpy as np
 from dyngs.camera import Cameras
 from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
 from dyngs.splats.rotation import with_scene
-from dyngs.view.cameras import camera_at, pose_of
 
 
 @dataclass(frozen=True)
@@ -21,11 +20,6 @@ class Keyframe:
     camera: Cameras
     time: float | None
     seconds: float = 1.0
-
-    @property
-    def camera_size(self) -> tuple[int, int]:
-        """Width and height of the window that it was recorded in, px."""
-        return self.camera.width, self.camera.height
 
 
 @dataclass(frozen=True)
@@ -43,16 +37,8 @@ class Recording:
         """Seconds of the path; those after the last keyframe count only in a loop."""
         return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
 
-    def added(self, keyframe: Keyframe) -> Recording:
-        """Return the recording with one more keyframe at the end."""
-        return replace(self, keyframes=(*self.keyframes, keyframe))
-
-    def without_last(self) -> Recording:
-        """Return the recording without its last keyframe."""
-        return replace(self, keyframes=self.keyframes[:-1])
-
     def turned_back(self, rotation: tuple[float, float, float, float]) -> Recording:
-        """Return the path as it is seen before a scene was turned by ``rotation``, wxyz."""
+        """Return the path as it is seen before a scene was rotated by ``rotation``, wxyz."""
         w, x, y, z = rotation
         keys = (replace(key, camera=with_scene(key.camera, (w, -x, -y, -z))) for key in self.keyframes)
         return replace(self, keyframes=tuple(keys))
@@ -62,13 +48,7 @@ class Recording:
         return np.concatenate([[0.0], np.cumsum([key.seconds for key in self.keyframes[:-1]])]).tolist()
 
     def document(self, size: tuple[int, int], fps: float, world_offset: np.ndarray) -> str:
-        """Return the path as JSON, in the coordinates of the capture's files.
-
-        Args:
-            size: width and height of the images, px; focal lengths follow the height.
-            fps: frames per second.
-            world_offset: (3,) as ``Capture.world_offset``.
-        """
+        """Return the path as JSON, in the coordinates of the capture's files; focal lengths follow the height, px."""
         width, height = size
         keys: list[dict[str, Any]] = []
         for key, start in zip(self.keyframes, self.starts(), strict=True):
@@ -97,14 +77,3 @@ class Recording:
         pose, matrix = (first.cam_from_world.new_tensor(x) for x in (made.cam_from_world, made.intrinsics))
         camera = replace(first, cam_from_world=pose, intrinsics=matrix)
         return camera, None if made.times is None else float(made.times[0])
-
-
-def fov_of(camera: Cameras) -> float:
-    """Return the vertical field of view of one camera, rad."""
-    return 2 * float(np.arctan(0.5 * camera.height / float(camera.intrinsics[0, 1, 1])))
-
-
-def in_window(camera: Cameras, size: tuple[int, int]) -> Cameras:
-    """Return one camera as a window of ``size`` shows it: the same pose and vertical field of view."""
-    wxyz, position = pose_of(camera)
-    return camera_at(wxyz, position, fov_of(camera), size)

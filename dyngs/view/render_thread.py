@@ -11,11 +11,7 @@ from dyngs.view.session import Session
 
 
 class Drawer:
-    """Sessions, and the turn of each.
-
-    Args:
-        on_error: is told what went wrong for a session; the others go on.
-    """
+    """Sessions, and the turn of each; ``on_error`` is told what went wrong for one, the others go on."""
 
     def __init__(self, on_error: Callable[[Session, str], None]) -> None:
         self._on_error = on_error
@@ -27,19 +23,16 @@ class Drawer:
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        """All that are open."""
         with self._changed:
             return tuple(self._sessions)
 
     def add(self, session: Session) -> None:
-        """Draw for ``session`` from now on."""
         session.on_change = self._wake
         with self._changed:
             self._sessions.append(session)
             self._changed.notify_all()
 
     def remove(self, session: Session) -> None:
-        """Draw no more for ``session``."""
         session.close()
         self._failures.pop(session, None)
         with self._changed:
@@ -50,7 +43,7 @@ class Drawer:
     def draw_one(self) -> bool:
         """Do what is due for one session; return whether anything was."""
         session, wait = self._next()
-        if session is None or wait is None or wait > 0:
+        if session is None or wait > 0:
             return False
         self._turn(session)
         return True
@@ -69,24 +62,21 @@ class Drawer:
             self._thread.join(timeout=10)
 
     def _run(self) -> None:
-        while True:
+        while not self._is_stopped:
             session, wait = self._next()
-            with self._changed:
-                if self._is_stopped:
-                    return
-            if session is not None and wait is not None and wait <= 0:
+            if session is not None and wait <= 0 and not self._is_stopped:
                 self._turn(session)
                 continue
             with self._changed:
                 if not self._is_stopped:
-                    self._changed.wait(0.5 if wait is None else min(wait, 0.5))
+                    self._changed.wait(wait)
 
-    def _next(self) -> tuple[Session | None, float | None]:
-        """Return the session that is due first, the one that was served longest ago among equals, and when."""
-        best: tuple[Session | None, float | None] = (None, None)
+    def _next(self) -> tuple[Session | None, float]:
+        """Return the session that is due first, among equals that served longest ago, and when: within 0.5 s."""
+        best: tuple[Session | None, float] = (None, 0.5)
         for session in self.sessions:
             wait = session.due()
-            if wait is not None and (best[1] is None or wait < best[1]):
+            if wait is not None and wait < best[1]:
                 best = (session, wait)
         return best
 

@@ -15,7 +15,7 @@ from dyngs.errors import DyngsError
 from dyngs.runs.opened import Opened
 from dyngs.view.cameras import fitting_fov, look_point, pose_of
 from dyngs.view.captured_views import viewpoint_of, views_of
-from dyngs.view.gate import free_port, gate_for, guarded, link_to
+from dyngs.view.gate import free_port, gate_for, guarded, link_to, port_taken
 from dyngs.view.pace import Pace
 from dyngs.view.render_thread import Drawer
 from dyngs.view.session import Eye, Sent, Session
@@ -35,11 +35,9 @@ class Serving:
     """How the page is served.
 
     Attributes:
-        host: address to listen on.
-        port: that is asked for; None: 8080 or the next that is free.
+        port: None: 8080 or the next that is free.
         motions: motion files for people, by name.
-        target: seconds that an image may take while something moves.
-        longest: seconds that any image may take.
+        target, longest: seconds that an image may take while something moves, and at all.
         in_thread: images are drawn in a thread of the server; else by whoever calls ``drawer.draw_one``.
     """
 
@@ -52,13 +50,7 @@ class Serving:
 
 
 class Browsing:
-    """One browser: its connection, its session, and the images that went to it.
-
-    Args:
-        client: viser's handle of it.
-        opened: what it looks at first.
-        pace: how large its images are.
-    """
+    """One browser: its connection, its session, and the images that went to it; ``opened`` is what it sees first."""
 
     def __init__(self, client: viser.ClientHandle, opened: Opened, pace: Pace) -> None:
         self.client = client
@@ -123,12 +115,7 @@ class Browsing:
 class Viewer:
     """A page that shows scenes to any number of browsers, each with its own camera, time and settings.
 
-    A context manager: the page is there from ``__enter__`` on.
-
-    Args:
-        source: scenes to choose from.
-        first: the scene that a new browser sees.
-        serving: how the page is served.
+    A context manager: the page is there from ``__enter__`` on. A new browser sees the scene ``first``.
 
     Raises:
         DyngsError: viser is not installed, or the port cannot be had.
@@ -149,7 +136,7 @@ class Viewer:
             self.server = viser.ViserServer(host=serving.host, port=port, verbose=False)
         if serving.port is not None and self.server.get_port() != serving.port:
             self.server.stop()
-            raise DyngsError(f"--port {serving.port}: taken; choose another, or leave it out to get a free one")
+            raise port_taken(serving.port)
         self._prepare()
 
     @property
@@ -171,9 +158,6 @@ class Viewer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def stop(self) -> None:
         """Close the page; browsers that show it say so."""
         for browsing in self.browsing:
             self.drawer.remove(browsing.session)

@@ -14,15 +14,14 @@ import numpy as np
 
 from dyngs.camera import Cameras
 from dyngs.runs.opened import Opened
-from dyngs.view.cameras import camera_at, nearest_camera
+from dyngs.view.cameras import camera_at, in_window, nearest_camera
 from dyngs.view.captured_views import viewpoint_of, views_of
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.pace import STILL_AFTER, Pace, size_within
-from dyngs.view.recording import Recording, in_window
+from dyngs.view.recording import Recording
 
 _SHORTEST = 1 / 30
 """Seconds between two images at least."""
-_DEFAULT_LONGEST = 1600
 
 
 @dataclass(frozen=True)
@@ -49,15 +48,9 @@ class Eye:
 
 @dataclass(frozen=True)
 class Timeline:
-    """The time that is shown.
+    """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
 
-    Attributes:
-        time: in [0, 1] when the clock read ``since``.
-        since: seconds of a monotonic clock.
-        playing: whether time passes.
-        loops: whether it begins again after 1; else it stops there.
-        speed: factor of the speed of the recording.
-        seconds: that the recording takes from time 0 to 1.
+    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or stops.
     """
 
     time: float = 0.0
@@ -78,15 +71,8 @@ class Timeline:
         """Return whether it plays without a loop and has reached the end."""
         return self.playing and not self.loops and self.at(clock) >= 1.0
 
-    def moved(self, time: float, clock: float) -> Timeline:
-        """Return the timeline set to ``time``; it plays on if it does."""
-        return replace(self, time=min(max(time, 0.0), 1.0), since=clock)
-
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
-        """Return the timeline with other ``playing``, ``loops``, ``speed`` or ``seconds``; the time does not jump.
-
-        Who plays from the end begins at 0.
-        """
+        """Return the timeline with other attributes; the time does not jump, but who plays from the end begins at 0."""
         now = replace(self, time=self.at(clock), since=clock)
         if changes.get("playing") and now.time >= 1.0:
             now = replace(now, time=0.0)
@@ -94,14 +80,13 @@ class Timeline:
 
 
 @dataclass(frozen=True)
-class Look:
+class Display:
     """What is shown.
 
     Attributes:
-        layer, part: as in ``Shot``.
-        comparing: show the truth beside the render.
+        layer, part, divide: as in ``Shot``.
+        comparing: show the truth next to the render.
         view: index of the view that is compared with; None: the nearest.
-        divide: fraction of the width that shows the render.
         longest: most pixels of the longer side of an image.
     """
 
@@ -110,7 +95,7 @@ class Look:
     comparing: bool = False
     view: int | None = None
     divide: float = 0.5
-    longest: int = _DEFAULT_LONGEST
+    longest: int = 1600
 
 
 @dataclass(frozen=True)
@@ -125,13 +110,8 @@ class Sent:
 class Session:
     """One browser's view of a scene.
 
-    Several threads tell it what has changed; one thread calls ``draw_next``, and gets the newest state.
-
-    Args:
-        opened: scene to look at.
-        send: passes an image to the browser.
-        pace: how large images are; None: fourteen a second while something moves, whole when all is still.
-        clock: monotonic seconds.
+    Several threads tell it what has changed; one thread calls ``draw_next``, and gets the newest state, for ``send``.
+    Images are as large as ``pace`` says: by default fourteen a second while something moves, full when all is still.
     """
 
     def __init__(
@@ -152,11 +132,10 @@ class Session:
         self._preview: tuple[Recording, float] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
-        self.opened, self.eye, self.look = opened, None, Look()
+        self.opened, self.look = opened, Display()
+        self.eye: Eye | None = None
         self.timeline = Timeline(seconds=opened.seconds)
         self.closed = False
-
-    eye: Eye | None
 
     def move(self, eye: Eye) -> bool:
         """Look from ``eye`` from now on; return False, and go on as before, where there is no such camera."""
@@ -170,15 +149,14 @@ class Session:
         return True
 
     def change(self, **changes: Any) -> None:
-        """Show something else: attributes of ``Look``."""
+        """Show something else: attributes of ``Display``."""
         with self._lock:
             self.look = replace(self.look, **changes)
         self._note_change()
 
     def set_time(self, time: float) -> None:
-        """Show another time."""
         with self._lock:
-            self.timeline = self.timeline.moved(time, self._clock())
+            self.timeline = replace(self.timeline, time=min(max(time, 0.0), 1.0), since=self._clock())
         self._note_change()
 
     def change_timeline(self, **changes: bool | float) -> None:
@@ -197,19 +175,13 @@ class Session:
                 self.look = replace(self.look, view=None)
         self._note_change()
 
-    def preview(self, recording: Recording | None) -> None:
-        """Show a recorded path once; None: end that."""
+    def preview(self, recording: Recording) -> None:
         with self._lock:
-            self._preview = (recording, self._clock()) if recording is not None and len(recording) else None
+            self._preview = (recording, self._clock()) if len(recording) else None
         self._note_change()
 
     def take(self, opened: Opened, *, refreshes: bool) -> None:
-        """Look at another state of the same scene; an image that is refined stays as large, and is drawn again.
-
-        Args:
-            opened: the newest state.
-            refreshes: draw it even if nothing else has changed.
-        """
+        """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing else has changed."""
         with self._lock:
             self.opened = opened
             self._is_stale = self._is_stale or refreshes
@@ -320,8 +292,7 @@ class Session:
 
     @property
     def _full_area(self) -> float:
-        width, height = self._full_size
-        return float(width * height)
+        return float(math.prod(self._full_size))
 
     @property
     def _refined_area(self) -> float:
@@ -330,12 +301,13 @@ class Session:
 
     def _end_of_play(self) -> None:
         now = self._clock()
-        if self.timeline.is_over(now):
+        stops = self.timeline.is_over(now)
+        if stops:
             self.timeline = self.timeline.changed(now, playing=False)
             self.on_play(False)
-            self._changed_at, self._is_stale = now, True
         if self._preview is not None and now - self._preview[1] > self._preview[0].duration:
-            self._preview = None
+            self._preview, stops = None, True
+        if stops:
             self._changed_at, self._is_stale = now, True
 
     def _note_change(self) -> None:

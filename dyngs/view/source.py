@@ -29,13 +29,7 @@ MOST_IMAGES = 5
 
 @dataclass(frozen=True)
 class PeopleNetwork:
-    """A trained network and captures of people.
-
-    Attributes:
-        run: run folder of the network.
-        people: by name.
-        num_images: that it was trained to predict from.
-    """
+    """A trained network, captures of people by name, and the number of images that it was trained to predict from."""
 
     run: Path
     people: dict[str, DataConfig]
@@ -43,11 +37,7 @@ class PeopleNetwork:
     _images: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def images_of(self, person: str) -> tuple[str, ...]:
-        """Return the names of the images of a person that can be predicted from.
-
-        Raises:
-            DyngsError: the capture cannot be read.
-        """
+        """Return the names of the images of a person that can be predicted from. Raises DyngsError."""
         if person not in self._images:
             views = read_capture(self.people[person]).splits["train"]
             self._images[person] = tuple(view.name for view in views)
@@ -57,7 +47,6 @@ class PeopleNetwork:
         """Return a person as the network predicts it.
 
         Args:
-            person: name.
             images: to predict from; without any, as many as in training, chosen to see much of the person.
             up: up axis; None: that of the capture.
 
@@ -75,8 +64,7 @@ class PeopleNetwork:
 def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
     """Return a network with the people it was trained on, or those of ``capture``: one, or a folder of them.
 
-    Raises:
-        DyngsError: not the run of a network, or no captures there.
+    Raises DyngsError: not the run of a network, or no captures there.
     """
     config, model = network_config(run)
     data = config.data if capture is None else config.data.model_copy(update={"root": capture.absolute()})
@@ -95,13 +83,7 @@ def _is_capture(data: DataConfig) -> bool:
 
 @dataclass(frozen=True)
 class Source:
-    """Scenes by name, loaded when they are chosen.
-
-    Attributes:
-        names: at least one.
-        load: returns the scene of a name. Raises DyngsError.
-        network: that predicts the people; None: scenes are loaded.
-    """
+    """Names of scenes, at least one, what loads the scene of a name, and the network if that is what makes them."""
 
     names: tuple[str, ...]
     load: Callable[[str], Opened]
@@ -118,10 +100,8 @@ def open_source(
     """Return what is to be seen of a run, a file, a folder of runs or a network; the first scene is not loaded yet.
 
     Args:
-        path: of it.
-        up: up axis; None: that of the capture, or of the file.
+        up, data_root: as in ``open_to_view``.
         capture: for a network: a person, or a folder of people.
-        data_root: where the capture of a run lies by now, if it was moved.
         device: draws the scenes.
 
     Raises:
@@ -151,7 +131,6 @@ def open_to_view(path: Path, name: str, up: str | None = None, data_root: Path |
     """Open a run or a file; where its capture is gone, a note says what lacks.
 
     Args:
-        path: of it.
         name: that it is shown by.
         up: up axis such as "z" or "-y"; None: that of the capture, or as the file or its format has it.
         data_root: where the capture of a run lies by now, if it was moved.
@@ -170,11 +149,7 @@ def open_to_view(path: Path, name: str, up: str | None = None, data_root: Path |
 
 
 def first_of(source: Source) -> Opened:
-    """Return the first scene that can be loaded; a note says which could not.
-
-    Raises:
-        DyngsError: none can; the error of the first.
-    """
+    """Return the first scene that can be loaded; a note says which could not. Raises DyngsError."""
     failed: list[DyngsError] = []
     for name in source.names:
         try:

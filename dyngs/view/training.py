@@ -36,11 +36,6 @@ class DrawnBetweenSteps:
 
     Without browsers a step costs one look at an empty list. Images change nothing of the training: they are drawn
     from a copy of the scene's shell, with caches of its own, and without gradients or random numbers.
-
-    Args:
-        drawer: of the browsers.
-        share: of the time that images may take.
-        clock: seconds.
     """
 
     def __init__(
@@ -51,11 +46,7 @@ class DrawnBetweenSteps:
         self._refreshed_at = -1e9
 
     def after_step(self, scene: Scene) -> float:
-        """Draw one image if one is due and time for it is left; return the seconds that it took.
-
-        Args:
-            scene: that is trained.
-        """
+        """Draw one image if one is due and time for it is left; return the seconds that it took."""
         sessions = self._drawer.sessions
         if not sessions:
             return 0.0
@@ -77,15 +68,9 @@ class DrawnBetweenSteps:
 
 
 class TrainingView:
-    """Listener that serves a page with the scene of a training; a context manager.
+    """Listener that serves a page with the scene of a training; a context manager. ``say`` is told the link.
 
-    Args:
-        config: of the run.
-        serving: how the page is served.
-        say: is told the link.
-
-    Raises:
-        DyngsError: a network is trained, which has no scene, viser is missing, or the port cannot be had.
+    Raises DyngsError: a network is trained, which has no scene, viser is missing, or the port cannot be had.
     """
 
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
@@ -95,7 +80,6 @@ class TrainingView:
         free_port(serving.host, serving.port)  # now, not after reading the capture
         self._say = say
         self._serving = replace(serving, in_thread=False, target=0.05, longest=0.3)
-        self._viewer: Viewer | None = None
         self._drawn: DrawnBetweenSteps | None = None
         self._stack = ExitStack()
 
@@ -107,35 +91,21 @@ class TrainingView:
 
     def __call__(self, event: Event) -> None:
         """Draw what browsers ask for, after a step."""
-        match event:
-            case StepDone():
-                if self._drawn is None:
-                    start = time.perf_counter()
-                    self._drawn = self._begin(event)
-                    took = time.perf_counter() - start
-                else:
-                    took = self._draw(event, self._drawn)
-                if took:
-                    event.loop.watch.pause(took)
+        if isinstance(event, StepDone) and isinstance(event.loop.trainer, Trainer):
+            trainer, start = event.loop.trainer, time.perf_counter()
+            if self._drawn is None:
+                self._drawn = self._begin(opened_training(trainer))
+                took = time.perf_counter() - start
+            else:
+                took = self._drawn.after_step(trainer.model.scene)
+            if took:
+                event.loop.watch.pause(took)
 
-    def _draw(self, event: StepDone, drawn: DrawnBetweenSteps) -> float:
-        match event.loop.trainer:
-            case Trainer() as trainer:
-                return drawn.after_step(trainer.model.scene)
-            case _:
-                return 0.0
-
-    def _begin(self, event: StepDone) -> DrawnBetweenSteps:
+    def _begin(self, first: Opened) -> DrawnBetweenSteps:
         """Serve the page, now that there is a scene."""
-        match event.loop.trainer:
-            case Trainer() as trainer:
-                first = opened_training(trainer)
-            case _:
-                raise ValueError("what is trained has no scene")
-        viewer = Viewer(Source((first.name,), lambda _: first), first, self._serving)
-        self._viewer = self._stack.enter_context(viewer)
-        self._say(f"viewing: {self._viewer.link} (until the training ends)")
-        return DrawnBetweenSteps(self._viewer.drawer)
+        viewer = self._stack.enter_context(Viewer(Source((first.name,), lambda _: first), first, self._serving))
+        self._say(f"viewing: {viewer.link} (until the training ends)")
+        return DrawnBetweenSteps(viewer.drawer)
 
 
 def opened_training(trainer: Trainer[Any]) -> Opened:

@@ -32,10 +32,8 @@ WORDS = {
     "render": {"times", "view", "overrides"},
     "export": {"times", "overrides"},
     "tradeoff": {"overrides", "vary", "require", "minimize", "maximize"},
-    "bench deform": {"kind"},
     "config": {"overrides"},
     "docs": {"topic"},
-    "completion": {"line"},
 }
 """Arguments that are plain words, no paths; the paths among overrides are found by their keys."""
 

@@ -40,7 +40,7 @@ def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFi
         (". --vary prun", "no such setting"),
         (". --require psnr>30", "is no condition"),
         (". --minimize size", "no such metric"),
-        (". --rounds 0", "--rounds 0: give a whole number from 1 on"),
+        (". --rounds 0", "argument --rounds: '0' is not a number; write a whole number from 1"),
         (". ", "not a run folder"),
         (". --minimize mb --maximize psnr", "not allowed with"),
     ],

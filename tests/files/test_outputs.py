@@ -10,7 +10,7 @@ import pytest
 
 from dyngs.errors import DyngsError
 from dyngs.files import outputs
-from dyngs.files.outputs import SOURCES_NAME, Inputs, new_capture, note_sources, require_new_folder
+from dyngs.files.outputs import SOURCES_NAME, Inputs, new_folder, note_sources, require_new_folder
 
 
 def filled(root: Path) -> Path:
@@ -137,7 +137,7 @@ def test_a_made_capture_stands_for_the_video_it_is_made_of(tmp_path: Path) -> No
 
 
 def stopped(out: Path, error: type[BaseException]) -> None:
-    with new_capture(out) as started:
+    with new_folder(out) as started:
         (started / "1.jpg").write_text("half")
         raise error
 
@@ -148,7 +148,7 @@ def test_a_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
         with pytest.raises(error):
             stopped(out, error)
         assert list(tmp_path.iterdir()) == []
-    with new_capture(out) as started:
+    with new_folder(out) as started:
         (started / "1.jpg").write_text("full")
         assert not out.exists()
     assert [path.name for path in tmp_path.iterdir()] == ["capture"]

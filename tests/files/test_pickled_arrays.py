@@ -20,7 +20,6 @@ def arrays() -> Arrays:
     ("module", "name", "known"),
     [
         ("numpy._core.multiarray", "_reconstruct", "numpy.core.multiarray._reconstruct"),
-        ("__builtin__", "set", "builtins.set"),
         ("scipy.sparse._csc", "csc_matrix", "scipy.sparse.csc_matrix"),
         ("chumpy.ch", "Ch", "chumpy.ch.Ch"),
     ],

@@ -347,7 +347,6 @@ OVERSIZED = {
     "partial whose state is set": b"c_codecs\nencode\n(c_codecs\nencode\n)}NtbN.",
     "partial of partial": b"cfunctools\npartial\n.",
     "hash of a deep tuple": b"}" + b"N" + b"\x85" * 200_000 + b"Ns.",
-    "hash of a deep tuple in a set": b"\x8f(" + b"N" + b"\x85" * MANY + b"\x90.",
     "hash of a doubled tuple": b"}" + doubled(60) + b"Ns.",
     "doubled tuples": doubled(60) + b".",
     "doubled tuples as text of a type": b"cnumpy\ndtype\n(" + doubled(60) + b"tR.",
@@ -407,7 +406,7 @@ def test_hostile_pickles_cost_little_and_end_in_one_line(tmp_path: Path, name: s
     assert seconds < 30  # untraced they take a second at most
 
 
-@pytest.mark.parametrize(("what", "step"), [("containers", b"\x8f"), ("remembered values", b"\x94")])
+@pytest.mark.parametrize(("what", "step"), [("containers", b"]"), ("remembered values", b"\x94")])
 def test_instructions_of_one_byte_that_take_hundreds(
     tmp_path: Path, what: str, step: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -449,7 +448,6 @@ def test_a_variable_allows_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_what_writers_do_beside_lists_and_dictionaries(tmp_path: Path, protocol: int) -> None:
     shared = {"a": [1, 2.5]}
     tree = {
-        "sets": [{1, 2}, frozenset({"a", b"b"}), set()],
         "ordered": OrderedDict([("z", 1), ("y", 2)]),
         "shared": [shared, shared],
         "numbers": [2**200, -(2**200), 0, 255, 256, -1, 2**31, 1e300, float("inf"), True, False],

@@ -17,13 +17,13 @@ from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.config.io import load_resolved
-from dyngs.demo import unused_folder
+from dyngs.demo import is_unused
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.export.splat_files import write_run_sequence
-from dyngs.files.outputs import require_new_folder
+from dyngs.files.outputs import new_folder, require_new_folder
 from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_checkpoint, load_run, save_checkpoint
-from dyngs.runs.folder import default_folder, new_folder, tidy
+from dyngs.runs.folder import default_folder, require_empty, tidy
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 from dyngs.runs.log import RunLog
 
@@ -79,7 +79,7 @@ COMMANDS: dict[str, Command] = {
     "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),
     "synth": lambda capture, run, out: require_new_folder(out),
     "sequence": lambda capture, run, out: write_run_sequence(load_run(run), out, (0.0, 1.0)),
-    "demo": lambda capture, run, out: _require(unused_folder(out) == out),
+    "demo": lambda capture, run, out: _require(is_unused(out)),
 }
 
 
@@ -261,15 +261,15 @@ def test_the_time_of_a_checkpoint_is_there_as_soon_as_it_is(
 
 def test_a_new_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with pytest.raises(DyngsError), new_folder(out) as started:
+    with pytest.raises(DyngsError), new_folder(out, require_empty) as started:
         _require(not _filled(started, {"a": ""}).is_dir())
     assert not list(tmp_path.iterdir())
     out.mkdir()
     (out / LOCK_NAME).touch()  # of a process that was killed
-    with new_folder(out) as started:
+    with new_folder(out, require_empty) as started:
         (started / "a").touch()
     assert [path.name for path in out.iterdir()] == ["a"]
-    with pytest.raises(DyngsError, match="exists already"), new_folder(tmp_path / "new") as started:
+    with pytest.raises(DyngsError, match="exists already"), new_folder(tmp_path / "new", require_empty) as started:
         _filled(tmp_path / "new", {"b": "of somebody else"})
     assert _contents(tmp_path) == {"out/a": b"", "new/b": b"of somebody else"}
 

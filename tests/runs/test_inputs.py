@@ -32,15 +32,14 @@ from dyngs.runs.opened import open_run
 PACKAGE = Path(dyngs.__file__).parent
 
 WRITERS = {"atomic_file", "write_text", "write_image", "VideoWriter", "write_tensors", "save_config"}
-CHECKS = {"require_output", "require_empty", "require_new_folder", "new_folder", "new_capture", "folder_of_export"}
+CHECKS = {"require_output", "require_empty", "require_new_folder", "new_folder", "folder_of_export"}
 ROOMS_BELOW = ("files/", "config/", "runs/", "data/images/", "splats/", "ops/")
 """Rooms of writers that are handed what they write, or that keep the run folder and the caches of dyngs itself."""
 VALUES = "is handed values, and reads no file that it could replace; the command checks its arguments"
 OWN = "in a run folder, or in a hidden folder, that its caller has made and checked"
 UNCHECKED = {
     "api/choose.py:write_choices": OWN,
-    "bench/deform.py:write_report": VALUES,
-    "bench/rasterize.py:write_report": VALUES,
+    "bench.py:write_report": VALUES,
     "budget/size.py:write_within": OWN,
     "camera_paths/path.py:write_path": VALUES,
     "capture/background.py:with_background_masks": OWN,
@@ -52,6 +51,7 @@ UNCHECKED = {
     "capture/sfm_work.py:working": OWN,
     "capture/sfm_work.py:write_report": OWN,
     "data/times.py:write_seconds": OWN,
+    "demo.py:run_demo": "in a folder that is empty, and locked",
     "data/tracks.py:write_true_tracks": OWN,
     "evaluate/report.py:evaluate_run": "checks it in _require_possible",
     "export/tracks.py:write_tracks": VALUES,
@@ -60,7 +60,7 @@ UNCHECKED = {
     "human/fit/inputs.py:read_person": OWN,
     "human/motion/amass.py:write_amass": VALUES,
     "storage/file.py:write_scene": VALUES,
-    "tradeoff/measurements.py:write_measurement": OWN,
+    "tradeoff/measure.py:write_measurement": OWN,
     "tradeoff/report.py:write_report": OWN,
 }
 """Functions that write without a check of their own, each with its reason."""

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.tradeoff.measurements import Measurement, Quartiles, Speed, on_front, pareto_mask
+from dyngs.tradeoff.measure import Measurement, Quartiles, Speed, on_front, pareto_mask
 from dyngs.tradeoff.pareto import combinations, exchange_rates, rate, slope
 from dyngs.tradeoff.variants import Variant
 

@@ -4,36 +4,30 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from moving_scene import write_moving_run
 from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.train import num_cores, train
+from dyngs.api.train import train
 from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.scene import render_options
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
-from dyngs.tradeoff.measure import render_options_of
-from dyngs.tradeoff.measurements import Measurement, read_measurement
+from dyngs.tradeoff.measure import Measurement, read_measurement, render_options_of
 from dyngs.tradeoff.report import write_report
-from dyngs.tradeoff.sweep import SINGLE_PROCESS, Plan, ProcessGroup, sweep
+from dyngs.tradeoff.sweep import Plan, sweep
 from dyngs.tradeoff.table import table_rows
 from dyngs.tradeoff.variant_runs import VariantRuns, field_changes, run_settings, write_chosen
 from dyngs.tradeoff.variants import Variant, parse_variations
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SETTINGS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
-PLAN = Plan(parse_variations(SETTINGS, trains=False), finetune=2, combine=2, rounds=1, threads=1)
+PLAN = Plan(parse_variations(SETTINGS, trains=False), finetune=2, combine=2, rounds=1)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +97,7 @@ def test_points_of_something_else_do_not_mix(points: list[Measurement], runs: Va
 
 
 def test_on_a_gpu_quality_is_the_same(runs: VariantRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    briefly = replace(PLAN, variations=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
+    briefly = replace(PLAN, settings=parse_variations(("prune=0.5",), trains=False), finetune=0, combine=0)
     expected = sweep(VariantRuns(runs.run_dir, tmp_path / "here", 1), briefly, lambda line: None)
     monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
@@ -183,7 +177,7 @@ def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns,
 
 def test_what_cannot_be_varied_is_named(runs: VariantRuns) -> None:
     said: list[str] = []
-    sweep(runs, replace(PLAN, variations=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
+    sweep(runs, replace(PLAN, settings=parse_variations(["sh_degree=3"], trains=False), combine=0), said.append)
     assert said == ["nothing to vary in this run: sh_degree"]
 
 
@@ -207,58 +201,3 @@ def test_a_damaged_point_says_what_to_do(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(DyngsError, match=r"x\.json: .* no measurement of a variant: remove it"):
             read_measurement(path)
-
-
-VARIANTS = st.builds(
-    Variant,
-    colour=st.sampled_from([None, "network"]),
-    prune=st.sampled_from([0.0, 0.5, 0.7]),
-    finetune=st.sampled_from([0, 9]),
-    sh_degree=st.sampled_from([None, 0]),
-    storage=st.sampled_from([None, "auto"]),
-    scale=st.sampled_from([1.0, 0.5]),
-)
-NAMES = {"RANK": "1", "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
-
-
-@given(st.lists(VARIANTS, unique=True, max_size=12), st.integers(1, 4))
-def test_all_is_shared_out_once(variants: list[Variant], size: int) -> None:
-    fractions = [ProcessGroup(rank, size).share(variants) for rank in range(size)]
-    assert sorted(v.slug for fraction in fractions for v in fraction) == sorted(v.slug for v in variants)
-
-
-def test_what_is_made_from_one_another_stays_together() -> None:
-    tuned = Variant(prune=0.5, finetune=9)
-    together = [tuned, Variant(prune=0.5, finetune=9, storage="auto"), Variant(prune=0.5, finetune=9, sh_degree=0)]
-    others = [Variant(alpha_min=0.01), Variant(storage="auto"), Variant(), Variant(storage="auto", scale=0.5)]
-    fractions = [ProcessGroup(rank, 2).share([*others, *together]) for rank in range(2)]
-    assert any(set(together) <= set(fraction) for fraction in fractions)
-    assert any({others[1], others[3]} <= set(fraction) for fraction in fractions)
-    assert all(fractions)
-
-
-def test_one_process_waits_for_nobody() -> None:
-    SINGLE_PROCESS.wait()
-    assert SINGLE_PROCESS.is_first
-    assert SINGLE_PROCESS.cores == num_cores()
-
-
-def test_what_torchrun_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in NAMES.items():
-        monkeypatch.delenv(name, raising=False)
-        assert ProcessGroup.from_environment() == SINGLE_PROCESS
-        monkeypatch.setenv(name, value)
-    assert ProcessGroup.from_environment() == ProcessGroup(1, 4, 2)
-    assert not ProcessGroup.from_environment().is_first
-    monkeypatch.setenv("RANK", "first")
-    with pytest.raises(DyngsError, match="RANK, WORLD_SIZE, LOCAL_WORLD_SIZE must be numbers"):
-        ProcessGroup.from_environment()
-
-
-def test_two_processes_make_one_report(tmp_path: Path) -> None:
-    run, out = write_moving_run(tmp_path), tmp_path / "out"
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "dyngs"]
-    words = ["tradeoff", str(run), "--out", str(out), "--vary", "scale=0.5", "--rounds", "1", "--threads", "1"]
-    subprocess.run([*torchrun, *words], check=True, capture_output=True, cwd=tmp_path)
-    rows = (out / "tradeoff.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows[1:]] == ["as it is", "scale=0.5"]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.variants import SETTINGS, RunSettings, Setting, Variant, parse_variations, single_changes
+from dyngs.tradeoff.variants import SETTINGS, RunSettings, Variant, Varied, parse_variations, single_changes
 
 VARIANTS = st.builds(
     Variant,
@@ -132,5 +132,5 @@ def test_a_setting_twice_is_refused() -> None:
 
 
 @pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.name)
-def test_defaults_of_settings_are_allowed(setting: Setting) -> None:
+def test_defaults_of_settings_are_allowed(setting: Varied) -> None:
     assert [setting.parsed(str(value)) for value in setting.values] == list(setting.values)

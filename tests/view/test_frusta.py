@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 from view_sessions import looking_at_balls
 
-from dyngs.view.frusta import Frusta, distinct, frustum_size, spread
-
-
-@pytest.mark.parametrize(("count", "most", "chosen"), [(0, 5, []), (3, 5, [0, 1, 2]), (11, 3, [0, 5, 10]), (1, 1, [0])])
-def test_frusta_are_spread_over_the_cameras(count: int, most: int, chosen: list[int]) -> None:
-    assert spread(count, most) == chosen
+from dyngs.view.frusta import Frusta, distinct, frustum_size
 
 
 def test_a_fixed_camera_is_shown_once() -> None:

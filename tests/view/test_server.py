@@ -166,7 +166,7 @@ def test_two_browsers_have_cameras_of_their_own_and_one_may_go(viewer: Viewer, b
 def test_a_dead_server_is_shown_as_such(viewer: Viewer, browser: Browser) -> None:
     page, _ = opened(viewer, browser)
     assert page.driven.get_by_text("Connected", exact=True).is_visible()
-    viewer.stop()
+    viewer.__exit__()
     page.driven.get_by_text("Connecting...").wait_for(timeout=15_000)
     assert not page.driven.get_by_text("Connected", exact=True).is_visible()
     page.close()

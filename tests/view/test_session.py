@@ -189,7 +189,7 @@ def test_the_scene_in_training_is_drawn_again_as_large_as_it_was() -> None:
 
 
 def test_time_passes_only_while_it_plays() -> None:
-    still = Timeline(seconds=4).moved(0.5, 10.0)
+    still = Timeline(time=0.5, since=10.0, seconds=4)
     assert still.at(99.0) == 0.5
     playing = still.changed(10.0, playing=True)
     assert playing.at(11.0) == pytest.approx(0.75)
@@ -208,5 +208,7 @@ def test_a_loop_begins_again_and_no_loop_ends() -> None:
 
 
 def test_a_time_that_is_set_stays_within_the_recording() -> None:
-    assert Timeline().moved(7.0, 0.0).time == 1.0
-    assert Timeline().moved(-7.0, 0.0).time == 0.0
+    session = Session(opened(), lambda sent: None)
+    for time, shown in ((7.0, 1.0), (-7.0, 0.0)):
+        session.set_time(time)
+        assert session.time == shown

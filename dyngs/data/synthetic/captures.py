@@ -13,7 +13,7 @@ from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, is_seen, render
 from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
-from dyngs.files.outputs import new_capture
+from dyngs.files.outputs import new_folder
 from dyngs.files.write import write_image, write_text
 
 
@@ -83,7 +83,7 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
         "val": orbit_cameras(options.num_val, options.distance, elevation_deg=45.0, start_deg=10.0),
         "test": orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0),
     }
-    with new_capture(out) as started:
+    with new_folder(out) as started:
         for split, poses in splits.items():
             shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
             _write_split(started, split, shots, lambda _: scene, options)
@@ -107,7 +107,7 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
         raise DyngsError("a synthetic capture needs size, num_times, num_cameras and samples of at least 1")
     splits = _room_shots(options) if name == "room" else _teleporting_shots(options)
     taken = [(shot.name, shot.time or 0.0, shot.world_from_cam) for shots in splits.values() for shot in shots]
-    with new_capture(out) as started:
+    with new_folder(out) as started:
         for split, shots in splits.items():
             _write_split(started, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options)
         write_true_tracks(started, true_tracks(lambda time: scene_at(name, time), taken, options.seed))

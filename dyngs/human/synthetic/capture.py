@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
-from dyngs.files.outputs import new_capture
+from dyngs.files.outputs import new_folder
 from dyngs.files.write import write_image, write_text
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
@@ -106,7 +106,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
         clips = {name: (walk if name == "train" else squat)(body, count) for name, count in lengths.items()}
     else:
         clips = {name: random_clip(body, n, 2 * seed + (name == "pose")) for name, n in lengths.items()}
-    with new_capture(out) as started:
+    with new_folder(out) as started:
         for name, clip in clips.items():
             motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
             meshes = list(_posed_meshes(clothed, motion, texture))

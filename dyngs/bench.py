@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.errors import reading
+from dyngs.errors import counted, reading
 from dyngs.files.numpy_files import read_arrays
 from dyngs.files.write import write_text
 from dyngs.ops.native import active_isa, kernel_threads
@@ -32,13 +32,7 @@ STAGES = ("project", "bin + sort", "blend", "blend backward", "project backward"
 
 @dataclass(frozen=True)
 class Workload:
-    """Gaussians and one camera, as inputs of the kernels.
-
-    Attributes:
-        means, quats, scales: (N, 3), (N, 4), (N, 3).
-        opacities: (N,).
-        colors: (1, N, 3).
-    """
+    """N Gaussians, with colours (1, N, 3), and one camera, as inputs of the kernels."""
 
     means: Tensor
     quats: Tensor
@@ -58,14 +52,7 @@ class Workload:
 
 @dataclass(frozen=True)
 class StageTimes:
-    """Times over the repeats, at one number of threads.
-
-    Attributes:
-        threads: threads of the kernels and of the matrix product.
-        milliseconds: median time by stage.
-        fastest: shortest time by stage.
-        sgemm_gflops: rate of a float32 matrix product of 2048 x 2048, measured between the repeats.
-    """
+    """Median and shortest times by stage, and the rate of a float32 matrix product, at one number of threads."""
 
     threads: int
     milliseconds: dict[str, float]
@@ -82,8 +69,7 @@ class RasterizeReport:
     """Results of ``dyngs bench rasterize``.
 
     Attributes:
-        entries: number of (tile, Gaussian) pairs.
-        pairs: number of blended (pixel, Gaussian) pairs.
+        entries, pairs: numbers of (tile, Gaussian) pairs, and of blended (pixel, Gaussian) pairs.
         lanes_used: fraction of the computed pairs that were blended.
         runs: times per number of threads; on a GPU one.
         device: "cpu", or the name of the GPU.
@@ -230,18 +216,18 @@ def _summary(threads: int, samples: dict[str, list[float]]) -> StageTimes:
 
 
 def write_report(report: RasterizeReport, path: Path) -> None:
-    """Write the report as JSON."""
     write_text(path, json.dumps(asdict(report), indent=2) + "\n")
 
 
 def format_report(report: RasterizeReport) -> str:
-    """Return the report as text."""
+    labels = [counted(run.threads, "thread") if report.device == "cpu" else "cuda" for run in report.runs]
+    preparing = [(run.milliseconds["project"] + run.milliseconds["bin + sort"]) / run.total for run in report.runs]
     lines = [
-        f"{report.num_gaussians:,} Gaussians, {report.num_visible:,} visible at {report.width}x{report.height}, "
-        f"{report.entries:,} tile entries, {report.pairs / 1e6:.1f} M blended pairs, "
+        f"{counted(report.num_gaussians, 'Gaussian')}, {report.num_visible:,} visible at "
+        f"{report.width}x{report.height}, {report.entries:,} tile entries, {report.pairs / 1e6:.1f} M blended pairs, "
         f"{report.lanes_used:.0%} of the lanes used; "
         + (f"instruction set {report.isa}" if report.device == "cpu" else report.device),
-        f"{'stage, median (best) ms':<26}" + "".join(f"{_label(report, run):>20}" for run in report.runs),
+        f"{'stage, median (best) ms':<26}" + "".join(f"{label:>20}" for label in labels),
     ]
     for name in STAGES:
         cells = [f"{run.milliseconds[name]:10.2f} ({run.fastest[name]:6.2f})" for run in report.runs]
@@ -249,7 +235,7 @@ def format_report(report: RasterizeReport) -> str:
     rows = [
         ("all stages", [f"{run.total:.2f}" for run in report.runs]),
         ("speed-up", [f"{report.runs[0].total / run.total:.2f}x" for run in report.runs]),
-        ("project + bin, share", [f"{_preparation_fraction(run):.0%}" for run in report.runs]),
+        ("project + bin, fraction", [f"{fraction:.0%}" for fraction in preparing]),
         ("sgemm, GFLOP/s", [f"{run.sgemm_gflops:.0f}" for run in report.runs]),
     ]
     for name in ("blend", "blend backward"):
@@ -259,11 +245,3 @@ def format_report(report: RasterizeReport) -> str:
         rows.append(("  per sgemm GFLOP/s", [f"{x:.2f}" for x in per_flop]))
     lines += [f"{name:<26}" + "".join(f"{cell:>20}" for cell in cells) for name, cells in rows]
     return "\n".join(lines)
-
-
-def _label(report: RasterizeReport, run: StageTimes) -> str:
-    return f"{run.threads} thread(s)" if report.device == "cpu" else "cuda"
-
-
-def _preparation_fraction(run: StageTimes) -> float:
-    return (run.milliseconds["project"] + run.milliseconds["bin + sort"]) / run.total

@@ -11,7 +11,7 @@ import torch
 from pretend_gpu import GPU, pretend_gpu
 from reference import project, rasterize
 
-from dyngs.bench.rasterize import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
+from dyngs.bench import STAGES, bench_rasterize, format_report, garden_workload, random_workload, write_report
 from dyngs.cli import main
 from dyngs.errors import DyngsError
 from dyngs.ops.projection import ProjectionOptions
@@ -20,7 +20,7 @@ from dyngs.ops.projection import ProjectionOptions
 @pytest.fixture(autouse=True)
 def small_product(monkeypatch: pytest.MonkeyPatch) -> None:
     """The matrix product beside the stages is a small one: no test asks how fast it is."""
-    monkeypatch.setattr("dyngs.bench.rasterize.SGEMM_SIZE", 64)
+    monkeypatch.setattr("dyngs.bench.SGEMM_SIZE", 64)
 
 
 def test_counts_agree_with_the_reference() -> None:

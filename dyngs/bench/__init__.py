@@ -1,1 +1,0 @@
-"""Benchmarks: speed of the rasterizer and of training steps of dynamic models on this machine."""

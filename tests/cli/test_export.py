@@ -1,0 +1,199 @@
+"""``dyngs export`` of cameras, pages and people with their skeleton, from the command line."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from bare_person import bare_run, bare_scene
+from gltf_skins import SkinnedGlb
+from moving_scene import write_moving_run
+
+import dyngs
+from dyngs.cli import main
+from dyngs.config import DataConfig
+from dyngs.data.geometry import camera_center
+from dyngs.data.read import read_capture
+from dyngs.human.motion.amass import write_amass
+from dyngs.human.motion.motion import Motion
+from dyngs.runs.avatar import write_avatar
+
+
+def run_of(still: Path, folder: Path, refine: str) -> Path:
+    keys = [f"data.root={still}", f"run.dir={folder}", "train.steps=30", "init.num_random=60", "run.threads=1"]
+    return dyngs.train(dyngs.load_config("static", [*keys, f"camera.refine={refine}"]))
+
+
+@pytest.fixture(scope="module")
+def refined(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_of(still, tmp_path_factory.mktemp("runs") / "refined", "always")
+
+
+def test_refined_cameras_are_a_capture_of_their_own(
+    refined: Path, still: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(refined), "--format", "cameras"]) == 0
+    said = capsys.readouterr()
+    assert f"written: {refined / 'cameras' / 'transforms.json'}" in said.out
+    assert "as training found them" in said.err + said.out
+    given = read_capture(still).splits
+    found = read_capture(DataConfig(root=refined / "cameras", follow_links=True)).splits
+    for moves in (True, False):
+        split = "train" if moves else "test"
+        there = {view.image_path.resolve(): camera_center(view.cam_from_world) for view in found[split]}
+        shifts = [np.abs(there[v.image_path.resolve()] - camera_center(v.cam_from_world)).max() for v in given[split]]
+        assert bool(max(shifts) > 1e-6) is moves
+
+
+def test_cameras_of_a_run_that_refined_none_are_those_of_the_capture(
+    still: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_of(still, tmp_path / "run", "never")
+    assert main(["export", str(run), "--out", str(tmp_path / "out" / "transforms.json")]) == 0
+    said = capsys.readouterr()
+    assert "the cameras of the capture" in said.err + said.out
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("--format cameras --time 0", "--time does not go with"),
+        ("--format cameras --static", "--static does not go with"),
+        ("--format cameras --out cameras.ply", "--format cameras does not write"),
+    ],
+)
+def test_what_does_not_go_with_cameras_is_one_line(
+    words: str, part: str, refined: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(refined), *words.split()]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert part in lines[0]
+
+
+def test_cameras_of_the_capture_are_not_written_over(
+    refined: Path, still: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(refined), "--format", "cameras", "--out", str(still)]) == 2
+    assert "is the folder that is read" in capsys.readouterr().err
+    assert main(["export", str(refined), "--format", "cameras", "--out", str(still / "transforms.json")]) == 2
+    assert "stand in for the cameras of the capture" in capsys.readouterr().err
+    assert not (still / "transforms.json").exists()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_run(tmp_path_factory.mktemp("moving"))
+
+
+def test_a_page_is_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(run), "--out", str(tmp_path / "scene.html")]) == 0
+    assert f"written: {tmp_path / 'scene.html'}" in capsys.readouterr().out
+    assert (tmp_path / "scene.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert main(["export", str(run), "--format", "html"]) == 0
+    assert (run / "scene.html").is_file()
+
+
+def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
+    dotted = shutil.copytree(run, tmp_path / "rc_0.2")
+    assert main(["export", str(dotted), "--format", "html"]) == 0
+    assert "<title>rc_0.2</title>" in (dotted / "scene.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("--format html --times 0:1:3", "plays the whole clip"),
+        ("--format html --static", "shows the whole scene"),
+        ("--format html --up y", "--from-up names its axis"),
+        ("--format html --sh-degree 3", "the colours of the run"),
+        ("--format html --max-change 3", "goes with --format dyngs"),
+        ("--format html --out page.pdf", "give --out page.html"),
+        ("--format html --motion walk.bvh", "needs the run of a person"),
+    ],
+)
+def test_what_does_not_go_with_a_page_is_one_line(
+    words: str, part: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", str(run), *words.split()]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert part in lines[0]
+
+
+def test_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(tmp_path / "none"), "--format", "html"]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def avatar(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_avatar(bare_run(bare_scene(resolution=24)), tmp_path_factory.mktemp("person") / "ann.safetensors")
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    poses = 0.3 * torch.randn(3, 55, 3, generator=torch.Generator().manual_seed(0))
+    path = tmp_path_factory.mktemp("motion") / "walk.npz"
+    write_amass(Motion(poses, torch.zeros(3, 3), torch.zeros(10), 10.0, torch.ones(3)), path)
+    return path
+
+
+def test_a_mesh_that_walks(avatar: Path, motion: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "ann.glb"
+    assert main(["export", str(avatar), "--format", "mesh", "--motion", str(motion), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert f"written: {out}" in said.out
+    assert "texture of 96 x 96" in said.out + said.err
+    found = SkinnedGlb(out)
+    assert (found.json["animations"][0]["name"], found.num_frames) == ("walk", 3)
+    assert abs(min(found.posed(frame)[:, 1].min() for frame in range(3))) < 1e-5
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_gaussians_with_joints(avatar: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"ann{suffix}"
+    assert main(["export", str(avatar), "--joints", "--out", str(out)]) == 0
+    assert (b"property float weight_7" if suffix == ".ply" else b"JOINTS_1") in out.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--format mesh", r"ann\.safetensors: where to\? Give --out FILE\.glb"),
+        ("--format mesh --out x.ply", "--format mesh does not write files of that suffix"),
+        ("--format mesh --out .", r"--format mesh writes one file; give --out"),
+        ("--format mesh --time 0 --out x.glb", "--time does not go with --format mesh"),
+        ("--format mesh --up y --out x.glb", "--up does not go with --format mesh"),
+        ("--format mesh --motion no.npz --out x.glb", r"no\.npz: no such file"),
+        ("--format mesh --joints --out x.glb", "--joints goes with --format ply and glb, not with mesh"),
+        ("--joints --out x.spz", "--joints goes with --format ply and glb, not with spz"),
+        ("--joints --static --out x.ply", "--static does not go with --joints"),
+        ("--joints --motion no.npz --out x.ply", "--motion does not go with --joints in a .ply"),
+    ],
+)
+def test_wrong_options_end_in_one_line(
+    avatar: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: str,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(avatar), *options.split()]) == 2
+    said = capsys.readouterr().err
+    assert re.search(words, said)
+    assert said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("options", [["--joints", "--out", "x.ply"], ["--format", "mesh"]])
+def test_a_scene_without_a_person(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]) -> None:
+    run = write_moving_run(tmp_path / "run")
+    assert main(["export", str(run), *options]) == 2
+    assert re.search(r"needs the run of a person \(model\.kind=human\), this one is", capsys.readouterr().err)
