@@ -71,7 +71,7 @@ std::vector<Chunk<S>> load_chunks(const PlanePoints<S>& points, const int32_t* o
 // Positions of a chunk's points between the samples of one level: index + frac, along each axis.
 template <class S>
 struct Cells {
-  typename Packet<S>::Int index[kAxes][kLanes];
+  int32_t index[kAxes][kLanes];
   Packet<S> frac[kAxes];
 };
 
@@ -80,8 +80,7 @@ Cells<S> locate_chunk(const Chunk<S>& chunk, int64_t size) {
   Cells<S> cells;
   for (int a = 0; a < kAxes; ++a) {
     const Cell<Packet<S>> cell = locate(Packet<S>::load(chunk.coords[a]), size);
-    const auto index = __builtin_convertvector(cell.index.v, typename Packet<S>::IntVec);
-    std::memcpy(cells.index[a], &index, sizeof index);
+    for (int i = 0; i < kLanes; ++i) cells.index[a][i] = static_cast<int32_t>(cell.index[i]);
     cells.frac[a] = cell.frac;
   }
   return cells;

@@ -79,7 +79,7 @@ std::vector<S> joint_rows(const Posing<S>& in) {
 // As many of a packet's lanes as a register holds: a covariance needs dozens of numbers at a time.
 template <class S>
 Native<S> part(const Packet<S>& x, int lane) {
-  return Native<S>::load(reinterpret_cast<const S*>(&x.v) + lane);
+  return Native<S>::load(reinterpret_cast<const S*>(&x) + lane);
 }
 template <class S>
 void put(Packet<S>& to, int lane, const Native<S>& x) {

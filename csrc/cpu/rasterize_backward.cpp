@@ -1,31 +1,23 @@
 // Backward pass of the blending, back to front (math/blend.hpp). For each Gaussian only sums over pixels are needed: the six
-// moments of p = dL/dlog alpha, and of the blending weights times dL/dC. They are taken 16 Gaussians at a time after a
-// transpose, added up per tile entry, written to the entry's own slot, and finally summed per Gaussian in slot order: no
-// atomics, the same bytes for any thread count.
+// moments of p = dL/dlog alpha, and of the blending weights times dL/dC. An entry of a tile visits the tile's blocks that it
+// touches, adds to one packet per sum, and adds up the lanes once. The sums go to the entry's own slot, and are finally added
+// up per Gaussian in slot order: no atomics, the same bytes for any thread count.
 //
 // The centre may lie far outside the image, 1e5 px where the splat is 1 px wide. Moments about it would be differences of
 // numbers 1e10 times larger than they are. So a tile sums moments in x, y about the point of the tile nearest to the centre,
 // a slot holds those with u and v about the point of the image nearest to it, and only the total is moved to the centre.
-#include <array>
 #include <memory>
 
+#include "cpu/lane_sums.hpp"
 #include "cpu/parallel.hpp"
 #include "cpu/tile.hpp"
-#include "cpu/transpose.hpp"
 
 namespace dyngs {
 namespace {
 
-constexpr int kMaxFields = 48;  // moments, channels, two absolute gradients; padded to whole packets
-static_assert(kBlendSums + kMaxChannels + 2 <= kMaxFields);
-
 // Fields of one entry's gradient record: moments, D colours, then |d mean x|, |d mean y| if asked for.
-struct Layout {
-  int channels;
-  bool absolute;
-  int fields() const { return kBlendSums + channels + (absolute ? 2 : 0); }
-  int packets() const { return (fields() + kLanes - 1) / kLanes; }
-};
+constexpr int kMaxFields = kBlendSums + kMaxChannels + 2;
+constexpr int kPrefetchedSlots = 16;  // Gaussians ahead, when slots are added up
 
 // The point nearest to (x, y) in the square of a tile's pixel centres.
 template <class S>
@@ -39,47 +31,36 @@ Vec2<S> nearest_in_image(const Splats<S>& s, S x, S y) {
   return {std::clamp(x, S(0), static_cast<S>(s.width)), std::clamp(y, S(0), static_cast<S>(s.height))};
 }
 
-// Up to 16 Gaussians of one block, waiting for the transpose.
-template <class S>
-struct Batch {
-  Packet<S> p[kLanes], weight[kLanes];  // row: Gaussian, lane: pixel
-  Packet<S> dx, dy;                     // lane: Gaussian; its anchor minus the block's first pixel centre
-  int index[kLanes];
-  int count = 0;
-};
-
-template <class S>
-struct Scratch {
-  Chunk<S> chunk;
-  uint16_t list[kChunk + 16];
-  Batch<S> batch;
-  Packet<S> sums[kChunk * kMaxFields / kLanes];  // gradient records of the chunk, padded to whole packets
-};
-
-// A block's pixels: loss gradients and the running state of the backward recursion.
-template <class S>
+// A block's pixels: the running state of the backward recursion and the loss gradients.
+template <class S, int D>
 struct BlockPixels {
   BlendBehind<Packet<S>> behind;
   Packet<S> threshold;
-  Packet<S> grad[kMaxChannels];       // dL/dC per channel, lane: pixel
-  S grad_rows[kMaxChannels][kLanes];  // the same, to broadcast one pixel
-  int32_t stop[kLanes];
-  int32_t last = 0;  // largest stop
+  Packet<S> stop;                                    // relative to the chunk
+  Packet<S> grad[D == kDynamic ? kMaxChannels : D];  // dL/dC per channel
 };
 
-template <class S>
-BlockPixels<S> load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int block, const ImageGrads<S>& image) {
-  BlockPixels<S> b;
-  const int channels = s.channels;
+template <class S, int D>
+struct TileState {
+  BlockPixels<S, D> blocks[kBlocks];
+  int32_t stop[kBlocks][kLanes];
+  int32_t last[kBlocks] = {};  // largest stop of the block; 0 outside the image
+};
+
+template <class S, int D>
+void load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int block, const ImageGrads<S>& image,
+                 TileState<S, D>& state) {
+  BlockPixels<S, D>& b = state.blocks[block];
+  const int channels = D == kDynamic ? s.channels : D;
   b.behind = {Packet<S>(S(1)), Packet<S>(S(0))};
   b.threshold = pixel_threshold(s, frame, block);
-  std::fill(b.stop, b.stop + kLanes, 0);
+  std::fill(state.stop[block], state.stop[block] + kLanes, 0);
   for (int c = 0; c < channels; ++c) b.grad[c] = Packet<S>(S(0));
   const S* background = image.background ? image.background + frame.view * channels : nullptr;
   for_each_pixel(s, frame, block, [&](int i, int64_t pixel) {
     b.behind.transmittance[i] = image.final_transmittance[pixel];
-    b.stop[i] = image.stop[pixel];
-    b.last = std::max(b.last, b.stop[i]);
+    state.stop[block][i] = image.stop[pixel];
+    state.last[block] = std::max(state.last[block], image.stop[pixel]);
     S light = image.transmittance[pixel];
     for (int c = 0; c < channels; ++c) {
       b.grad[c][i] = image.color[pixel * channels + c];
@@ -87,182 +68,116 @@ BlockPixels<S> load_pixels(const Splats<S>& s, const TileFrame<S>& frame, int bl
     }
     b.behind.light[i] = light;
   });
-  for (int c = 0; c < channels; ++c) b.grad[c].store(b.grad_rows[c]);
-  return b;
-}
-
-// Sums over the block's pixels of p times the powers of the lane offsets, for 16 Gaussians (rows already transposed),
-// turned into moments about each Gaussian's anchor in the tile: dx = batch.dx - lane.x.
-template <class S>
-void add_moments(const Packet<S> (&p)[kLanes], const Batch<S>& batch, Packet<S>* out) {
-  using P = Packet<S>;
-  P one(S(0)), x(S(0)), y(S(0)), xx(S(0)), xy(S(0)), yy(S(0));  // an array of them would live in memory
-  for (int r = 0; r < kBlockSide; ++r) {
-    const P &a = p[4 * r], &b = p[4 * r + 1], &c = p[4 * r + 2], &d = p[4 * r + 3];
-    const P row = (a + b) + (c + d), row_x = b + P(S(2)) * c + P(S(3)) * d;
-    const P fy(static_cast<S>(r)), fyy(static_cast<S>(r * r));
-    one += row, x += row_x, xx += b + P(S(4)) * c + P(S(9)) * d;
-    y += fy * row, xy += fy * row_x, yy += fyy * row;
-  }
-  const P sum[] = {one, x, y, xx, xy, yy};
-  moments_about(sum, batch.dx, batch.dy, out);
-}
-
-// Sums over the block's pixels of |p d(log alpha)/d(mean)|: absolute values do not factor into moments.
-template <class S>
-void add_absolute(const Packet<S> (&p)[kLanes], const Batch<S>& batch, const Chunk<S>& chunk, S px, S py,
-                  Packet<S>* out) {
-  using P = Packet<S>;
-  P u, w, v, first_a, first_b;
-  for (int i = 0; i < kLanes; ++i) {
-    const BlendGaussian<S>& g = chunk.gaussians[batch.index[i]];
-    u[i] = g.u, w[i] = g.w, v[i] = g.v;
-    first_a[i] = g.u * (g.x - px) + g.w * (g.y - py), first_b[i] = g.v * (g.y - py);
-  }
-  P sum_x(S(0)), sum_y(S(0));
-  for (int i = 0; i < kLanes; ++i) {
-    const P x(static_cast<S>(i % kBlockSide)), y(static_cast<S>(i / kBlockSide));
-    const Vec2<P> slope = slope_by_mean(p[i], u, w, v, whitened(u, w, v, Vec2<P>{first_a, first_b}, x, y));
-    sum_x += abs(slope.x);
-    sum_y += abs(slope.y);
-  }
-  const P unscale(S(2) / S(kLog2E));  // a BlendGaussian holds u, w, v times sqrt(log2(e) / 2)
-  out[0] = sum_x * unscale;
-  out[1] = sum_y * unscale;
-}
-
-// `px`, `py`: the block's first pixel centre.
-template <class S>
-void flush(const Layout& layout, S px, S py, const BlockPixels<S>& pixels, Scratch<S>& scratch) {
-  Batch<S>& batch = scratch.batch;
-  if (batch.count == 0) return;
-  for (int i = batch.count; i < kLanes; ++i) {
-    batch.p[i] = batch.weight[i] = Packet<S>(S(0));
-    batch.dx[i] = batch.dy[i] = S(0);
-    batch.index[i] = batch.index[0];
-  }
-  transpose16(batch.p);
-  transpose16(batch.weight);
-  Packet<S> fields[kMaxFields];
-  add_moments(batch.p, batch, fields);
-  for (int c = 0; c < layout.channels; ++c) {
-    Packet<S> even(S(0)), odd(S(0));
-    for (int i = 0; i < kLanes; i += 2) {
-      even += batch.weight[i] * Packet<S>(pixels.grad_rows[c][i]);
-      odd += batch.weight[i + 1] * Packet<S>(pixels.grad_rows[c][i + 1]);
-    }
-    fields[kBlendSums + c] = even + odd;
-  }
-  if (layout.absolute) add_absolute(batch.p, batch, scratch.chunk, px, py, fields + kBlendSums + layout.channels);
-  const int packets = layout.packets();
-  for (int i = layout.fields(); i < packets * kLanes; ++i) fields[i] = Packet<S>(S(0));
-  for (int k = 0; k < packets; ++k) {
-    Packet<S>(&group)[kLanes] = *reinterpret_cast<Packet<S>(*)[kLanes]>(fields + k * kLanes);
-    transpose16(group);
-    for (int i = 0; i < batch.count; ++i) scratch.sums[batch.index[i] * packets + k] += group[i];
-  }
-  batch.count = 0;
 }
 
 // Positions at which the pixels were full, relative to the chunk.
 template <class S>
-Packet<S> relative_stop(const BlockPixels<S>& pixels, int32_t chunk_begin) {
+Packet<S> relative_stop(const int32_t (&stop)[kLanes], int32_t chunk_begin) {
   Packet<S> r;
   for (int i = 0; i < kLanes; ++i)
-    r[i] = static_cast<S>(std::clamp<int64_t>(int64_t{pixels.stop[i]} - chunk_begin, 0, kChunk));
+    r[i] = static_cast<S>(std::clamp<int64_t>(int64_t{stop[i]} - chunk_begin, 0, kChunk));
   return r;
 }
 
-template <class S, int D>
-void block_backward(const Splats<S>& s, const Layout& layout, const TileFrame<S>& frame, int block, int32_t chunk_begin,
-                    int listed, BlockPixels<S>& pixels, Scratch<S>& scratch) {
+// Adds one block's pixels to the sums of entry `i` of the chunk, whose anchor is the point (x, y).
+template <class S, int D, bool kAbsolute>
+DYNGS_INLINE void add_block(const BlendGaussian<S>& g, const S* color, int channels, int i, const LaneOffsets<S>& lane,
+                            const Vec2<S>& block, const Vec2<S>& anchor, S alpha_max, BlockPixels<S, D>& pixels,
+                            Packet<S>* sum) {
   using P = Packet<S>;
-  const S px = frame.block_x[block], py = frame.block_y[block];
-  const int channels = D == kDynamic ? layout.channels : D;
-  const LaneOffsets<S> lane;
-  const P alpha_max(s.alpha_max);
-  const P stop = relative_stop(pixels, chunk_begin);
-  Batch<S>& batch = scratch.batch;
-  BlendBehind<P> behind = pixels.behind;
-  for (int k = listed - 1; k >= 0; --k) {
-    const int i = scratch.list[k];
-    const BlendGaussian<S>& g = scratch.chunk.gaussians[i];
-    const P x = log2_alpha(g, g.x - px, g.y - py, lane.x, lane.y);
-    const PacketMask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < stop);
-    const P raw = exp2(x);
-    const P alpha = clamped_alpha(raw, alpha_max, drawn);
-    const S* color = scratch.chunk.template color<D>(i);
-    P shade(S(0));
-    for (int c = 0; c < channels; ++c) shade += P(color[c]) * pixels.grad[c];
-    const BlendGrad<P> grad = blend_vjp(raw, alpha, alpha_max, shade, behind);
-    batch.p[batch.count] = grad.by_log_alpha;
-    batch.weight[batch.count] = grad.weight;
-    const Vec2<S> anchor = nearest_in_tile(frame, g.x, g.y);
-    batch.dx[batch.count] = anchor.x - px, batch.dy[batch.count] = anchor.y - py;
-    batch.index[batch.count] = i;
-    if (++batch.count == kLanes) flush(layout, px, py, pixels, scratch);
+  const P x = log2_alpha(g, g.x - block.x, g.y - block.y, lane.x, lane.y);
+  const PacketMask<S> drawn = (x >= pixels.threshold) & (P(static_cast<S>(i)) < pixels.stop);
+  const P raw = exp2(x);
+  const P alpha = clamped_alpha(raw, P(alpha_max), drawn);
+  P shade(S(0));
+  for (int c = 0; c < channels; ++c) shade += P(color[c]) * pixels.grad[c];
+  const BlendGrad<P> grad = blend_vjp(raw, alpha, P(alpha_max), shade, pixels.behind);
+  const P p = grad.by_log_alpha, dx = P(anchor.x - block.x) - lane.x, dy = P(anchor.y - block.y) - lane.y;
+  const P px = p * dx, py = p * dy;
+  sum[kOne] += p, sum[kX] += px, sum[kY] += py;
+  sum[kXX] += px * dx, sum[kXY] += px * dy, sum[kYY] += py * dy;
+  for (int c = 0; c < channels; ++c) sum[kBlendSums + c] += grad.weight * pixels.grad[c];
+  if constexpr (kAbsolute) {  // absolute values do not factor into moments
+    const Vec2<S> first = whitened_first(g, g.x - block.x, g.y - block.y);
+    const Vec2<P> at = whitened(P(g.u), P(g.w), P(g.v), Vec2<P>{P(first.x), P(first.y)}, lane.x, lane.y);
+    const Vec2<P> slope = slope_by_mean(p, P(g.u), P(g.w), P(g.v), at);
+    sum[kBlendSums + channels] += abs(slope.x), sum[kBlendSums + channels + 1] += abs(slope.y);
   }
-  flush(layout, px, py, pixels, scratch);
-  pixels.behind = behind;
 }
 
 // Turns the moments of one entry about its anchor in the tile into the sums of its slot.
 template <class S>
-void write_moments(const Splats<S>& s, const TileFrame<S>& frame, const BlendGaussian<S>& g, const S* sum, S* to) {
+void write_moments(const Splats<S>& s, const Vec2<S>& anchor, const BlendGaussian<S>& g, const S* sum, S* to) {
   const double unscale = 1 / std::sqrt(0.5 * kLog2E);  // a BlendGaussian holds u, w, v times sqrt(log2(e) / 2)
   const double u = g.u * unscale, w = g.w * unscale, v = g.v * unscale;
-  const Vec2<S> anchor = nearest_in_tile(frame, g.x, g.y), near = nearest_in_image(s, g.x, g.y);
+  const Vec2<S> near = nearest_in_image(s, g.x, g.y);
   const Vec2<double> far{double(g.x) - anchor.x, double(g.y) - anchor.y};  // 0 where the centre is in the tile
   blend_sums(sum, u, w, v, far, {double(near.x) - anchor.x, double(near.y) - anchor.y}, to);
 }
 
-template <class S>
-void store_chunk(const Splats<S>& s, const Layout& layout, const TileFrame<S>& frame, const Entries& entries,
-                 int64_t begin, const Scratch<S>& scratch, S* slots) {
-  const int fields = layout.fields(), packets = layout.packets();
-  for (int i = 0; i < scratch.chunk.count; ++i) {
-    S* to = slots + int64_t{entries.slots[begin + i]} * fields;
-    const S* from = reinterpret_cast<const S*>(scratch.sums + i * packets);
-    write_moments(s, frame, scratch.chunk.gaussians[i], from, to);
-    for (int f = kBlendSums; f < fields; ++f) to[f] = from[f];
+// Entry `i` of the chunk in the blocks of the bits `touched`; writes its slot.
+template <class S, int D, bool kAbsolute>
+void entry_backward(const Splats<S>& s, const TileFrame<S>& frame, const Chunk<S>& chunk, int i, uint32_t touched,
+                    const LaneOffsets<S>& lane, TileState<S, D>& state, S* slot) {
+  using P = Packet<S>;
+  constexpr int kFixed = kBlendSums + (kAbsolute ? 2 : 0);
+  const int channels = D == kDynamic ? s.channels : D;
+  const BlendGaussian<S> g = chunk.gaussians[i];
+  const S* color = chunk.template color<D>(i);
+  const Vec2<S> anchor = nearest_in_tile(frame, g.x, g.y);
+  P sum[D == kDynamic ? (kMaxFields + kLanes - 1) / kLanes * kLanes : kFixed + D];
+  S fields[sizeof(sum) / sizeof(P)];
+  const int count = kFixed + channels;
+  for (int f = 0; f < count; ++f) sum[f] = P(S(0));
+  for (; touched != 0; touched &= touched - 1) {
+    const int b = __builtin_ctz(touched);
+    add_block<S, D, kAbsolute>(g, color, channels, i, lane, {frame.block_x[b], frame.block_y[b]}, anchor, s.alpha_max,
+                               state.blocks[b], sum);
+  }
+  if constexpr (D == kDynamic) {
+    for (int f = count; f % kLanes != 0; ++f) sum[f] = P(S(0));
+    for (int f = 0; f < count; f += kLanes) lane_sums(reinterpret_cast<P(&)[kLanes]>(sum[f]), fields + f);
+  } else {
+    lane_sums(sum, fields);
+  }
+  write_moments(s, anchor, g, fields, slot);
+  std::copy(fields + kBlendSums, fields + kBlendSums + channels, slot + kBlendSums);
+  if constexpr (kAbsolute) {
+    const S unscale = S(2) / S(kLog2E);
+    for (int k = count - 2; k < count; ++k) slot[k] = fields[k] * unscale;
   }
 }
 
-template <class S, int D>
-void tile_backward(const Splats<S>& s, const Layout& layout, const Entries& entries, const ImageGrads<S>& image,
-                   int64_t tile, S* slots) {
+template <class S, int D, bool kAbsolute>
+void tile_backward(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image, int64_t tile, S* slots) {
   const TileFrame<S> frame = tile_frame(s, tile);
   const int64_t begin = entries.tile_offsets[tile], end = entries.tile_offsets[tile + 1];
   if (begin == end) return;
-  std::array<BlockPixels<S>, kBlocks> pixels;
+  const int fields = kBlendSums + s.channels + (kAbsolute ? 2 : 0);
+  TileState<S, D> state;
   for (int b = 0; b < kBlocks; ++b)
-    if (frame.inside >> b & 1) pixels[b] = load_pixels(s, frame, b, image);
-  Scratch<S> scratch;
+    if (frame.inside >> b & 1) load_pixels(s, frame, b, image, state);
+  Chunk<S> chunk;
+  const LaneOffsets<S> lane;
   for (int64_t at = begin + (end - begin - 1) / kChunk * kChunk; at >= begin; at -= kChunk) {
     const int count = static_cast<int>(std::min<int64_t>(kChunk, end - at));
     const int32_t chunk_begin = static_cast<int32_t>(at - begin);
-    load_chunk<D>(s, entries, frame, at, count, scratch.chunk);
-    std::fill(scratch.sums, scratch.sums + count * layout.packets(), Packet<S>(S(0)));
+    load_chunk<D>(s, entries, frame, at, count, chunk);
+    uint32_t open = 0;  // blocks that saw something of the chunk
     for (int b = 0; b < kBlocks; ++b) {
-      if (!(frame.inside >> b & 1) || pixels[b].last <= chunk_begin) continue;
-      const int listed = scratch.chunk.list_block(b, scratch.list);
-      block_backward<S, D>(s, layout, frame, b, chunk_begin, listed, pixels[b], scratch);
+      if (state.last[b] <= chunk_begin) continue;
+      open |= 1u << b;
+      state.blocks[b].stop = relative_stop<S>(state.stop[b], chunk_begin);
     }
-    store_chunk(s, layout, frame, entries, at, scratch, slots);
+    for (int i = count - 1; i >= 0; --i)
+      entry_backward<S, D, kAbsolute>(s, frame, chunk, i, chunk.masks[i] & open, lane, state,
+                                      slots + int64_t{entries.slots[at + i]} * fields);
   }
 }
 
-template <class S, int D>
-void all_tiles_backward(const Splats<S>& s, const Layout& layout, const Entries& entries, const ImageGrads<S>& image,
-                        S* slots) {
-  parallel_for(s.tiles(), 1, s.threads, [&](int64_t begin, int64_t end) {
-    for (int64_t t = begin; t < end; ++t) tile_backward<S, D>(s, layout, entries, image, t, slots);
-  });
-}
-
+// `sum`: a record, as in a slot.
 template <class S>
-void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const Layout& layout,
-                    const SplatGrads<S>& out) {
+void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const SplatGrads<S>& out) {
   const S mean_x = s.means2d[2 * row], mean_y = s.means2d[2 * row + 1];
   const Vec2<S> near = nearest_in_image(s, mean_x, mean_y);
   const S* factor = s.factors + 3 * row;
@@ -272,25 +187,53 @@ void write_gaussian(const Splats<S>& s, int64_t row, const double* sum, const La
   out.factors[3 * row] = grad.u, out.factors[3 * row + 1] = grad.w, out.factors[3 * row + 2] = grad.v;
   out.opacities[row] = grad.opacity;
   const double* channels = sum + kBlendSums;
-  for (int c = 0; c < layout.channels; ++c) out.colors[row * layout.channels + c] = static_cast<S>(channels[c]);
+  for (int c = 0; c < s.channels; ++c) out.colors[row * s.channels + c] = static_cast<S>(channels[c]);
   if (out.probe == nullptr) return;
   out.probe[4 * row] = grad.mean.x, out.probe[4 * row + 1] = grad.mean.y;
   for (int k = 0; k < 2; ++k)
-    out.probe[4 * row + 2 + k] = layout.absolute ? static_cast<S>(channels[layout.channels + k]) : S(0);
+    out.probe[4 * row + 2 + k] = out.absolute ? static_cast<S>(channels[s.channels + k]) : S(0);
 }
 
-template <class S>
-void sum_slots(const Splats<S>& s, const Layout& layout, const Entries& entries, const S* slots,
-               const SplatGrads<S>& out) {
-  const int fields = layout.fields();
-  parallel_for(s.num_views * s.num_gaussians, 1024, s.threads, [&](int64_t begin, int64_t end) {
+// Adds up the slots of each Gaussian. `kFields`: their number of fields, 0 if known only at run time.
+template <class S, int kFields>
+void sum_slots(const Splats<S>& s, int num_fields, const Entries& entries, const S* slots, const SplatGrads<S>& out) {
+  const int fields = kFields > 0 ? kFields : num_fields;
+  const int64_t rows = s.num_views * s.num_gaussians;
+  parallel_for(rows, 1024, s.threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
-      double sum[kMaxFields] = {};
+      if (i + kPrefetchedSlots < rows) {  // slots lie in the order of depth
+        const S* ahead = slots + int64_t{entries.slot_ranges[2 * (i + kPrefetchedSlots)]} * fields;
+        __builtin_prefetch(ahead), __builtin_prefetch(ahead + 64 / sizeof(S));
+      }
+      double sum[kFields > 0 ? kFields : kMaxFields];
+      std::fill(sum, sum + fields, 0.0);
       for (int64_t k = entries.slot_ranges[2 * i]; k < entries.slot_ranges[2 * i + 1]; ++k)
         for (int f = 0; f < fields; ++f) sum[f] += slots[k * fields + f];
-      write_gaussian(s, i, sum, layout, out);
+      write_gaussian(s, i, sum, out);
     }
   });
+}
+
+template <class S, int D, bool kAbsolute>
+void backward(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image, const SplatGrads<S>& out) {
+  constexpr int kFixed = kBlendSums + (kAbsolute ? 2 : 0);
+  const int fields = kFixed + s.channels;
+  const auto slots = std::make_unique_for_overwrite<S[]>(static_cast<size_t>(entries.count) * fields);
+  parallel_for(s.tiles(), 1, s.threads, [&](int64_t begin, int64_t end) {
+    for (int64_t t = begin; t < end; ++t) tile_backward<S, D, kAbsolute>(s, entries, image, t, slots.get());
+  });
+  sum_slots<S, D == kDynamic ? 0 : kFixed + D>(s, fields, entries, slots.get(), out);
+}
+
+template <class S, bool kAbsolute>
+void backward_of_channels(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image,
+                          const SplatGrads<S>& out) {
+  switch (s.channels) {
+    case 1: return backward<S, 1, kAbsolute>(s, entries, image, out);
+    case 3: return backward<S, 3, kAbsolute>(s, entries, image, out);
+    case 4: return backward<S, 4, kAbsolute>(s, entries, image, out);
+    default: return backward<S, kDynamic, kAbsolute>(s, entries, image, out);
+  }
 }
 
 }  // namespace
@@ -298,15 +241,8 @@ void sum_slots(const Splats<S>& s, const Layout& layout, const Entries& entries,
 template <class S>
 void rasterize_backward(const Splats<S>& s, const Entries& entries, const ImageGrads<S>& image,
                         const SplatGrads<S>& out) {
-  const Layout layout{s.channels, out.absolute};
-  const auto slots = std::make_unique_for_overwrite<S[]>(static_cast<size_t>(entries.count) * layout.fields());
-  switch (s.channels) {
-    case 1: all_tiles_backward<S, 1>(s, layout, entries, image, slots.get()); break;
-    case 3: all_tiles_backward<S, 3>(s, layout, entries, image, slots.get()); break;
-    case 4: all_tiles_backward<S, 4>(s, layout, entries, image, slots.get()); break;
-    default: all_tiles_backward<S, kDynamic>(s, layout, entries, image, slots.get());
-  }
-  sum_slots(s, layout, entries, slots.get(), out);
+  out.absolute ? backward_of_channels<S, true>(s, entries, image, out)
+               : backward_of_channels<S, false>(s, entries, image, out);
 }
 
 template void rasterize_backward<float>(const Splats<float>&, const Entries&, const ImageGrads<float>&,

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 #if defined(__x86_64__)
 #include <immintrin.h>
 #endif
@@ -24,7 +25,7 @@ inline constexpr int kRegisterBytes = 16;
 #endif
 
 template <class S, int kCount>
-struct Mask;
+inline constexpr bool kInOneRegister = kCount * sizeof(S) <= kRegisterBytes;
 
 // Outside of Simd, because GCC 12 forgets the attribute while it looks at a template's own constructors.
 template <class S, int kCount>
@@ -32,8 +33,37 @@ struct VectorOf {
   typedef S Type __attribute__((vector_size(kCount * sizeof(S))));
 };
 
+// More numbers than a register holds are two halves: GCC lowers comparisons of a vector type that is wider than a register to
+// scalar code, which took eight times as long with AVX2.
 template <class S, int kCount>
-struct Simd {  // with the alignment of its vector
+struct Simd {
+  using Half = Simd<S, kCount / 2>;
+  static constexpr int kSize = kCount;
+  Half lo, hi;
+
+  Simd() = default;
+  DYNGS_INLINE Simd(Half a, Half b) : lo(a), hi(b) {}
+  DYNGS_INLINE Simd(S x) : lo(x), hi(x) {}
+
+  S& operator[](int i) { return reinterpret_cast<S*>(this)[i]; }
+  S operator[](int i) const { return reinterpret_cast<const S*>(this)[i]; }
+
+  DYNGS_INLINE static Simd load(const S* p) { return {Half::load(p), Half::load(p + kCount / 2)}; }
+  DYNGS_INLINE void store(S* p) const { lo.store(p), hi.store(p + kCount / 2); }
+
+  DYNGS_INLINE friend Simd operator+(Simd a, Simd b) { return {a.lo + b.lo, a.hi + b.hi}; }
+  DYNGS_INLINE friend Simd operator-(Simd a, Simd b) { return {a.lo - b.lo, a.hi - b.hi}; }
+  DYNGS_INLINE friend Simd operator*(Simd a, Simd b) { return {a.lo * b.lo, a.hi * b.hi}; }
+  DYNGS_INLINE friend Simd operator/(Simd a, Simd b) { return {a.lo / b.lo, a.hi / b.hi}; }
+  DYNGS_INLINE friend Simd operator-(Simd a) { return {-a.lo, -a.hi}; }
+  DYNGS_INLINE Simd& operator+=(Simd b) { return *this = *this + b; }
+  DYNGS_INLINE Simd& operator-=(Simd b) { return *this = *this - b; }
+  DYNGS_INLINE Simd& operator*=(Simd b) { return *this = *this * b; }
+};
+
+template <class S, int kCount>
+  requires kInOneRegister<S, kCount>
+struct Simd<S, kCount> {  // with the alignment of its vector
   using Vec = typename VectorOf<S, kCount>::Type;
   using Int = std::conditional_t<sizeof(S) == 4, int32_t, int64_t>;
   using IntVec = typename VectorOf<Int, kCount>::Type;
@@ -41,36 +71,27 @@ struct Simd {  // with the alignment of its vector
   Vec v;
 
   Simd() = default;
-  Simd(Vec x) : v(x) {}
-  Simd(S x) : v(x - Vec{}) {}  // x - {} broadcasts x
+  DYNGS_INLINE Simd(Vec x) : v(x) {}
+  DYNGS_INLINE Simd(S x) : v(x - Vec{}) {}  // x - {} broadcasts x
 
-  S& operator[](int i) { return reinterpret_cast<S*>(&v)[i]; }
-  S operator[](int i) const { return reinterpret_cast<const S*>(&v)[i]; }
+  S& operator[](int i) { return reinterpret_cast<S*>(this)[i]; }
+  S operator[](int i) const { return reinterpret_cast<const S*>(this)[i]; }
 
-  static Simd load(const S* p) {
+  DYNGS_INLINE static Simd load(const S* p) {
     Simd r;
     std::memcpy(&r.v, p, sizeof(Vec));
     return r;
   }
-  void store(S* p) const { std::memcpy(p, &v, sizeof(Vec)); }
+  DYNGS_INLINE void store(S* p) const { std::memcpy(p, &v, sizeof(Vec)); }
 
-  friend Simd operator+(Simd a, Simd b) { return a.v + b.v; }
-  friend Simd operator-(Simd a, Simd b) { return a.v - b.v; }
-  friend Simd operator*(Simd a, Simd b) { return a.v * b.v; }
-  friend Simd operator/(Simd a, Simd b) { return a.v / b.v; }
-  friend Simd operator-(Simd a) { return -a.v; }
-  Simd& operator+=(Simd b) {
-    v += b.v;
-    return *this;
-  }
-  Simd& operator-=(Simd b) {
-    v -= b.v;
-    return *this;
-  }
-  Simd& operator*=(Simd b) {
-    v *= b.v;
-    return *this;
-  }
+  DYNGS_INLINE friend Simd operator+(Simd a, Simd b) { return a.v + b.v; }
+  DYNGS_INLINE friend Simd operator-(Simd a, Simd b) { return a.v - b.v; }
+  DYNGS_INLINE friend Simd operator*(Simd a, Simd b) { return a.v * b.v; }
+  DYNGS_INLINE friend Simd operator/(Simd a, Simd b) { return a.v / b.v; }
+  DYNGS_INLINE friend Simd operator-(Simd a) { return -a.v; }
+  DYNGS_INLINE Simd& operator+=(Simd b) { return *this = *this + b; }
+  DYNGS_INLINE Simd& operator-=(Simd b) { return *this = *this - b; }
+  DYNGS_INLINE Simd& operator*=(Simd b) { return *this = *this * b; }
 };
 
 // Sixteen Gaussians, or the pixels of a 4x4 block.
@@ -99,18 +120,30 @@ struct ScalarOf<Simd<S, kCount>> {
 // Result of comparing two vectors: all bits set where true.
 template <class S, int kCount>
 struct Mask {
+  using Half = Mask<S, kCount / 2>;
+  Half lo, hi;
+  DYNGS_INLINE friend Mask operator&(Mask a, Mask b) { return {a.lo & b.lo, a.hi & b.hi}; }
+  DYNGS_INLINE friend Mask operator|(Mask a, Mask b) { return {a.lo | b.lo, a.hi | b.hi}; }
+  DYNGS_INLINE friend Mask operator!(Mask a) { return {!a.lo, !a.hi}; }
+};
+template <class S, int kCount>
+  requires kInOneRegister<S, kCount>
+struct Mask<S, kCount> {
   typename Simd<S, kCount>::IntVec bits;
-  friend Mask operator&(Mask a, Mask b) { return {a.bits & b.bits}; }
-  friend Mask operator|(Mask a, Mask b) { return {a.bits | b.bits}; }
-  friend Mask operator!(Mask a) { return {~a.bits}; }
+  DYNGS_INLINE friend Mask operator&(Mask a, Mask b) { return {a.bits & b.bits}; }
+  DYNGS_INLINE friend Mask operator|(Mask a, Mask b) { return {a.bits | b.bits}; }
+  DYNGS_INLINE friend Mask operator!(Mask a) { return {~a.bits}; }
 };
 template <class S>
 using PacketMask = Mask<S, kLanes>;
 
-#define DYNGS_COMPARE(op)                                                    \
-  template <class S, int kCount>                                             \
-  inline Mask<S, kCount> operator op(Simd<S, kCount> a, Simd<S, kCount> b) { \
-    return {a.v op b.v};                                                     \
+#define DYNGS_COMPARE(op)                                                          \
+  template <class S, int kCount>                                                   \
+  DYNGS_INLINE Mask<S, kCount> operator op(Simd<S, kCount> a, Simd<S, kCount> b) { \
+    if constexpr (kInOneRegister<S, kCount>)                                       \
+      return {a.v op b.v};                                                         \
+    else                                                                           \
+      return {a.lo op b.lo, a.hi op b.hi};                                         \
   }
 DYNGS_COMPARE(<)
 DYNGS_COMPARE(<=)
@@ -119,14 +152,31 @@ DYNGS_COMPARE(>=)
 DYNGS_COMPARE(==)
 #undef DYNGS_COMPARE
 template <class S, int kCount>
-inline Simd<S, kCount> select(Mask<S, kCount> m, Simd<S, kCount> a, Simd<S, kCount> b) {
-  return m.bits ? a.v : b.v;
+DYNGS_INLINE Simd<S, kCount> select(Mask<S, kCount> m, Simd<S, kCount> a, Simd<S, kCount> b) {
+  if constexpr (kInOneRegister<S, kCount>)
+    return m.bits ? a.v : b.v;
+  else
+    return {select(m.lo, a.lo, b.lo), select(m.hi, a.hi, b.hi)};
 }
-template <class S>
-inline uint32_t to_bits(PacketMask<S> m) {
-  uint32_t bits = 0;
-  for (int i = 0; i < kLanes; ++i) bits |= (m.bits[i] != 0 ? 1u : 0u) << i;
-  return bits;
+
+// Bit i: lane i.
+template <class S, int kCount>
+DYNGS_INLINE uint32_t to_bits(Mask<S, kCount> m) {
+  if constexpr (!kInOneRegister<S, kCount>) {
+    return to_bits(m.lo) | to_bits(m.hi) << (kCount / 2);
+#if defined(__AVX__)
+  } else if constexpr (sizeof m == 32 && sizeof(S) == 4) {
+    return static_cast<uint32_t>(_mm256_movemask_ps((__m256)m.bits));
+#endif
+#if defined(__SSE2__)
+  } else if constexpr (sizeof m == 16 && sizeof(S) == 4) {
+    return static_cast<uint32_t>(_mm_movemask_ps((__m128)m.bits));
+#endif
+  } else {
+    uint32_t bits = 0;
+    for (int i = 0; i < kCount; ++i) bits |= (m.bits[i] != 0 ? 1u : 0u) << i;
+    return bits;
+  }
 }
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
@@ -152,41 +202,14 @@ inline Packet<float> select(PacketMask<float> m, Packet<float> a, Packet<float> 
   return (Packet<float>::Vec)_mm512_mask_blend_ps(m.bits, (__m512)b.v, (__m512)a.v);
 }
 inline uint32_t to_bits(PacketMask<float> m) { return m.bits; }
-#elif defined(__SSE2__)
-inline uint32_t to_bits(PacketMask<float> m) {
-  uint32_t bits = 0;
-  for (int i = 0; i < 4; ++i) {
-    __m128 part;
-    std::memcpy(&part, reinterpret_cast<const char*>(&m.bits) + 16 * i, 16);
-    bits |= static_cast<uint32_t>(_mm_movemask_ps(part)) << (4 * i);
-  }
-  return bits;
-}
 #endif
 
 template <class S, int kCount>
-inline bool any(Mask<S, kCount> m) {
-#if defined(__AVX__)
-  if constexpr (sizeof m == 32) {
-    __m256 bits;
-    std::memcpy(&bits, &m, sizeof bits);
-    return _mm256_movemask_ps(bits) != 0;
-  }
-#endif
-#if defined(__SSE2__)
-  if constexpr (sizeof m == 16) {
-    __m128 bits;
-    std::memcpy(&bits, &m, sizeof bits);
-    return _mm_movemask_ps(bits) != 0;
-  }
-#endif
-  if constexpr (kCount == kLanes) {
+DYNGS_INLINE bool any(Mask<S, kCount> m) {
+  if constexpr (!kInOneRegister<S, kCount>)
+    return any(m.lo | m.hi);
+  else
     return to_bits(m) != 0;
-  } else {
-    bool found = false;
-    for (int i = 0; i < kCount; ++i) found |= m.bits[i] != 0;
-    return found;
-  }
 }
 
 #if defined(__AVX512F__)
@@ -200,13 +223,25 @@ inline Packet<float> max(Packet<float> a, Packet<float> b) {
 #endif
 
 template <class S, int kCount>
-inline Simd<S, kCount> sqrt(Simd<S, kCount> x) {
+DYNGS_INLINE Simd<S, kCount> sqrt(Simd<S, kCount> x) {
+  if constexpr (!kInOneRegister<S, kCount>) return {sqrt(x.lo), sqrt(x.hi)};
 #if defined(__AVX512F__)
-  if constexpr (sizeof(S) == 4 && kCount == kLanes) return (typename Packet<S>::Vec)_mm512_sqrt_ps((__m512)x.v);
+  else if constexpr (sizeof(x) == 64 && sizeof(S) == 4)
+    return (typename Simd<S, kCount>::Vec)_mm512_sqrt_ps((__m512)x.v);
 #endif
-  Simd<S, kCount> r;
-  for (int i = 0; i < kCount; ++i) r[i] = std::sqrt(x[i]);
-  return r;
+#if defined(__AVX__)
+  else if constexpr (sizeof(x) == 32 && sizeof(S) == 4)
+    return (typename Simd<S, kCount>::Vec)_mm256_sqrt_ps((__m256)x.v);
+#endif
+#if defined(__SSE2__)
+  else if constexpr (sizeof(x) == 16 && sizeof(S) == 4)
+    return (typename Simd<S, kCount>::Vec)_mm_sqrt_ps((__m128)x.v);
+#endif
+  else {
+    Simd<S, kCount> r;
+    for (int i = 0; i < kCount; ++i) r[i] = std::sqrt(x[i]);
+    return r;
+  }
 }
 
 template <class S, int kCount>
@@ -225,9 +260,12 @@ inline Simd<S, kCount> ceil(Simd<S, kCount> x) {
 
 // For |x| below 2^31.
 template <class S, int kCount>
-inline Simd<S, kCount> trunc(Simd<S, kCount> x) {
+DYNGS_INLINE Simd<S, kCount> trunc(Simd<S, kCount> x) {
   using V = Simd<S, kCount>;
-  return __builtin_convertvector(__builtin_convertvector(x.v, typename V::IntVec), typename V::Vec);
+  if constexpr (!kInOneRegister<S, kCount>)
+    return {trunc(x.lo), trunc(x.hi)};
+  else
+    return __builtin_convertvector(__builtin_convertvector(x.v, typename V::IntVec), typename V::Vec);
 }
 
 template <int kCount>
@@ -239,23 +277,27 @@ inline Simd<double, kCount> exp2(Simd<double, kCount> x) {
 
 // 2^x for x <= 0, relative error below 2.5e-7; results under 2^-126 are flushed to about 2^-126.
 template <int kCount>
-inline Simd<float, kCount> exp2(Simd<float, kCount> x) {
+DYNGS_INLINE Simd<float, kCount> exp2(Simd<float, kCount> x) {
   using P = Simd<float, kCount>;
-  x = max(x, P(-126.0f));
-  const P shifted = x + P(12582912.0f);  // 1.5 * 2^23: rounds x to an integer, which lands in the low mantissa bits
-  const P f = x - (shifted - P(12582912.0f));
-  P p = P(1.32764713e-3f);  // minimax fit of 2^f on [-0.5, 0.5], relative error 7.5e-8
-  p = p * f + P(9.67554133e-3f);
-  p = p * f + P(5.55071328e-2f);
-  p = p * f + P(2.40221197e-1f);
-  p = p * f + P(6.93146967e-1f);
-  p = p * f + P(1.00000007f);
-  typename P::IntVec n, bits;
-  std::memcpy(&n, &shifted.v, sizeof n);
-  std::memcpy(&bits, &p.v, sizeof bits);
-  bits += n << 23;  // the float 1.5*2^23 has zeros below, so the shift leaves just the integer in the exponent field
-  std::memcpy(&p.v, &bits, sizeof bits);
-  return p;
+  if constexpr (!kInOneRegister<float, kCount>) {
+    return {exp2(x.lo), exp2(x.hi)};
+  } else {
+    x = max(x, P(-126.0f));
+    const P shifted = x + P(12582912.0f);  // 1.5 * 2^23: rounds x to an integer, which lands in the low mantissa bits
+    const P f = x - (shifted - P(12582912.0f));
+    P p = P(1.32764713e-3f);  // minimax fit of 2^f on [-0.5, 0.5], relative error 7.5e-8
+    p = p * f + P(9.67554133e-3f);
+    p = p * f + P(5.55071328e-2f);
+    p = p * f + P(2.40221197e-1f);
+    p = p * f + P(6.93146967e-1f);
+    p = p * f + P(1.00000007f);
+    typename P::IntVec n, bits;
+    std::memcpy(&n, &shifted.v, sizeof n);
+    std::memcpy(&bits, &p.v, sizeof bits);
+    bits += n << 23;  // the float 1.5*2^23 has zeros below, so the shift leaves just the integer in the exponent field
+    std::memcpy(&p.v, &bits, sizeof bits);
+    return p;
+  }
 }
 
 template <class S, int kCount>

@@ -39,7 +39,8 @@ inline Four<S> load_some(const S* from, int64_t count) {
 }
 template <class S>
 inline Four<S> four(S x, S y, S z, S w) {
-  return typename Four<S>::Vec{x, y, z, w};
+  const S numbers[] = {x, y, z, w};
+  return Four<S>::load(numbers);
 }
 template <class S>
 inline Four<S> load_three(const S* from) {

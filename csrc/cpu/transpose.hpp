@@ -45,9 +45,9 @@ inline void transpose16(Packet<float> (&rows)[kLanes]) {
   for (int r = 0; r < kLanes; r += 4)
     for (int c = 0; c < kLanes; c += 4) {
       __m128 part[4];
-      for (int i = 0; i < 4; ++i) part[i] = _mm_loadu_ps(reinterpret_cast<const float*>(&rows[r + i].v) + c);
+      for (int i = 0; i < 4; ++i) part[i] = _mm_loadu_ps(reinterpret_cast<const float*>(&rows[r + i]) + c);
       _MM_TRANSPOSE4_PS(part[0], part[1], part[2], part[3]);
-      for (int i = 0; i < 4; ++i) _mm_storeu_ps(reinterpret_cast<float*>(&out[c + i].v) + r, part[i]);
+      for (int i = 0; i < 4; ++i) _mm_storeu_ps(reinterpret_cast<float*>(&out[c + i]) + r, part[i]);
     }
   for (int r = 0; r < kLanes; ++r) rows[r] = out[r];
 }

@@ -1,7 +1,7 @@
 // Rotations, projection and harmonics of csrc/math: every hand-derived vjp against central differences in double, the
 // forward passes against plain formulas in long double, and packets against scalars. Prints what failed; the exit code is
 // 1 if anything did. test_formulas.cpp has the rest of the folder.
-#include "cpu/simd.hpp"
+#include "cpu/lane_sums.hpp"
 #include "math/harmonics.hpp"
 #include "math/projection.hpp"
 #include "tests/check.hpp"
@@ -215,6 +215,33 @@ void test_exp2() {
   expect_near("exp2 far below is small, not NaN", tiny >= 0 && tiny < 2e-38f, 1, 0);
 }
 
+// Integers, whose sums are exact: each number belongs to its packet and lane.
+template <class S, int kCount>
+void test_lane_sums() {
+  Packet<S> x[kCount];
+  S sums[kCount];
+  for (int i = 0; i < kCount; ++i)
+    for (int lane = 0; lane < kLanes; ++lane) x[i][lane] = static_cast<S>(1000 * i + (lane * lane * 7 + i) % 31);
+  lane_sums(x, sums);
+  for (int i = 0; i < kCount; ++i)
+    expect_near("sum of lanes " + std::to_string(i), sums[i], horizontal_sum(x[i]), 0);
+}
+
+// Selections and comparisons, lane by lane, of which each is of its own half or quarter of a packet on older processors.
+template <class S>
+void test_masks() {
+  for (uint32_t bits : {0u, 1u, 0x8000u, 0x0180u, 0x7ffeu, 0xffffu}) {
+    Packet<S> x;
+    for (int lane = 0; lane < kLanes; ++lane) x[lane] = bits >> lane & 1 ? S(lane) : S(-1 - lane);
+    const PacketMask<S> mask = x >= Packet<S>(S(0));
+    expect(to_bits(mask) == bits && to_bits(!mask) == (~bits & 0xffffu), "bits of a mask");
+    expect(any(mask) == (bits != 0) && any(!mask) == (bits != 0xffffu), "any lane of a mask");
+    const Packet<S> chosen = select(mask, x, -x);
+    for (int lane = 0; lane < kLanes; ++lane)
+      expect_near("lane of a selection", chosen[lane], bits >> lane & 1 ? lane : lane + 1, 0);
+  }
+}
+
 }  // namespace
 
 int main() {
@@ -231,5 +258,8 @@ int main() {
   test_packets<double>(1e-13);  // same formulas, other order of fused multiply-adds
   test_packets<float>(2e-5);    // float rounding, 6e-8, times the condition of the formulas
   test_exp2();
+  test_lane_sums<float, 1>(), test_lane_sums<float, 7>(), test_lane_sums<float, 9>(), test_lane_sums<float, 16>();
+  test_lane_sums<double, 9>();
+  test_masks<float>(), test_masks<double>();
   return report();
 }
