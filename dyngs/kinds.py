@@ -1,4 +1,4 @@
-"""The kinds of model, and trainers and scenes of them. A new kind is one line here."""
+"""Trainers and scenes of every kind of model."""
 
 from __future__ import annotations
 
@@ -16,15 +16,12 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.kind import KIND as DYNAMIC
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians.init import surroundings
-from dyngs.gaussians.model import GaussianModel, gaussian_model
+from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import Scene, require_gaussians
-from dyngs.human.avatar.kind import KIND as HUMAN
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
-from dyngs.models.kind import Kind, Setting
-from dyngs.models.model import Model
+from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import (
     IMAGES,
@@ -36,56 +33,28 @@ from dyngs.models.views import (
     training_times,
 )
 from dyngs.ops.device import device_for
-from dyngs.static.training import KIND as STATIC
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import exposures_of
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
-from dyngs.training.prediction import KIND as HUMAN_PREDICTOR
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.trainer import Trainer
 
-KINDS: tuple[Kind[Any], ...] = (STATIC, DYNAMIC, HUMAN, HUMAN_PREDICTOR)
-"""All kinds, one for each section that ``Config.model`` may be."""
-
-
 GaussianTrainer = Trainer[GaussianModel]
 """The trainer of a scene of Gaussians."""
 
 
-def kind_of(model: ModelSection) -> Kind[Any]:
-    """Return the kind of a section of the configuration."""
-    return next(kind for kind in KINDS if type(model) is kind.section)
-
-
 def build(config: Config, capture: Capture | None = None, *, restored: bool = False) -> Trainable:
     """Return what the loop steps; see ``assemble`` for arguments and errors."""
-    trainer = kind_of(config.model).trainer
-    return assemble_any(config, capture, restored=restored) if trainer is None else trainer(config)
+    if config.model.is_network:
+        return kind_of(config.model).trainer(config)
+    return assemble(config, capture, restored=restored)
 
 
 def assemble(
-    config: Config,
-    capture: Capture | None = None,
-    *,
-    restored: bool = False,
-    images: ImageLoader | None = None,
-    held_out: frozenset[int] = frozenset(),
-) -> GaussianTrainer:
-    """Return the trainer of a scene of Gaussians; see ``assemble_any``.
-
-    Raises:
-        DyngsError: the model is made of something else, too.
-    """
-    trainer = assemble_any(config, capture, restored=restored, images=images, held_out=held_out)
-    gaussian_model(trainer.model, f"model.kind={config.model.kind}")
-    return trainer
-
-
-def assemble_any(
     config: Config,
     capture: Capture | None = None,
     *,
@@ -96,7 +65,7 @@ def assemble_any(
     """Return the trainer of a scene: its model begun, nothing trained.
 
     Args:
-        config: of a run.
+        config: of a run, not of a network.
         capture: as ``prepared`` returned it; None: it is read now.
         restored: a checkpoint will be, so that it does not matter where the model begins: no points are triangulated.
         images: the training images of another trainer of the same ones; None: they are opened.
@@ -111,16 +80,13 @@ def assemble_any(
     if config.model.made_of_gaussians:
         config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
-    views = capture.splits["train"]
     if images is None:
-        images = ImageLoader(views, config.data, with_maps=True, decoding_threads=usual_threads())
+        images = ImageLoader(capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads())
     priors = _priors(config, capture, images)
     if not priors.masks:
         images = images.without_motion_masks()
     background, extent = resolved_background(config, capture), surroundings(capture).extent
-    model: Model[Any] = kind_of(config.model).start(
-        Setting(config, asked, capture, images, background, extent, generator)
-    )
+    model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator))
     refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
     trainer = Trainer(
         config=config,

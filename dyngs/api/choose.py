@@ -29,7 +29,6 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.config.keys.section import Section
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.images import target_size
 from dyngs.data.loader import ImageLoader
@@ -41,6 +40,7 @@ from dyngs.kinds import GaussianTrainer, assemble, with_points
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
+from dyngs.section import Section
 from dyngs.training.interrupt import Interrupts
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000

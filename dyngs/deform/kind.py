@@ -20,7 +20,7 @@ from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Kind, Setting
+from dyngs.models.kind import RunStart
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 from dyngs.static.training import start as start_static
@@ -29,17 +29,17 @@ MAX_STANDING = 12
 """Fixed cameras from which tracks are found, at most."""
 
 
-def start(setting: Setting) -> GaussianModel:
+def start(run: RunStart) -> GaussianModel:
     """Return the model of a moving scene before its first step: a static one where there are no times to move in."""
-    model = setting.config.model
-    if not isinstance(model, DynamicModel) or len(set(training_times(setting.capture))) < 2:
-        return start_static(setting)
-    gaussians = first_gaussians(setting)
-    colours = colours_of(setting, gaussians, sees_time=True)
-    schedule = deform_schedule(model, rates_of(setting.config))
-    views = _training_views(setting, model, colours)
-    training = DynamicTraining(model, schedule, views, filter_update(setting), setting.generator)
-    return GaussianModel(setting, training.first_scene(gaussians), training, densifier_of(setting), colours)
+    model = run.config.model
+    if not isinstance(model, DynamicModel) or len(set(training_times(run.capture))) < 2:
+        return start_static(run)
+    gaussians = first_gaussians(run)
+    colours = colours_of(run, gaussians, sees_time=True)
+    schedule = deform_schedule(model, rates_of(run.config))
+    views = _training_views(run, model, colours)
+    training = DynamicTraining(model, schedule, views, filter_update(run), run.generator)
+    return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
 
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
@@ -48,12 +48,9 @@ def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     return drawn_as_trained(scene, model, checkpoint)
 
 
-KIND = Kind(DynamicModel, start, restore)
-
-
-def _training_views(setting: Setting, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
     """Return the properties of the capture that training a dynamic scene needs."""
-    config, capture, images = setting.config, setting.capture, setting.images
+    config, capture, images = run.config, run.capture, run.images
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
@@ -77,7 +74,7 @@ def _training_views(setting: Setting, model: DynamicModel, colours: ColourTraini
     return TrainingViews(
         training_times(capture),
         training_cameras(views, config.data),
-        setting.extent,
+        run.extent,
         errors_of,
         cameras_stay=bool(in_place),
         standing=standing,

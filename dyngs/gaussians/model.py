@@ -12,7 +12,6 @@ from torch import Tensor
 from dyngs.config import AutoColour, Config, DefaultStrategy, SceneModel
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, TrainingLooks
@@ -24,7 +23,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep, Scene, render_options
 from dyngs.gaussians.schedule import active_sh_degree, means_rate, rates_of
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Setting
+from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
@@ -110,7 +109,7 @@ class GaussianModel(Model[Scene]):
     """A scene of Gaussians in training.
 
     Args:
-        setting: of the run.
+        run: of the run.
         scene: before the first step, or predicted; its Gaussians become leaf tensors.
         training: how its kind is trained.
         densifier: the strategy, which adds and removes Gaussians.
@@ -122,15 +121,15 @@ class GaussianModel(Model[Scene]):
 
     def __init__(
         self,
-        setting: Setting,
+        run: RunStart,
         scene: Scene,
         training: SceneTraining[Any],
         densifier: Densifier,
         colours: ColourTraining,
     ) -> None:
-        config = setting.config
+        config = run.config
         self._config, self.densifier, self.colours = config, densifier, colours
-        self._setting, self._generator = setting, setting.generator
+        self._run, self._generator = run, run.generator
         self.options = training_options(config)
         self.begin_with(scene, training)
 
@@ -138,7 +137,7 @@ class GaussianModel(Model[Scene]):
         """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned yet."""
         config = self._config
         self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, config.optim)
-        behind = evaluation_background(config.data.background, self._setting.capture.has_alpha)[1]
+        behind = evaluation_background(config.data.background, self._run.capture.has_alpha)[1]
         self._scene = replace(
             scene.with_gaussians(self._optimizer.parameters),
             colour=self.colours.network,
@@ -218,7 +217,7 @@ class GaussianModel(Model[Scene]):
 
     def update(self, step: int) -> Updated:
         before, generator = self._optimizer.parameters, self._generator
-        lr_means = means_rate(self._config.optim, rates_of(self._config).progress(step), self._setting.extent)
+        lr_means = means_rate(self._config.optim, rates_of(self._config).progress(step), self._run.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
         bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
@@ -259,7 +258,7 @@ class GaussianModel(Model[Scene]):
 
     def keep_plain(self, plain: Tensor, colour: AutoColour) -> None:
         """Leave the harmonics of the Gaussians ``plain`` (N,) zero from now on."""
-        colours = AutoTraining(colour, self._config.train.steps, len(self._setting.images))
+        colours = AutoTraining(colour, self._config.train.steps, len(self._run.images))
         colours.freeze(plain)
         self.colours = colours
 
@@ -323,7 +322,7 @@ class GaussianModel(Model[Scene]):
 
     def _looks(self, step: int) -> TrainingLooks:
         """Return the training views as they are drawn after ``step``."""
-        images, colour = self._setting.images, background_colour(self._setting.background).to(self._scene.device)
+        images, colour = self._run.images, background_colour(self._run.background).to(self._scene.device)
 
         def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
             for image in (images[i] for i in indices):
@@ -338,18 +337,3 @@ def training_options(config: Config) -> RenderOptions:
     """Return how the training images of a run are drawn."""
     absgrad = isinstance(config.strategy, DefaultStrategy) and config.strategy.absgrad
     return replace(render_options(config.model), absgrad=absgrad, nonfinite="trust")
-
-
-def gaussian_model(model: Model[Any] | None, what: str) -> GaussianModel:
-    """Return ``model`` if it is made of Gaussians.
-
-    Args:
-        model: of any kind.
-        what: is not made of them, for the message.
-
-    Raises:
-        DyngsError: it is made of something else.
-    """
-    if not isinstance(model, GaussianModel):
-        raise DyngsError(f"{what}: is not made of Gaussians, which this needs")
-    return model

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
+from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
@@ -23,8 +24,7 @@ from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atla
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
-from dyngs.models.kind import Kind, Setting
-from dyngs.models.model import Model
+from dyngs.models.model import Predictor
 from dyngs.models.renderable import Renderable, Rendering
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for
@@ -45,6 +45,9 @@ MAX_GRADIENT = 1.0
 """Norm to which gradients are clipped."""
 MEAN_VIEWS = 8
 """Images of each person that the mean colours are taken from."""
+ADAPTING_RATE = 1e-4
+"""Highest learning rate of Adam per image of one person, which falls linearly: a single one says little about the other
+sides."""
 
 _LOWEST = 1e-3
 """Ratio of the last to the highest learning rate."""
@@ -75,14 +78,65 @@ class Filmed:
             self._there = fields_moved_to(self.sitter, device)
         return self._there
 
-    def look(self, views: list[int]) -> TexelMaps:
+    def look(self, views: Sequence[int]) -> TexelMaps:
         """Return the maps of these images."""
         return observe_texels(self.sitter, ((self.images[i], self.sitter.pose_in(self.sitter.views[i])) for i in views))
 
 
 @dataclass
+class PersonPredictor(Predictor):
+    """A network that predicts the person of a capture.
+
+    Attributes:
+        config: of the network's run.
+        model: its section.
+        network: may be trained on images of the person before, see ``adapt``.
+        mean: (3, S, S) colours of the people that it was trained on.
+        person: with images.
+    """
+
+    config: Config
+    model: HumanPredictorModel
+    network: AtlasNetwork
+    mean: Tensor
+    person: Filmed
+
+    @torch.no_grad()
+    def predict(self, views: Sequence[int]) -> HumanScene:
+        return self._scene(self.person.look(views))
+
+    def adapt(self, views: Sequence[int], steps: int, report: ReportProgress = report_nothing) -> None:
+        """Train the network until its prediction shows the images better that it is predicted from.
+
+        Args:
+            views: predicted from, and compared with.
+            steps: 0 changes nothing.
+            report: is told how far it has come.
+        """
+        options = replace(render_options(self.model), nonfinite="trust")
+        background = evaluation_background(self.config.data.background, True)[1]
+        images, maps = [self.person.images[i] for i in views], self.person.look(views)
+        rate = ADAPTING_RATE * len(views)
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=rate)
+        for step in range(steps):
+            scene, total = self._scene(maps), torch.zeros((), device=self.mean.device)
+            for image in images:
+                moment = scene.time_step(image.time)
+                rendering = scene.render(image.cameras, moment, options=options, background=background)
+                total = total + image_loss(rendering, image, image.composite(background), self.config) / len(images)
+            if not _updated(optimizer, self.network, total, rate * (1.0 - step / steps)):
+                break
+            report("training on the images", step + 1, steps)
+
+    def _scene(self, maps: TexelMaps) -> HumanScene:
+        fraction = self.model.min_silhouette_fraction
+        avatar = predict_gaussians(self.person.sitter, maps, self.mean, self.network, fraction)
+        return scene_of(human_options(self.model), avatar, Rates(1))[0]
+
+
+@dataclass
 class NetworkTrainer:
-    """A run in memory, as ``dyngs.training.step.Trainer``.
+    """A run in memory, as ``Trainer``.
 
     Attributes:
         people: to train on, at least one.
@@ -185,18 +239,23 @@ class NetworkTrainer:
         return [person.images[shown[i]].to(self.device) for i in order[: self.model.target_views]]
 
     def _update(self, loss: Tensor, step: int) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), MAX_GRADIENT)
-        if not bool(length.isfinite()):
-            self.bad_gradients += 1
-            return
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate_at(self.model, step, self.config.train.steps)
-        self.optimizer.step()
+        rate = rate_at(self.model, step, self.config.train.steps)
+        self.bad_gradients += not _updated(self.optimizer, self.network, loss, rate)
 
     def _draw(self, count: int) -> int:
         return int(torch.randint(count, (1,), generator=self.generator, device="cpu"))
+
+
+def _updated(optimizer: torch.optim.Optimizer, network: AtlasNetwork, loss: Tensor, rate: float) -> bool:
+    """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are not finite."""
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    if not bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT).isfinite()):
+        return False
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    optimizer.step()
+    return True
 
 
 def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config) -> Tensor:
@@ -212,7 +271,7 @@ def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config
     return loss
 
 
-def assemble_network(config: Config) -> NetworkTrainer:
+def trainer(config: Config) -> NetworkTrainer:
     """Return the trainer of ``model.kind: human_predictor``: captures read, nothing trained.
 
     Raises:
@@ -241,12 +300,9 @@ def assemble_network(config: Config) -> NetworkTrainer:
     )
 
 
-def _no_scene(_: HumanPredictorModel, checkpoint: Checkpoint) -> Renderable:
+def restore(_: HumanPredictorModel, checkpoint: Checkpoint) -> Renderable:
+    """Raise DyngsError: a network is no scene."""
     raise DyngsError(f"{checkpoint.name}: a network, not a scene; `dyngs predict RUN CAPTURE --out RUN` makes one")
-
-
-def _no_model(setting: Setting) -> Model[Any]:
-    raise TypeError("a network is not trained on one capture")
 
 
 def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
@@ -353,6 +409,3 @@ def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[
     """Return a predicted avatar as a scene, and how it is trained on."""
     training = HumanTraining(model, avatar.subject.motion.frames, rates)
     return training.first_scene(avatar.gaussians, avatar.subject), training
-
-
-KIND = Kind(HumanPredictorModel, _no_model, _no_scene, trainer=assemble_network)

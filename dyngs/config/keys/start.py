@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Positive, Section
+from dyngs.section import Positive, Section
 
 
 class PointsInit(Section):

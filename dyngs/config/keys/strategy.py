@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Fraction, Positive, Section
+from dyngs.section import Fraction, Positive, Section
 
 _OF_30000 = "of a 30,000-step run, scaled with train.steps"
 

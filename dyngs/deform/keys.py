@@ -1,4 +1,4 @@
-"""Section ``model``, part 2: moving scenes, and the deformation fields of ``model.deform``."""
+"""Section ``model`` of moving scenes, and the deformation fields of ``model.deform``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.model import SceneModel
-from dyngs.config.keys.section import Fraction, Positive, Section
+from dyngs.section import Fraction, Positive, SceneModel, Section
 
 
 class FieldSection(Section):
