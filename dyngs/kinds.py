@@ -19,7 +19,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
@@ -121,7 +121,7 @@ def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
             raise DyngsError(f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew") from None
 
 
-def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> Scene:
+def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
     """Return the scene of a checkpoint of ``model``; see ``restored_model``.
 
     Raises:

@@ -37,7 +37,7 @@ class ModelSection(Section):
     is_posed: ClassVar[bool] = False
     may_move: ClassVar[bool] = False
     if TYPE_CHECKING:
-        kind: Any
+        kind: Any = None
         """Name of the kind."""
 
     @property

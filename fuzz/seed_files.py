@@ -21,7 +21,7 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.files.tensor_file import write_tensors
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.kinds import restored_scene
@@ -365,7 +365,7 @@ def _gaussians() -> dict[str, torch.Tensor]:
     return {f"gaussians.{name}": x.contiguous() for name, x in row_of_balls().tensors().items()}
 
 
-def _scene(tensors: dict[str, torch.Tensor], model: SceneModel) -> Scene:
+def _scene(tensors: dict[str, torch.Tensor], model: SceneModel) -> GaussianScene:
     return restored_scene(Checkpoint(_INFO, tensors), model)
 
 

@@ -17,7 +17,7 @@ from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import prefixed, tensors_of
 from dyngs.storage.coding import compressed
@@ -112,7 +112,7 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
     return body + hashlib.sha256(body).digest()
 
 
-def require_drawable(scene: Scene) -> None:
+def require_drawable(scene: GaussianScene) -> None:
     """Nothing, if the images of a scene are finite; raises what drawing it raises."""
     for time in (None, 0.0, 0.37, 1.0):
         for options in (RenderOptions(), RenderOptions(near=0.01, depth="expected")):

@@ -22,7 +22,7 @@ from dyngs.errors import DyngsError, counted
 if TYPE_CHECKING:
     from dyngs.export.redrawn import Redrawn
     from dyngs.export.splat_files import Part
-    from dyngs.gaussians.scene import Scene
+    from dyngs.gaussians.scene import GaussianScene
     from dyngs.runs.opened import Opened
     from dyngs.splats.formats import Written
 
@@ -288,7 +288,7 @@ def _part(arguments: argparse.Namespace) -> Part:
     return "still" if arguments.static else "moving" if arguments.dynamic else "all"
 
 
-def _redrawn(opened: Opened, scene: Scene, time: float, written: Written) -> Redrawn:
+def _redrawn(opened: Opened, scene: GaussianScene, time: float, written: Written) -> Redrawn:
     """Return how a file differs from the scene."""
     from dyngs.export.redrawn import compare_run
     from dyngs.splats.formats import read_splats

@@ -13,7 +13,7 @@ from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
-from dyngs.gaussians.scene import GaussianTimeStep, Scene, stored_times, times_state
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, matched
 from dyngs.models.renderable import clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed
@@ -23,7 +23,7 @@ _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DynamicScene(Scene):
+class DynamicScene(GaussianScene):
     """N canonical Gaussians of which a field moves M.
 
     Attributes:
@@ -145,7 +145,7 @@ class DynamicScene(Scene):
         return _Part(gaussians.picked(active), std, means, asked, rows)
 
 
-def field_scene_of(scene: Scene) -> DynamicScene | None:
+def field_scene_of(scene: GaussianScene) -> DynamicScene | None:
     """Return ``scene`` if a deformation field moves it, None for any other scene."""
     return scene if isinstance(scene, DynamicScene) and not scene.is_static else None
 

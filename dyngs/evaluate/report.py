@@ -24,7 +24,7 @@ from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, 
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import LpipsNet, MetricValue, load_lpips
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
@@ -186,7 +186,7 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
         "step": run.step,
         "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
     }
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, GaussianScene):
         values = sum(x.tensor.numel() for x in scene.drawing_state().values())
         none = {"num_gaussians": 0, "num_moving": 0, "moving_fraction": 0.0, "field_mb": 0.0, "colour_floats": 0.0}
         return facts | none | {"model_mb": 4e-6 * values}
@@ -243,12 +243,12 @@ def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Se
     """Return the errors of the scene's motion where the capture has true tracks."""
     tracks = read_true_tracks(capture.root, capture.world_offset)
     cameras = training_cameras(views, run.config.data)
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, GaussianScene):
         return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")
     return track_scores(scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits))
 
 
-def parameter_megabytes(scene: Scene) -> float:
+def parameter_megabytes(scene: GaussianScene) -> float:
     """Return the size in 1e6 bytes as float32: 236 bytes per Gaussian at SH degree 3, the field, and masks as bits.
 
     Harmonics of a Gaussian that are all zero beyond the base colour do not count.

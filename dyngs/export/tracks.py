@@ -12,7 +12,7 @@ import torch
 from dyngs.errors import DyngsError
 from dyngs.export.splat_files import scene_part
 from dyngs.files.write import atomic_file
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 
 MAX_BYTES = 4_000_000_000
 """Largest size of the positions, which are held in memory."""
@@ -37,7 +37,7 @@ class Tracks:
 
 
 def tracks_of(
-    scene: Scene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
+    scene: GaussianScene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
 ) -> Tracks:
     """Return the tracks of a scene.
 

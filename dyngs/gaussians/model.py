@@ -20,7 +20,7 @@ from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import GaussianTimeStep, Scene, render_options
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import active_sh_degree, means_rate, rates_of
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
@@ -30,7 +30,7 @@ from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, prefixed, with_role
 
-S = TypeVar("S", bound=Scene)
+S = TypeVar("S", bound=GaussianScene)
 
 
 class SceneTraining(Generic[S]):
@@ -105,7 +105,7 @@ class SceneTraining(Generic[S]):
         return {}
 
 
-class GaussianModel(Model[Scene]):
+class GaussianModel(Model[GaussianScene]):
     """A scene of Gaussians in training.
 
     Args:
@@ -122,7 +122,7 @@ class GaussianModel(Model[Scene]):
     def __init__(
         self,
         run: RunStart,
-        scene: Scene,
+        scene: GaussianScene,
         training: SceneTraining[Any],
         densifier: Densifier,
         colours: ColourTraining,
@@ -133,7 +133,7 @@ class GaussianModel(Model[Scene]):
         self.options = training_options(config)
         self.begin_with(scene, training)
 
-    def begin_with(self, scene: Scene, training: SceneTraining[Any]) -> None:
+    def begin_with(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
         """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned yet."""
         config = self._config
         self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, config.optim)
@@ -146,7 +146,7 @@ class GaussianModel(Model[Scene]):
         )
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> GaussianScene:
         return self._scene
 
     @property
@@ -235,7 +235,7 @@ class GaussianModel(Model[Scene]):
         text = "; ".join(text for text in findings if text) or None
         return Updated(bad, text, self._optimizer.parameters is not before)
 
-    def exchange(self, scene: Scene) -> None:
+    def exchange(self, scene: GaussianScene) -> None:
         """Go on with ``scene``: the same Gaussians, moved, masked or drawn in another way."""
         self._scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene.changed()
@@ -292,7 +292,7 @@ class GaussianModel(Model[Scene]):
         self._optimizer = self._optimizer.to(device)
         self.colours.place(device)
         self.densifier.place(device)
-        scene: Scene = self._scene.to(device)
+        scene: GaussianScene = self._scene.to(device)
         scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene = replace(scene, colour=self.colours.network)
 
@@ -301,7 +301,7 @@ class GaussianModel(Model[Scene]):
         degree = active_sh_degree(self._config.train, step, self._scene.gaussians.sh_degree)
         return replace(self.options, sh_degree=degree)
 
-    def _apply(self, result: EditResult, edited: Scene | None = None) -> None:
+    def _apply(self, result: EditResult, edited: GaussianScene | None = None) -> None:
         """Change the set of Gaussians, and everything that is stored per Gaussian with it; ``edited``: is already."""
         self._optimizer.apply(result)
         if edited is None:

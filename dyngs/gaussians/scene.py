@@ -28,7 +28,7 @@ from dyngs.models.views import background_colour
 from dyngs.state import Role, State, prefixed, with_role
 from dyngs.tensor_checks import require_moments
 
-S = TypeVar("S", bound="Scene")
+S = TypeVar("S", bound="GaussianScene")
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class GaussianTimeStep(TimeStep):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene(Renderable):
+class GaussianScene(Renderable):
     """N Gaussians at any time.
 
     Example::
@@ -175,7 +175,7 @@ class Scene(Renderable):
         """Return the scene with only the Gaussians at ``index`` (long or bool)."""
         return self.edited(TopologyEdit.select(index))
 
-    def part(self, which: Literal["moving", "still"]) -> Scene:
+    def part(self, which: Literal["moving", "still"]) -> GaussianScene:
         """Return only the Gaussians that move, or only those that do not."""
         moves = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         if not self.is_static:
@@ -208,7 +208,7 @@ class Scene(Renderable):
         """Return the state of this kind of scene beside its Gaussians and colours."""
 
 
-def require_gaussians(scene: Renderable, what: str) -> Scene:
+def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
     """Return ``scene`` if it is made of Gaussians.
 
     Args:
@@ -218,7 +218,7 @@ def require_gaussians(scene: Renderable, what: str) -> Scene:
     Raises:
         DyngsError: it is made of something else.
     """
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, GaussianScene):
         raise DyngsError(f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed")
     return scene
 

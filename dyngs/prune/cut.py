@@ -13,7 +13,7 @@ from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY
 from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.views import background_colour
 from dyngs.ops.transfer import sent
@@ -52,7 +52,7 @@ class Cut:
         return ", ".join(words) or "nothing"
 
 
-def field_size(scene: Scene) -> FieldSize | None:
+def field_size(scene: GaussianScene) -> FieldSize | None:
     """Return the size of the field of ``scene``; None where no control nodes move anything."""
     match scene:
         case DynamicScene(field=ControlNodes() as field, is_static=False) if field.num_nodes:
@@ -61,7 +61,7 @@ def field_size(scene: Scene) -> FieldSize | None:
             return None
 
 
-def with_field(scene: Scene, size: FieldSize) -> Scene:
+def with_field(scene: GaussianScene, size: FieldSize) -> GaussianScene:
     """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move anything."""
     match scene:
         case DynamicScene(field=ControlNodes() as field, is_static=False):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 
 STEEPNESS = 4.0
 """Slope of the hyperbolic tangent: second differences of a profile are small numbers."""
@@ -31,7 +31,7 @@ class ScoringViews:
         times: K moments in [0, 1], ascending; one None for a static scene.
     """
 
-    scene: Scene
+    scene: GaussianScene
     cameras: Sequence[Cameras]
     times: Sequence[float | None]
     options: RenderOptions

@@ -23,7 +23,7 @@ from dyngs.config import Config
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
@@ -199,7 +199,7 @@ class Search:
             return Stored(candidate, file, Limit("precision", f"steps {file.factor:.2g} times the usual", refused))
         raise DyngsError(f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more")
 
-    def _quality(self, scene: Scene) -> float:
+    def _quality(self, scene: GaussianScene) -> float:
         """Return the mean PSNR of the views that count, drawn of ``scene`` as it wants to be drawn, dB."""
         return quality_of(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
 

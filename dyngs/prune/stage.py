@@ -19,7 +19,7 @@ from dyngs.camera import Cameras
 from dyngs.config import PruneConfig
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
@@ -140,7 +140,9 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
     return [different[i] for i in evenly_spaced(len(different), count)]
 
 
-def scoring_views(trainer: GaussianTrainer, scene: Scene, times: Sequence[float | None] | None = None) -> ScoringViews:
+def scoring_views(
+    trainer: GaussianTrainer, scene: GaussianScene, times: Sequence[float | None] | None = None
+) -> ScoringViews:
     """Return all pairs of some training cameras and some times; with no times all that matters are cameras."""
     background = background_colour(trainer.background)
     if times is None:
@@ -151,7 +153,7 @@ def scoring_views(trainer: GaussianTrainer, scene: Scene, times: Sequence[float 
 
 
 @torch.no_grad()
-def training_quality(trainer: GaussianTrainer, scene: Scene) -> float:
+def training_quality(trainer: GaussianTrainer, scene: GaussianScene) -> float:
     """Return the mean PSNR of at most 16 training images drawn of ``scene``, dB."""
     return quality_of(trainer, scene, probe_images(trainer))
 
@@ -163,7 +165,7 @@ def probe_images(trainer: GaussianTrainer) -> list[Image]:
 
 @torch.no_grad()
 def quality_of(
-    trainer: GaussianTrainer, scene: Scene, images: Sequence[Image], alpha_min: float | None = None
+    trainer: GaussianTrainer, scene: GaussianScene, images: Sequence[Image], alpha_min: float | None = None
 ) -> float:
     """Return the mean PSNR of ``images`` drawn of ``scene``, dB; ``alpha_min`` instead of that of training."""
     background, options = sent(background_colour(trainer.background), trainer.device), trainer.model.options
@@ -175,7 +177,7 @@ def quality_of(
     return fmean(values)
 
 
-def _masks(trainer: GaussianTrainer, scene: Scene, kept: Tensor) -> VisibilityMasks:
+def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> VisibilityMasks:
     """Return at which of evenly spaced key times each Gaussian kept is seen from any of the survey's cameras."""
     options, last = trainer.config.prune, len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))

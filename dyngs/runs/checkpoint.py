@@ -23,7 +23,7 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, as_word, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.kinds import restored_model
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.renderable import Renderable
@@ -54,7 +54,7 @@ class LoadedRun:
     info: CheckpointInfo
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> GaussianScene:
         """Its scene of Gaussians.
 
         Raises:

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
-from dyngs.gaussians.scene import GaussianTimeStep, Scene, stored_times, times_state
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
 from dyngs.models.renderable import clamped_time
 from dyngs.state import State
 
 
 @dataclass(frozen=True, kw_only=True)
-class StaticScene(Scene):
+class StaticScene(GaussianScene):
     """The same N Gaussians at every time.
 
     Attributes:

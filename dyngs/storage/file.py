@@ -26,7 +26,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.storage.coding import Packing, compressed, decompressed, packed, unpacked
 from dyngs.storage.tensors import (
     COARSENESS,
@@ -139,7 +139,9 @@ def read_scene(path: Path) -> StoredScene:
         raise DyngsError(f"{path}: {error}") from None
 
 
-def encoded(info: SceneInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
+def encoded(
+    info: SceneInfo, scene: GaussianScene, steps: Mapping[str, float], coarseness: Tensor | None = None
+) -> bytes:
     """Return the bytes of a file; the same for what was read from it.
 
     Args:

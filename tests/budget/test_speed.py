@@ -40,7 +40,7 @@ from dyngs.config import (
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.drawing import Drawing
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import assemble, restored_scene
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.events import Event, StepDone
@@ -53,7 +53,7 @@ BASE, EACH = 1e-3, 1e-5
 """Seconds that the simulated machine takes for a drawing without Gaussians, and for each of them, moved or drawn."""
 
 
-def simulated(scene: Scene) -> float:
+def simulated(scene: GaussianScene) -> float:
     """Seconds of a drawing on the simulated machine."""
     return BASE + EACH * (len(scene) + (0 if scene.is_static else len(scene.rows)))
 
@@ -71,7 +71,7 @@ def asked(config: Config, fps: float | None) -> Config:
 def machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulated machine, on which nothing else takes time."""
 
-    def seconds(trainer: Trainer, scene: Scene, views: int = 0) -> float:
+    def seconds(trainer: Trainer, scene: GaussianScene, views: int = 0) -> float:
         return simulated(scene)
 
     monkeypatch.setattr("dyngs.budget.speed.drawing_seconds", seconds)

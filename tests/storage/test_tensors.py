@@ -16,7 +16,7 @@ from dyngs.config import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
@@ -228,7 +228,7 @@ def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
     return scene, DynamicModel(deform=tiny_options(kind))
 
 
-def stored(scene: Scene) -> dict[str, torch.Tensor]:
+def stored(scene: GaussianScene) -> dict[str, torch.Tensor]:
     """What a file holds of a scene, in its order."""
     return drawable(scene.edited(stored_edit(scene, scene.gaussians.means.numpy())))
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.training.corrections.camera_refinement import corrected, slopes, watched
@@ -21,7 +21,7 @@ SSIM_WEIGHT = 0.2
 
 
 def fitted_to_image(
-    scene: Scene,
+    scene: GaussianScene,
     image: Image,
     background: Tensor,
     size: float,

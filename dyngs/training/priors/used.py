@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.model import Look, Loss
 from dyngs.training.priors.depth_maps import Kind, depth_error
 from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
@@ -95,11 +95,11 @@ class UsedPriors(Loss):
         if self.depth is not None and image.depth is not None and rendering.depth is not None:
             drawn, alpha = rendering.depth[0], rendering.alpha[0]
             found["depth"] = depth_error(drawn, alpha, image.depth, self.depth, image.mask)
-        if isinstance(scene, Scene) and not scene.is_static and image.time is not None:
+        if isinstance(scene, GaussianScene) and not scene.is_static and image.time is not None:
             found |= self._motion(scene, look)
         return {name: WEIGHTS.get(name, 1.0) * x for name, x in found.items() if x is not None}
 
-    def _motion(self, scene: Scene, look: Look) -> dict[str, Tensor | None]:
+    def _motion(self, scene: GaussianScene, look: Look) -> dict[str, Tensor | None]:
         image, (first, last) = look.image, look.model.window(look.step)
 
         def may_use(time: float) -> bool:

@@ -28,7 +28,7 @@ from dyngs.deform.fields import new_field
 from dyngs.export.html.page import MOST_VIEWS, SCRIPTS, SHADERS, WrittenPage, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr, ssim
 from dyngs.runs.opened import Opened, open_run, opened_scene
 from dyngs.static.scene import StaticScene
@@ -41,7 +41,7 @@ def browser() -> Iterator[Browser]:
 
 
 def write(
-    scene: Scene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
+    scene: GaussianScene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
 ) -> WrittenPage:
     scene = replace(scene, options=options or scene.options, background=torch.ones(3))
     return write_page(replace(opened_scene(scene), stated_up="-y"), path, title=title, views=(view,))
@@ -64,7 +64,7 @@ def shown(page: Page, view: Cameras, time: float) -> torch.Tensor:
     return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
 
 
-def assert_alike(page: Page, scene: Scene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:
+def assert_alike(page: Page, scene: GaussianScene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:
     for time in (0.0, 0.4, 1.0):
         truth = scene.render(view, time, options=options, background=torch.ones(3)).rgb[0].detach()
         found = shown(page, view, time)
@@ -262,7 +262,7 @@ def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
     return a.shape != b.shape or bool(np.abs(a.astype(int) - b).max() > 40)
 
 
-def sliding_scene() -> Scene:
+def sliding_scene() -> GaussianScene:
     """Five balls of which two go along x."""
     options = tiny_options("trajectory", everything=False)
     field = new_field(options, FieldSetup(torch.zeros(3), torch.ones(3), 5, 2, 1.0), torch.Generator())
