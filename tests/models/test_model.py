@@ -15,7 +15,7 @@ from toy_kind import registered
 from dyngs.config import Config, ModelSection
 from dyngs.config.io import load_config
 from dyngs.errors import DyngsError
-from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.kinds import build, restored_model
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import KINDS, kind_of
@@ -131,7 +131,7 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config) -> None:
     if config.model.made_of_gaussians:
         assert require_gaussians(scene, "it") is scene
         return
-    assert not isinstance(scene, Scene)
+    assert not isinstance(scene, GaussianScene)
     with pytest.raises(DyngsError, match="it: is not made of Gaussians"):
         require_gaussians(scene, "it")
 
