@@ -356,9 +356,7 @@ CAPTURES: dict[str, dict[str, Seed]] = {
 _NEEDS = {"people_snapshot": "h5py"}
 # USD is read in a process of its own, too slow for thousands of inputs.
 _PACKED = ("compressed-ply", "spz", "splat", "sog", "glb")
-_RUNS: dict[str, Seed] = {
-    kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes", "trajectory")
-}
+_RUNS: dict[str, Seed] = {kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes")}
 _JOINTS: dict[str, Seed] = {
     "npz": files.write_joints_npz,
     "json": files.write_joints_json,

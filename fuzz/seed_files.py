@@ -250,7 +250,7 @@ def write_scene_file_still(root: Path) -> None:
 
 def write_scene_file_moving(root: Path) -> None:
     """The same of a scene that moves, with steps."""
-    config, tensors = _moving("trajectory")
+    config, tensors = _moving("control_nodes")
     save_config(config, root / RESOLVED_NAME)
     steps = {f"gaussians.{name}": 0.01 for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")}
     (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(tensors, config.model), steps))

@@ -137,7 +137,7 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         colours = NetworkTraining(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
         state |= tensors_of(prefixed("colour", colours.network.state() | colours.state()))
     elif kind != "static":
-        field = "trajectory" if kind == "masked" else kind
+        field = "control_nodes" if kind == "masked" else kind
         model = DynamicModel(deform=tiny_options(field))
         state |= tensors_of(prefixed("field", field_state(stirred_field(field, len(_ROWS)))))
         state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}

@@ -13,7 +13,6 @@ from dyngs.deform.keys import (
     FieldSection,
     HexplaneField,
     MlpField,
-    TrajectoryField,
 )
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
@@ -53,5 +52,4 @@ __all__ = [
     "StaticModel",
     "Strategy",
     "TrainConfig",
-    "TrajectoryField",
 ]

@@ -103,7 +103,7 @@ class ControlNodes(NetworkField):
         return self.parameters.num_values + sum(x.numel() for x in self.buffers.values())
 
     def edited(self, edit: TopologyEdit) -> ControlNodes:
-        field = self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+        field = copy.copy(self)
         field.buffers = {n: edit.apply(x) if n == "followed" else x for n, x in self.buffers.items()}
         return field
 

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel
+from dyngs.config import ControlNodesField, DynamicModel
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup, Offsets, deformed
-from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
+from dyngs.deform.fields import field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.motion import bake_, measure_motion
@@ -175,7 +175,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
-        if first.seeds:
+        if first.seeds and isinstance(self.options.deform, ControlNodesField):
             others = now.means.detach()[rows].cpu()  # tracks and seeds are found on the CPU
             field = field_on_its_way(self.options.deform, fields_moved_to(setup, "cpu"), first, others)
             self._on_its_way(True)
@@ -209,7 +209,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def _first_motion(self, still: Gaussians, rows: Tensor) -> FirstMotion:
         """Return what travels before fixed cameras, for a field that can begin on its way."""
-        if not can_begin_on_its_way(self.options.deform):
+        if not isinstance(self.options.deform, ControlNodesField):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still, rows, self.capture.extent, limit)

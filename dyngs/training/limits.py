@@ -124,8 +124,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     fixed, moves_by = 0.0, config.model.deform if isinstance(config.model, DynamicModel) else None
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
     if moves_by is not None and num_times > 1:
-        one, two = (num_field_values(moves_by, num_times, count) for count in (1, 2))
-        fixed, each = FIELD_BYTES * (2 * one - two), each + FIELD_BYTES * (two - one)
+        fixed = FIELD_BYTES * num_field_values(moves_by, num_times)
     found = int((1e6 * megabytes - fixed) / each)
     if found < FEWEST:
         field = f", of which the field takes {1e-6 * fixed:.2g}" if fixed else ""
@@ -136,7 +135,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     return found
 
 
-def num_field_values(options: DeformField, num_times: int, num_moving: int) -> int:
+def num_field_values(options: DeformField, num_times: int) -> int:
     """Return the number of values that a field learns."""
-    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0)
+    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, 0, 1.0)
     return new_field(options, setup, torch.Generator()).parameters.num_values

@@ -22,7 +22,6 @@ from dyngs.config import (
     McmcStrategy,
     MlpField,
     RandomInit,
-    TrajectoryField,
 )
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
@@ -40,15 +39,13 @@ POSING_BYTES = 2600
 """Bytes of a Gaussian of a person beside that, where the body fit is refined: its anchor, weights of joints, their
 gradients, and the Gaussian in a pose."""
 MOVING_BYTES = 200
-"""Bytes beside that of a Gaussian that control nodes or its own trajectory move: the Gaussian at a time."""
+"""Bytes beside that of a Gaussian that control nodes move: the Gaussian at a time."""
 LOOKUP_COPIES = 12
 """Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice."""
 ACTIVATION_COPIES = 3
 """Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a gradient."""
 FIELD_COPIES = 5
 """Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for the penalties."""
-FEW_TIMES = 100
-"""Distinct times for which the values of a field are counted where their number does not matter."""
 SHAPE_VALUES = 11
 """Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity."""
 DRAWING_BYTES = 200
@@ -310,9 +307,8 @@ def gaussian_bytes(config: Config) -> int:
             return each + 4 * LOOKUP_COPIES * field.channels * len(field.levels)
         case MlpField():
             return each + 4 * ACTIVATION_COPIES * field.depth * field.width
-        case ControlNodesField() | TrajectoryField():
-            one, two = (num_field_values(field, FEW_TIMES, count) for count in (1, 2))
-            return each + MOVING_BYTES + 4 * COPIES * (two - one)
+        case ControlNodesField():
+            return each + MOVING_BYTES
         case _:
             assert_never(field)
 
@@ -326,8 +322,7 @@ def field_bytes(config: Config, num_times: int) -> int:
     field = _field(config)
     if field is None or num_times < 2:
         return 0
-    one, two = (num_field_values(field, num_times, count) for count in (1, 2))
-    return 4 * FIELD_COPIES * (2 * one - two)
+    return 4 * FIELD_COPIES * num_field_values(field, num_times)
 
 
 def num_changes(config: Config, steps: int | None = None) -> int:

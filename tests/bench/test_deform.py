@@ -69,7 +69,7 @@ def test_all_or_none_may_move(capture: Path, fraction: float, num_moving: int) -
 
 
 def test_a_run_is_measured_with_what_moves_in_it(capture: Path, tmp_path: Path) -> None:
-    run = train(busy_config(capture, tmp_path / "run", "trajectory"))
+    run = train(busy_config(capture, tmp_path / "run", "control_nodes"))
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     last = json.loads((run / "log.jsonl").read_text().splitlines()[-1])
     _check(bench_deform(load_of_run(run), threads=1, rounds=1), last["num_gaussians"], last["num_moving"])
@@ -121,9 +121,9 @@ def test_bad_arguments_are_one_line(
 
 
 def test_the_command_prints_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--kind", "trajectory", "--gaussians", "40", "--moving", "0.5", "--threads", "1", "--repeats", "1"]
+    arguments = ["--kind", "control_nodes", "--gaussians", "40", "--moving", "0.5", "--threads", "1", "--repeats", "1"]
     assert main(["bench", "deform", *arguments, "--json", str(tmp_path / "bench.json")]) == 0
-    assert "trajectory: 40 Gaussians, 20 (50.0%) move; 1 thread(s)" in capsys.readouterr().out
+    assert "control_nodes: 40 Gaussians, 20 (50.0%) move; 1 thread(s)" in capsys.readouterr().out
     assert json.loads((tmp_path / "bench.json").read_text())["num_moving"] == 20
 
 

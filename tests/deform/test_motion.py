@@ -117,7 +117,7 @@ def test_long_clips_are_sampled_evenly(count: int) -> None:
 def test_baking_freezes_at_the_mean(everything: bool) -> None:
     """Rows that are baked look as the field shows them on average; the others do not change."""
     gaussians = cloud()
-    field = stirred_field("trajectory", everything=everything)
+    field = stirred_field("control_nodes", everything=everything)
     mean = measure_motion(field, gaussians, TIMES, torch.ones(9)).mean
     samples = [field.offsets(gaussians.means, t).means.detach() for t in TIMES]
     torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))

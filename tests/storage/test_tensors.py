@@ -253,12 +253,12 @@ def test_the_stored_form_looks_the_same(kind: str) -> None:
 
 
 def test_what_moves_is_in_front_and_followed() -> None:
-    scene, _ = moving("trajectory")
+    scene, _ = moving("control_nodes")
     kept = stored(scene)
     assert kept["model.rows"].tolist() == list(range(len(ROWS)))
     place = {tuple(mean): i for i, mean in enumerate(scene.gaussians.means.tolist())}
     came_from = [ROWS.index(place[tuple(mean)]) for mean in kept["gaussians.means"][: len(ROWS)].tolist()]
-    name = "model.field.learned.means"
+    name = "model.field.buffers.followed"
     assert torch.equal(kept[name], scene.state()[name].tensor[came_from])
 
 
@@ -311,7 +311,7 @@ def test_what_is_not_finite_is_refused() -> None:
 
 def masked() -> tuple[DynamicScene, DynamicModel]:
     """As ``moving``; each Gaussian is seen at one of three key times."""
-    scene, model = moving("trajectory")
+    scene, model = moving("control_nodes")
     masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
     return replace(scene, masks=masks), model
 
