@@ -65,14 +65,10 @@ def assemble(
     """Return the trainer of a scene: its model begun, nothing trained.
 
     Args:
-        config: of a run, not of a network.
         capture: as ``prepared`` returned it; None: it is read now.
         restored: a checkpoint will be, so that it does not matter where the model begins: no points are triangulated.
         images: the training images of another trainer of the same ones; None: they are opened.
         held_out: indices of training views that are never trained on.
-
-    Raises:
-        DyngsError: a capture that cannot be read, a budget that is too small.
     """
     if capture is None:
         capture = read_capture(config.data) if restored else prepared(config)
@@ -122,11 +118,7 @@ def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
 
 
 def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
-    """Return the scene of a checkpoint of ``model``; see ``restored_model``.
-
-    Raises:
-        DyngsError: it is made of something else than Gaussians, too.
-    """
+    """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
     return require_gaussians(restored_model(checkpoint, model), checkpoint.name)
 
 
@@ -134,21 +126,12 @@ def prepared(config: Config) -> Capture:
     """Return the capture of a run with the points that its scene begins with, see ``with_first_points``.
 
     What is suspicious about the capture, and where the points are from, is printed to stderr.
-
-    Raises:
-        DyngsError: it cannot be read.
     """
     return with_points(read_capture(config.data), config)
 
 
 def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
-    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others need none.
-
-    Args:
-        capture: as it was read.
-        config: of a run.
-        quiet: nothing is printed.
-    """
+    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others need none."""
     lines: list[str] = []
     if config.model.begins_with_points:
         init = config.init

@@ -63,7 +63,7 @@ LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
 
 
 @dataclass(frozen=True)
-class Setting:
+class OpenSetting:
     """A setting that small runs decide about.
 
     Attributes:
@@ -129,7 +129,7 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
             best = _with(best, "model", choose=False)
             if moves is None:
                 base, moving = _at_rest(plain_config), best
-                settings.insert(0, Setting("model.kind=dynamic", lambda _: moving))
+                settings.insert(0, OpenSetting("model.kind=dynamic", lambda _: moving))
             else:
                 base = best = best if moves else as_static(plain_config)
         case _ if settings:
@@ -153,7 +153,9 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     return found, choices, prepared
 
 
-def _decided(config: Config, settings: Sequence[Setting], plan: _Plan, capture: Capture) -> tuple[Config, list[Choice]]:
+def _decided(
+    config: Config, settings: Sequence[OpenSetting], plan: _Plan, capture: Capture
+) -> tuple[Config, list[Choice]]:
     """Return ``config`` with the settings that win, each tried on top of those before it, and all figures."""
     print(f"small runs of {plan.steps:,} steps, compared on training views that are held out:", flush=True)
     runs, found = plan.trained(config, capture), list[Choice]()
@@ -307,22 +309,24 @@ def _held_out(views: Sequence[View]) -> list[frozenset[int]]:
     return [frozenset(order[every // 2 :: every])]
 
 
-def _settings(config: Config) -> list[Setting]:
+def _settings(config: Config) -> list[OpenSetting]:
     """Return what is open in ``config``, by what it was worth in the past, the most first."""
-    model, found = config.model, list[Setting]()
+    model, found = config.model, list[OpenSetting]()
     if not isinstance(model, (StaticModel, DynamicModel)):
         return found
     if config.camera.refine == "auto":
-        found.append(Setting("camera.refine=always", lambda c: _with(c, "camera", refine="always"), after_pose_fit))
+        found.append(OpenSetting("camera.refine=always", lambda c: _with(c, "camera", refine="always"), after_pose_fit))
     if config.train.exposure == "auto":
-        found.append(Setting("train.exposure=always", lambda c: _with(c, "train", exposure="always"), after_colour_fit))
+        found.append(
+            OpenSetting("train.exposure=always", lambda c: _with(c, "train", exposure="always"), after_colour_fit)
+        )
     if config.train.robust == "auto":
-        found.append(Setting("train.robust=always", _robust, explained))
+        found.append(OpenSetting("train.robust=always", _robust, explained))
     if isinstance(model, DynamicModel) and model.choose:
         if config.colour == ShColour() and not config.colour.model_fields_set:
-            found.append(Setting("colour.kind=network", _network))
+            found.append(OpenSetting("colour.kind=network", _network))
         if "move_opacities" not in model.deform.model_fields_set:
-            found.append(Setting("model.deform.move_opacities=true", _moving_opacities))
+            found.append(OpenSetting("model.deform.move_opacities=true", _moving_opacities))
     return found
 
 

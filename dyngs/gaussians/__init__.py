@@ -93,7 +93,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Return the degree of the harmonics."""
+        """Degree of the harmonics."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def tensors(self) -> dict[str, Tensor]:

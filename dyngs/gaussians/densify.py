@@ -32,8 +32,6 @@ class DensifySchedule:
 
     Attributes:
         start, stop: changes happen strictly between the two.
-        every: steps between changes.
-        resets: steps at which opacities are lowered.
         prune_scale_after: from this step on, Gaussians that are too large are removed.
     """
 
@@ -199,8 +197,6 @@ def plan_edit(
     """Return the plan of one densification.
 
     Args:
-        score: (N,) mean gradient norm of the 2D means in NDC units.
-        extent: of the scene, world units.
         max_scale: larger Gaussians are removed, world units.
     """
     scale = parameters.log_scales.amax(1).exp()

@@ -25,10 +25,6 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
 
     The nearest depth is over the cameras that see a Gaussian at depth > 0.2; a Gaussian that none sees gets the largest
     nearest depth of the others (1 where there are no others). Constant with respect to gradients.
-
-    Args:
-        means: (N, 3) in the world.
-        cameras: the training cameras, with the intrinsics of the images that are trained on.
     """
     means = means.detach()
     nearest = torch.full((len(means),), torch.inf, device=means.device)
@@ -61,9 +57,6 @@ def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
 
     All in logarithms, one axis at a time, because products of scales underflow: log o' / (1 - o') is taken from
     log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive terms.
-
-    Args:
-        std: (N,) from ``filter_std``.
     """
     log_scales = torch.logaddexp(2 * gaussians.log_scales, 2 * std.log()[:, None]) / 2
     log_ratio = (gaussians.log_scales - log_scales).sum(1).clamp_max(0)

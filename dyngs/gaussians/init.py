@@ -57,9 +57,7 @@ class Surroundings:
     """Cameras and extent of a scene before training, in world units.
 
     Attributes:
-        views: the training cameras, one or more.
         points: (P, 3) sparse points, or None.
-        points_rgb: (P, 3) their colours, uint8; None without points.
         around_origin: by convention the scene lies around the origin (Blender scenes), where the cameras look there.
     """
 
@@ -108,9 +106,6 @@ def initial_gaussians(
 
     ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the scene's points; where
     there are none it draws that cube if the scene may lie in it by convention, else what the cameras see together.
-
-    Args:
-        generator: a CPU generator; the only source of randomness.
     """
     if options.kind != "random" and scene.points is not None and scene.points_rgb is not None:
         finite = np.isfinite(scene.points).all(axis=1)

@@ -43,7 +43,7 @@ class SceneTraining(Generic[S]):
     moves_by: tuple[str, str] = ("", "")
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return whether an image of ``time`` may be trained on in ``step``; at each step some may."""
+        """Return whether an image of ``time`` may be trained on in ``step``."""
         return True
 
     def window(self, step: int) -> tuple[float, float]:
@@ -66,13 +66,7 @@ class SceneTraining(Generic[S]):
         return None
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
-        """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen.
-
-        Args:
-            scene: after the optimizers and the strategy.
-            step: that was done.
-            edited: the set of Gaussians has just changed.
-        """
+        """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen."""
         return scene
 
     def revised(self, scene: S, step: int) -> tuple[S, EditResult] | None:
@@ -80,24 +74,14 @@ class SceneTraining(Generic[S]):
         return None
 
     def all_moving(self, scene: S, extent: float) -> S:
-        """Return ``scene`` as expensive to draw as it may become: all Gaussians move, by an untrained field if need be.
-
-        Args:
-            scene: N Gaussians.
-            extent: of the scene, world units.
-        """
+        """Return ``scene`` as expensive to draw as it may become: all Gaussians move, by an untrained field if need be."""
         return scene
 
     def follow(self, edit: TopologyEdit) -> None:
         """Let what the training itself keeps per Gaussian follow a change of the set."""
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> S:
-        """Return the scene of a checkpoint, and take over the training's state.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: the tensors do not fit together.
-        """
+        """Return the scene of a checkpoint, and take over the training's state."""
         raise NotImplementedError
 
     def state(self) -> State:
@@ -109,7 +93,6 @@ class GaussianModel(Model[GaussianScene]):
     """A scene of Gaussians in training.
 
     Args:
-        run: of the run.
         scene: before the first step, or predicted; its Gaussians become leaf tensors.
         training: how its kind is trained.
         densifier: the strategy, which adds and removes Gaussians.

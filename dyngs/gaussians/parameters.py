@@ -20,8 +20,6 @@ class Parameters:
     """Leaf tensors that receive gradients, optimised in place by Adam.
 
     Args:
-        tensors: name to start value.
-        rates: name to learning rate at the first step.
         decay: last over first rate; log-linear between. 0: rates fall linearly to 0.
         roles: of the tensors, one for all or by name.
     """
@@ -62,7 +60,6 @@ class Parameters:
         """Update all tensors, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
-            step: number of this update, from 1.
             progress: 0 at the first update, 1 at the last; decides the rates.
         """
         progress = min(progress, 1.0)
@@ -82,10 +79,7 @@ class Parameters:
         return self._with(moved, edit.apply_moments) if names else self
 
     def rearranged(self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor) -> Parameters:
-        """Return the parameters with other values for some tensors; row i has the moments of the old row ``source[i]``.
-
-        Rows that are new have zero moments, whatever their source.
-        """
+        """Return the parameters with other values for some tensors; row i has the moments of the old row ``source[i]``."""
         return self._with(values, lambda x: _moments_of(x, source, is_new))
 
     def values(self) -> dict[str, Tensor]:
@@ -102,12 +96,7 @@ class Parameters:
         Where no moments are stored, as in files for drawing, they are 0.
 
         Args:
-            tensors: names to values and moments.
             rows: names of the tensors that have another number of rows than now, and what it must be.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one has another type or shape, or is not finite.
         """
         values = {
             name: require_tensor(name, tensors[name], ((rows or {}).get(name, len(x)), *x.shape[1:]), x.dtype)

@@ -124,7 +124,6 @@ def render(
     Args:
         gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).
         cameras: V cameras, on the device of the Gaussians.
-        options: settings.
         background: (3,) or (V, 3) colour; None = black.
         probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
         shader: gives the colours; None: the Gaussians' harmonics do.
@@ -191,9 +190,6 @@ def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions
             torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64, 48
         )
         seen = dyngs.contributions(scene.gaussians, cameras).sum(0) > 0
-
-    Raises:
-        DyngsError: as ``render``.
     """
     gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
     projection, opacities = _project(gaussians, cameras, options)
@@ -211,9 +207,6 @@ def sensitivities(
     """Return the (V, N) sums over pixels of (dI/dG)^2 (Tu et al. 2026).
 
     I is the sum of a pixel's channels, G the value of the 2D Gaussian there.
-
-    Raises:
-        DyngsError: as ``render``.
     """
     gaussians, cameras = _checked(gaussians.detach(), cameras, background, options)
     projection, opacities = _project(gaussians, cameras, options)
@@ -285,11 +278,7 @@ def _check_views(cameras: Cameras, background: Tensor | None) -> None:
 
 
 def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
-    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``.
-
-    Raises:
-        DyngsError: naming the first camera whose focal lengths do not.
-    """
+    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``."""
     focal, (shortest, longest) = intrinsics.detach().diagonal(dim1=1, dim2=2)[:, :2], FOCAL_LENGTHS
     bad = torch.nonzero(~((focal >= shortest) & (focal <= longest)).all(1))[:, 0]
     if len(bad):
@@ -299,11 +288,7 @@ def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
 
 
 def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
-    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``.
-
-    Raises:
-        DyngsError: naming the first camera whose rotation is mirrored, scaled, sheared or zero.
-    """
+    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``."""
     poses = cam_from_world.detach().double()
     rotations = poses[:, :3, :3]
     unit = torch.eye(3, device=poses.device, dtype=poses.dtype)

@@ -36,8 +36,6 @@ class GaussianTimeStep(TimeStep):
     """Gaussians at one time.
 
     Attributes:
-        gaussians: as they are drawn; differentiable where gradients are enabled.
-        time: in [0, 1], for colours that depend on it.
         frame: where the Gaussians are at rest, if colours follow a body.
         penalties: differentiable regularizers, weighted, by name; empty outside training.
     """
@@ -62,8 +60,6 @@ class GaussianScene(Renderable):
     Attributes:
         gaussians: as stored: canonical, or at rest. In training they are the optimizer's leaf tensors.
         colour: network that colours them; None: their harmonics do.
-        options: how they are drawn unless ``render`` is told otherwise.
-        background: (3,) colour behind them unless ``render`` is told otherwise; None is black.
         masks: which Gaussians are seen around a time; None: all may be, at all times. Only where a field moves some.
     """
 
@@ -198,7 +194,6 @@ class GaussianScene(Renderable):
         self._derived.clear()
 
     def state(self) -> State:
-        """Return everything that is stored, by name, with its role."""
         return prefixed("gaussians", with_role(self.gaussians.detach().tensors(), Role.PER_GAUSSIAN)) | prefixed(
             "model", self._model_state() | ({} if self.colour is None else prefixed("colour", self.colour.state()))
         )
@@ -209,15 +204,7 @@ class GaussianScene(Renderable):
 
 
 def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
-    """Return ``scene`` if it is made of Gaussians.
-
-    Args:
-        scene: of any kind.
-        what: is not made of them, for the message.
-
-    Raises:
-        DyngsError: it is made of something else.
-    """
+    """Return ``scene`` if it is made of Gaussians."""
     if not isinstance(scene, GaussianScene):
         raise DyngsError(f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed")
     return scene
@@ -228,11 +215,7 @@ def _number(time: float | TimeStep | None) -> float | None:
 
 
 def drawn_as_trained(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
-    """Return a restored scene with the colours of the checkpoint, drawn as the model is.
-
-    Raises:
-        ValueError: the tensors of its colours do not fit together.
-    """
+    """Return a restored scene with the colours of the checkpoint, drawn as the model is."""
     colour, background = network_of(checkpoint.part("model.colour")), background_colour(checkpoint.info.background)
     return replace(scene, colour=colour, options=render_options(model), background=background)
 

@@ -36,7 +36,6 @@ class Rates:
     """The course of all learning rates that fall over a run.
 
     Attributes:
-        steps: of training, at the end of which rates are at their lowest.
         tuning: steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``.
     """
 

@@ -32,14 +32,7 @@ def first_gaussians(run: RunStart) -> Gaussians:
 
 
 def colours_of(run: RunStart, gaussians: Gaussians, *, sees_time: bool) -> ColourTraining:
-    """Return how colours are trained.
-
-    Args:
-        run: of the run.
-        gaussians: the first ones.
-        sees_time: colours of a network may depend on time; not those of a person, which would mean nothing in another
-            motion.
-    """
+    """Return how colours are trained."""
     colour, steps = run.config.colour, run.config.train.steps
     match colour:
         case ShColour():

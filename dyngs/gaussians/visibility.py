@@ -63,16 +63,7 @@ class VisibilityMasks:
 
     @staticmethod
     def restored(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
-        """Return the masks of a state that ``state()`` returned; None of an empty one.
-
-        Args:
-            state: by name.
-            count: N; None: as the state says.
-
-        Raises:
-            KeyError: something is missing.
-            ValueError: they are not masks of so many Gaussians.
-        """
+        """Return the masks of a state that ``state()`` returned; None of an empty one."""
         if not state:
             return None
         times, bits = state["times"], state["bits"]

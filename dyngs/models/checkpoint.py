@@ -18,7 +18,6 @@ class CheckpointInfo:
     """Metadata of a checkpoint.
 
     Attributes:
-        step: steps done.
         extent: of the scene, world units.
         world_offset: add it to the means to get the capture's own coordinates.
         background: resolved choice: "white", "black" or "random".
@@ -46,7 +45,7 @@ class Checkpoint:
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name for messages."""
         return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
 
     def part(self, prefix: str) -> dict[str, Tensor]:

@@ -27,13 +27,8 @@ class RunStart:
     """What a model begins with.
 
     Attributes:
-        config: of the run, with its limits applied.
         asked: the same without limits: a run may begin with more Gaussians than it may end with.
         capture: that is trained on, with its first points.
-        images: the training images.
-        background: "white", "black" or "random".
-        extent: of the scene, world units.
-        generator: the run's only source of randomness.
     """
 
     config: Config

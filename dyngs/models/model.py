@@ -73,14 +73,7 @@ class Model(ABC, Generic[S_co]):
 
     @abstractmethod
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
-        """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable.
-
-        Args:
-            image: of training, perhaps shrunk.
-            step: that is being done, from 1.
-            background: behind it.
-            depth: the expected depth is needed, too.
-        """
+        """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable."""
 
     @abstractmethod
     def update(self, step: int) -> Updated:
@@ -97,12 +90,7 @@ class Model(ABC, Generic[S_co]):
 
     @abstractmethod
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as it must be.
-        """
+        """Go back to where ``checkpoint`` was taken."""
 
     @abstractmethod
     def place(self, device: torch.device) -> None:
@@ -150,12 +138,8 @@ class Look:
 
     Attributes:
         index: of the view.
-        step: that is being done.
         image: what was trained on, with a mask of the pixels that count.
-        drawn: by the model.
         rendered, truth: (H, W, 3) that are compared, on the same background.
-        model: that is trained.
-        generator: the run's only source of randomness.
     """
 
     index: int

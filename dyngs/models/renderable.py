@@ -71,11 +71,7 @@ class Rendering:
 
 
 class TimeStep:
-    """A scene at one time, computed once for several images.
-
-    Attributes:
-        time: in [0, 1], for what depends on it.
-    """
+    """A scene at one time, computed once for several images."""
 
     def __init__(self, time: float | None = None) -> None:
         self.time = time
@@ -126,16 +122,10 @@ class Renderable(ABC):
         Args:
             cameras: V cameras, on any device.
             time: in [0, 1], or what ``time_step`` returned; None is the first.
-            options: how to draw; None: as the scene is to be drawn.
-            background: (3,) or (V, 3) colour; None: that of the scene.
         """
 
     def time_step(self, time: float | None) -> TimeStep:
-        """Return what drawing at ``time`` needs, clamped to [0, 1]; None is the first.
-
-        Raises:
-            DyngsError: the time is NaN.
-        """
+        """Return what drawing at ``time`` needs, clamped to [0, 1]; None is the first."""
         return TimeStep(clamped_time(time))
 
     @abstractmethod

@@ -34,7 +34,6 @@ class AlphaWeight:
     """Weight of the mean error of alpha in the loss.
 
     Attributes:
-        weight: 0 or more.
         finding: a line about why, if that was measured.
     """
 
@@ -74,12 +73,7 @@ def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
 
 
 def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
-    """Return the name and (3,) colour of the background to evaluate on: that of training, black where that was random.
-
-    Args:
-        choice: ``data.background`` of the config.
-        has_alpha: of the capture; decides what "auto" means.
-    """
+    """Return the name and (3,) colour of the background to evaluate on: that of training, black where that was random."""
     resolved = {"auto": "white" if has_alpha else "black", "random": "black"}.get(choice, choice)
     return resolved, torch.full((3,), _BACKGROUNDS[resolved], device="cpu")
 

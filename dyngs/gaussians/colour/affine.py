@@ -35,9 +35,6 @@ def recoloured(affine: Tensor, image: Image, rendering: Rendering, background: T
 
     Args:
         affine: (3, 4) M.
-        image: what it is compared with.
-        rendering: of its one view.
-        background: (3,) behind the rendering.
     """
     rgb = rendering.rgb[0]
     background, affine = background.to(rgb.device), affine.to(rgb.device)
@@ -56,7 +53,6 @@ def fitted_affine(shown: Sequence[Shown], background: Tensor, counts: Tensor | N
 
     Args:
         shown: one or more; masked pixels do not count.
-        background: (3,) behind both.
         counts: (H, W) weights beside the masks; None: 1.
     """
     background = background.to(shown[0][1].rgb.device)

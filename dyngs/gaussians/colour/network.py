@@ -41,9 +41,7 @@ class ColourNetwork:
     """F: what is added to the base colour of a Gaussian, by place, direction, normal and time.
 
     Attributes:
-        layers: first to last; 3 outputs.
         box: (2, 3) centre and half sides of the scene, world units.
-        sees_time: time is an input.
         sees_normals: the cosine between the shortest axis of the Gaussian and the direction, and the direction mirrored
             at that axis, are inputs.
     """
@@ -111,12 +109,7 @@ def box_around(means: Tensor) -> Tensor:
 
 
 def network_of(state: Mapping[str, Tensor]) -> ColourNetwork | None:
-    """Return the network of a checkpoint, from the state of its colours; None where there is none.
-
-    Raises:
-        KeyError: the state lacks a tensor.
-        ValueError: a tensor is not as the others have it.
-    """
+    """Return the network of a checkpoint, from the state of its colours; None where there is none."""
     count = sum(name.startswith("weight") for name in state)
     if not count:
         return None

@@ -39,8 +39,6 @@ class TrainingLooks:
     Attributes:
         indices: of the views that may be trained on.
         views: those of some indices, one at a time.
-        options: how to draw.
-        background: (3,) colour.
     """
 
     indices: Sequence[int]
@@ -113,24 +111,11 @@ class ColourTraining:
         return {}
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
-        """Take over the state of the scene's colours and of ``state``, for N Gaussians.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as it must be.
-        """
+        """Take over the state of the scene's colours and of ``state``, for N Gaussians."""
 
 
 class NetworkTraining(ColourTraining):
-    """A network that all Gaussians share, learned by Adam.
-
-    Args:
-        options: size and rate.
-        steps: length of the run.
-        box: (2, 3), see ``ColourNetwork``.
-        generator: of the first weights.
-        sees_time: time is an input.
-    """
+    """A network that all Gaussians share, learned by Adam."""
 
     def __init__(
         self, options: NetworkColour, steps: int, box: Tensor, generator: torch.Generator, *, sees_time: bool
@@ -166,13 +151,7 @@ class NetworkTraining(ColourTraining):
 
 
 class AutoTraining(ColourTraining):
-    """Harmonics for all Gaussians at first, later only for those where they are measured to improve images.
-
-    Args:
-        options: what may be given away.
-        steps: length of the run.
-        num_views: training views.
-    """
+    """Harmonics for all Gaussians at first, later only for those where they are measured to improve images."""
 
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)

@@ -34,9 +34,7 @@ class MeasuredView:
 
     Attributes:
         gaussians: at its time.
-        camera: one camera.
         truth: (H, W, 3) on the background.
-        mask: (H, W) weights, or None.
     """
 
     gaussians: Gaussians
@@ -77,15 +75,7 @@ def find_view_dependent(
     background: Tensor,
     tolerance: float,
 ) -> Finding:
-    """Return the Gaussians whose harmonics are worth their cost, and the colours of the others.
-
-    Args:
-        seen: views that were trained on, one at a time; at least one.
-        held_out: views that were not; at least one.
-        options: how to draw, with the degree of the harmonics that counts.
-        background: (3,) colour.
-        tolerance: dB that may be given away.
-    """
+    """Return the Gaussians whose harmonics are worth their cost, and the colours of the others."""
     means, changes = _mean_and_change(seen, options)
     errors, worths = [], torch.zeros(len(changes), device=changes.device)
     everywhere, nowhere = (
@@ -107,9 +97,6 @@ def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance:
     """Return (N,) bool, the fewest rows, by descending ``changes``, that bring all but ``tolerance`` of the gain.
 
     Args:
-        changes: (N,) what ranks the rows.
-        worths: (N,) by how much each lowers the error.
-        without: the error if no row is chosen.
         tolerance: dB by which the error may be above the lowest along the ranking; none is chosen if that suffices.
     """
     order = changes.argsort(descending=True, stable=True)
