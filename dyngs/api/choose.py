@@ -64,13 +64,7 @@ LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
 
 @dataclass(frozen=True)
 class OpenSetting:
-    """A setting that small runs decide about.
-
-    Attributes:
-        text: keys and values, as on the command line.
-        applied: returns a configuration with it; None where it means nothing.
-        score: compares two models on a view.
-    """
+    """A setting that small runs decide about."""
 
     text: str
     applied: Callable[[Config], Config | None]
@@ -82,12 +76,8 @@ class Choice:
     """What small runs said about a setting.
 
     Attributes:
-        setting: keys and values.
-        views: number of views compared.
         without, gain: mean PSNR without it, and mean gain by it, dB.
         error: standard error of the gain, dB.
-        steps: of each small run.
-        seconds: that it took.
         taken: whether the setting is used.
     """
 
@@ -111,10 +101,6 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     """Return ``config`` with all decided that was not requested, and what small runs said; lines say so, too.
 
     The capture is returned with the points that the scene begins with.
-
-    Args:
-        config: as requested.
-        capture: as it was read.
 
     Raises:
         DyngsError: images that cannot be read, or a capture without times for a scene that is to move.
@@ -224,7 +210,6 @@ class _Plan:
 
     Attributes:
         folds: sets of the training views held out; small runs are made once for each.
-        steps: of each.
         runs: number of configurations that can be tried.
         first_side: longest side of the images that the run itself begins with, px; small runs begin with no less.
     """

@@ -34,9 +34,7 @@ class Prediction:
     """Result of ``predict_person``.
 
     Attributes:
-        run_dir: the run folder.
         views: names of the images that were predicted from.
-        num_gaussians: N.
         seconds_steps: training the network on these images.
         seconds: of the prediction itself.
     """
@@ -96,11 +94,7 @@ def predict_person(
 
 
 def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
-    """Return the configuration of the run of a network, and its model section.
-
-    Raises:
-        DyngsError: the run is of something else.
-    """
+    """Return the configuration of the run of a network, and its model section."""
     config = load_resolved(run_dir)
     model = config.model
     if not isinstance(model, HumanPredictorModel):
@@ -118,16 +112,7 @@ def write_run(
     model: HumanPredictorModel,
     seconds: float,
 ) -> None:
-    """Write ``scene`` as a run of the preset for one person after no step.
-
-    Args:
-        out: a new run folder.
-        scene: predicted.
-        frames: of its motion.
-        data: its capture.
-        model: of the network.
-        seconds: taken so far.
-    """
+    """Write ``scene`` as a run of the preset for one person after no step."""
     preset = load_config(packaged_preset("human"), ["data.root=."])
     person = preset.model
     if not isinstance(person, HumanModel):

@@ -41,11 +41,8 @@ class Promise:
         folder: of the new run; its file is in ``EXPORT_FOLDER`` there.
         asked: largest loss on the views held out, dB.
         before: mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest.
-        after: that of the file.
         cut: what was taken away, for people; "nothing" where nothing could be.
-        limits: why no more was.
         views: that losses were measured on, for people.
-        trials: number of candidates that were fine-tuned.
     """
 
     folder: Path

@@ -190,13 +190,9 @@ class _Run:
     """A run from the reading of its capture to its last line.
 
     Args:
-        config: of the run.
-        folder: of the run.
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen.
-        capture: with its first points where the run begins; None: of a network.
         held: the lock of the folder, which knows where that is if it is renamed.
-        processes: that this one leads.
         threads: of the kernels in each of them.
     """
 
@@ -380,11 +376,7 @@ class _Run:
 
 
 def _tell_memory(trainer: GaussianTrainer, processes: int) -> None:
-    """Print how much memory a run will take, and a warning where that is likely to be more than is there.
-
-    Raises:
-        DyngsError: it is certain to be more than this machine, or its GPU, can give.
-    """
+    """Print how much memory a run will take, and a warning where that is likely to be more than is there."""
     for forecast in memory_forecasts(trainer, processes):
         print(forecast, flush=True)
         forecast.require_possible()
@@ -411,11 +403,7 @@ def _owes_file(config: Config, folder: Path) -> bool:
 
 
 def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint | None:
-    """Return the checkpoint to go on from, or None for a run that begins: a new one, or one stopped before its first.
-
-    Raises:
-        DyngsError: resuming where no run was begun, or a new run where something is that it would replace.
-    """
+    """Return the checkpoint to go on from, or None for a run that begins: a new one, or one stopped before its first."""
     if not resuming:
         require_startable(folder, config)
         return None
@@ -427,11 +415,7 @@ def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint
 
 
 def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -> Config:
-    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another number of steps.
-
-    Raises:
-        DyngsError: that number is not possible.
-    """
+    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another number of steps."""
     stored, steps = load_resolved(folder), config.train.steps
     was = stored.train.steps
     if steps == was:

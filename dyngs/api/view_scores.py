@@ -47,10 +47,6 @@ def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | N
     """Return (H, W) the pixels, of those that ``mask`` keeps, where the smaller error of two images is smallest.
 
     Neither image is favoured: exchanged, they give the same.
-
-    Args:
-        one, other, truth: (H, W, 3).
-        mask: (H, W); None: all pixels count.
     """
     error = torch.minimum((one - truth).square().mean(-1), (other - truth).square().mean(-1))
     weight = torch.ones_like(error) if mask is None else mask

@@ -79,11 +79,6 @@ class ControlNodes(NetworkField):
 
         Nodes are still placed where Gaussians are far from any, and begin with the motion of those around them: where
         nothing should move at first, nodes that stand still must be among the given ones.
-
-        Args:
-            positions: (S, 3) canonical, no two alike.
-            splines: by head, the control points (S, P, size); heads that are not given stay 0. P is the number of
-                pieces, from now on that of all splines, plus 3.
         """
         field, count = copy.copy(self), len(positions)
         field.num_pieces = splines["means"].shape[1] - SPAN + 1
@@ -151,7 +146,6 @@ class ControlNodes(NetworkField):
         return self.num_pieces + SPAN - 1
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
         if not len(means):  # whatever nodes there are
             return self.at(time).select(slice(0))
         nodes, now = self.nodes_for(means), self.at(time)

@@ -46,14 +46,7 @@ class Curves:
 
 @torch.no_grad()
 def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> Curves:
-    """Return the motion of ``means`` (M, 3) as splines.
-
-    Args:
-        field: that moves them.
-        means: (M, 3) canonical, of all moving Gaussians in order.
-        num_times: distinct training times.
-        tolerance: world units that the fit of a place may be off, where it is not exact.
-    """
+    """Return the motion of ``means`` (M, 3) as splines."""
     match field:
         case ControlNodes():
             return _curves_of_nodes(field, means)

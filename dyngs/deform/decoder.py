@@ -18,9 +18,6 @@ class Decoder:
     """A multilayer perceptron whose last layer starts at zero.
 
     Args:
-        num_inputs: features per row.
-        hidden: units of the hidden layers.
-        options: which heads there are.
         skip: layer whose input is the features once more, beside the hidden units.
     """
 

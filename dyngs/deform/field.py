@@ -56,8 +56,6 @@ class FieldSetup:
 
     Attributes:
         center, half_size: (3,) of the box in which things move, world units; no side is zero.
-        num_times: distinct training times.
-        num_moving: M.
         extent: of the scene, world units; learning rates are relative to it.
     """
 
@@ -88,8 +86,6 @@ class DeformationField(Protocol):
         """Return the offsets at ``time``.
 
         Args:
-            means: (M, 3) canonical, of all moving Gaussians in order.
-            time: in [0, 1].
             rows: (A,) only these of them are asked for, in this order, and cost anything; None: all.
         """
         ...
@@ -115,12 +111,7 @@ class DeformationField(Protocol):
         ...
 
     def restored(self, tensors: Mapping[str, Tensor]) -> DeformationField:
-        """Return the field of a state that ``state`` returned, with the options and the setup of this one.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as a field of these options has it.
-        """
+        """Return the field of a state that ``state`` returned, with the options and the setup of this one."""
         ...
 
     def to(self, device: torch.device | str) -> DeformationField:

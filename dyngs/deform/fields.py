@@ -32,14 +32,7 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
 
 
 def field_on_its_way(options: ControlNodesField, setup: FieldSetup, first: FirstMotion, others: Tensor) -> ControlNodes:
-    """Return an untrained field in which things already follow the paths found for them.
-
-    Args:
-        options: of the field.
-        setup: of the field.
-        first: what travels.
-        others: (M, 3) moving Gaussians that belong to none of it, which stand still.
-    """
+    """Return an untrained field in which things already follow the paths found for them."""
     field = ControlNodes(options, setup, torch.Generator())
     most = options.pieces or max(field.num_pieces, min(setup.num_times - 1, MAX_KEY_TIMES))
     positions, paths = first.nodes(others, options.nodes, range(field.num_pieces, most + 1))
@@ -54,12 +47,7 @@ def field_state(field: DeformationField) -> State:
 
 
 def restored_field(options: DeformField, tensors: Mapping[str, Tensor], num_moving: int) -> DeformationField:
-    """Return the field of a checkpoint for M moving Gaussians.
-
-    Raises:
-        KeyError: a tensor is missing.
-        ValueError: one is not as a field of these options has it.
-    """
+    """Return the field of a checkpoint for M moving Gaussians."""
     num_times, extent = require_positive("numbers", require_tensor("numbers", tensors["numbers"], (2,), None)).tolist()
     center, half_size = require_tensor("box", tensors["box"], (2, 3))
     setup = FieldSetup(center, require_positive("box", half_size), int(num_times), num_moving, extent)

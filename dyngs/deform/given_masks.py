@@ -24,12 +24,6 @@ def moving_fraction_of(
     s_vi = sum_p w_vip m_vp / sum_p w_vip with w = alpha T and m the mask of image v. ``most`` is the largest over
     images in which a Gaussian shows; ``usual`` their ``USUAL`` quantile, as in ``still_errors``: what stands behind
     is covered in fewer.
-
-    Args:
-        gaussians_at: N Gaussians at a time.
-        images: one or more with masks; others do not count.
-        options: how to draw.
-        sure: error that a fraction of ``SURE_SHARE`` stands for.
     """
     sums, weights = [], []
     for image in images:

@@ -54,7 +54,6 @@ class Hexplane(NetworkField):
         return [PlaneLevel(self.parameters[f"space{i}"], self.parameters[f"time{i}"]) for i in indices]
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """See ``DeformationField.offsets``; no gradient flows to ``means``."""
         coords = self.setup.normalized(chosen(means.detach(), rows))
         features = hexplane_features(coords, time, self.levels)
         return split_heads(self.decoder(features, self.parameters), self.options)

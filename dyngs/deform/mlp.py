@@ -34,7 +34,6 @@ class Mlp(NetworkField):
         self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), LR_DECAY)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """See ``DeformationField.offsets``; no gradient flows to ``means``, as in the paper."""
         space = encoded(self.setup.normalized(chosen(means.detach(), rows)), SPACE_FREQUENCIES)
         moment = encoded(space.new_full((1, 1), time), TIME_FREQUENCIES)
         features = torch.cat([space, moment.expand(len(space), -1)], dim=1)

@@ -38,7 +38,6 @@ def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequenc
     the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour.
 
     Args:
-        gaussians: the M canonical Gaussians that the field moves.
         times: in [0, 1]; at most ``MAX_SAMPLES`` evenly chosen ones are looked at.
         px_size: (M,) world units that one pixel covers, in the nearest training view.
     """

@@ -28,9 +28,7 @@ class DynamicScene(GaussianScene):
 
     Attributes:
         seen_at: distinct training times in [0, 1], ascending.
-        field: None before motion begins, and for good where nothing moves.
         moving: (M,) ascending indices of the Gaussians that it moves.
-        filter_std: (N,) standard deviations of Mip-Splatting's 3D filter, world units; None without one.
     """
 
     seen_at: tuple[float, ...]
@@ -40,12 +38,7 @@ class DynamicScene(GaussianScene):
 
     @staticmethod
     def restored(options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
-        """Return the scene of a state that ``state`` returned.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as the others and the options have it.
-        """
+        """Return the scene of a state that ``state`` returned."""
         count = len(gaussians)
         own = part_of(tensors, "field")
         std, times = stored_filter(tensors, count), stored_times(tensors)
@@ -91,7 +84,6 @@ class DynamicScene(GaussianScene):
         """Return the Gaussians drawn at ``time``, and the offsets of those of them that move.
 
         Args:
-            time: in [0, 1].
             detach: gradients reach the field alone, not the canonical Gaussians.
         """
         if self.field is None:

@@ -59,12 +59,6 @@ def still_errors(
     whatever is still exactly as it is; ``most`` is the largest, ``usual`` the ``USUAL`` quantile of e_vi over images
     in which a Gaussian shows. Else the rendering is expected, and both are the mean, weighted by sum_p w_vip: a still
     model that is not yet right errs too.
-
-    Args:
-        gaussians_at: N Gaussians at a time.
-        images: one or more, as many as are to be looked at.
-        background: (3,) colour.
-        shader_at: what colours the Gaussians at a time; None: their harmonics.
     """
     expected = _median_images(images, background)
     looked_at = [p for p in images if _camera_key(p) in expected] if expected else images
@@ -90,18 +84,7 @@ def still_errors(
 def signed_errors(
     gaussians: Gaussians, image: Image, options: RenderOptions, background: Tensor, expected: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return, per Gaussian, sums over pixels of its blending weight times the signed error, and of the weight alone.
-
-    Args:
-        gaussians: N, as they are drawn.
-        image: the truth; masked pixels do not count.
-        options: how to draw.
-        background: (3,) colour.
-        expected: (H, W, 3) image that is compared with it.
-
-    Returns:
-        (N, 3) and (N,); both come from passes back through the blending of a constant colour.
-    """
+    """Return, per Gaussian, sums over pixels of its blending weight times the signed error, and of the weight alone."""
     counts = torch.ones(expected.shape[:2], device=expected.device) if image.mask is None else image.mask
     error = (expected - image.composite(background)) * counts[..., None]
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
@@ -154,9 +137,6 @@ def differing_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
 
     Each image is first brought to the brightness of the median (changing exposure is no motion) and averaged over
     2x2 pixels, against noise.
-
-    Args:
-        cameras: images (H, W, 3) in [0, 1] of each camera that stays in place.
     """
     differing = total = 0
     for images in cameras:

@@ -18,14 +18,7 @@ FRONTIER_VIEWS = 6
 
 @dataclass(frozen=True)
 class TimeWindow:
-    """The times that are trained on at each step.
-
-    Attributes:
-        strays: |time - 0.5| of all training views, ascending.
-        first: views in the window at the start, as a fraction of all.
-        begins: step up to which all views are trained on, because nothing moves yet.
-        opens, full: steps between which the window grows evenly, in views, to all of them.
-    """
+    """The times that are trained on at each step."""
 
     strays: tuple[float, ...]
     first: float

@@ -51,7 +51,6 @@ class DeformSchedule:
         opens, full: steps between which the window of times grows, to all of them.
         decays: step from which the field's rates fall.
         splits: steps after which Gaussians that do not move are frozen.
-        rates: how the field's rates fall.
     """
 
     fine: int
@@ -68,8 +67,6 @@ class TrainingViews:
 
     Attributes:
         times: of the training views, in [0, 1], ascending; at least two differ.
-        cameras: the training cameras.
-        extent: of the scene, world units.
         still_errors: how far its images disagree with what is still, where N Gaussians are seen.
         cameras_stay: in place, so that images show what is still exactly alike.
         standing: returns what those cameras show.
@@ -84,11 +81,7 @@ class TrainingViews:
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):
-    """See ``SceneTraining``.
-
-    Attributes:
-        times: distinct times of the training views, ascending.
-    """
+    """See ``SceneTraining``."""
 
     moves_by = ("field", "model.deform")
 

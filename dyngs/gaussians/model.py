@@ -74,7 +74,7 @@ class SceneTraining(Generic[S]):
         return None
 
     def all_moving(self, scene: S, extent: float) -> S:
-        """Return ``scene`` as expensive to draw as it may become: all Gaussians move, by an untrained field if need be."""
+        """Return ``scene`` as expensive to draw as it may become: all Gaussians move."""
         return scene
 
     def follow(self, edit: TopologyEdit) -> None:

@@ -79,7 +79,7 @@ class Parameters:
         return self._with(moved, edit.apply_moments) if names else self
 
     def rearranged(self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor) -> Parameters:
-        """Return the parameters with other values for some tensors; row i has the moments of the old row ``source[i]``."""
+        """Return the parameters with other values for some tensors, and the moments of the old rows ``source``."""
         return self._with(values, lambda x: _moments_of(x, source, is_new))
 
     def values(self) -> dict[str, Tensor]:

@@ -73,7 +73,7 @@ def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
 
 
 def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
-    """Return the name and (3,) colour of the background to evaluate on: that of training, black where that was random."""
+    """Return the name and (3,) colour of the background to evaluate on: black where that of training was random."""
     resolved = {"auto": "white" if has_alpha else "black", "random": "black"}.get(choice, choice)
     return resolved, torch.full((3,), _BACKGROUNDS[resolved], device="cpu")
 

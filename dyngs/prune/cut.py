@@ -90,13 +90,7 @@ def cut_config(config: Config, cut: Cut) -> Config:
 
 
 def apply_cut(trainer: GaussianTrainer, cut: Cut, scores: Tensor) -> None:
-    """Take away what ``cut`` says from the scene of ``trainer``, which is at the end of its run.
-
-    Args:
-        trainer: its configuration becomes that of ``cut_config``; nothing is added to its scene from here on.
-        cut: what goes.
-        scores: (N,) importance of its Gaussians.
-    """
+    """Take away what ``cut`` says from the scene of ``trainer``, which is at the end of its run."""
     trainer.config = cut_config(trainer.config, cut)
     trainer.model.draw_as(trainer.config.model)
     remove_(trainer, scores if cut.fraction else None)

@@ -23,13 +23,7 @@ VOLUME_POWER = 0.1
 
 @dataclass(frozen=True)
 class ScoringViews:
-    """A scene, and the views that its Gaussians are scored on: every camera at every time.
-
-    Attributes:
-        scene: N Gaussians; none is masked.
-        cameras: V groups of one camera.
-        times: K moments in [0, 1], ascending; one None for a static scene.
-    """
+    """A scene, and the views that its Gaussians are scored on: every camera at every time."""
 
     scene: GaussianScene
     cameras: Sequence[Cameras]
@@ -40,14 +34,7 @@ class ScoringViews:
 
 @dataclass(frozen=True)
 class Importance:
-    """Contributions of N Gaussians at K moments.
-
-    Attributes:
-        fractions: (K, N) C, sums over pixels and views of alpha T.
-        slopes: (N,) sums over pixels, views and moments of (dI/dG)^2, or None where that was not asked for.
-        opacities: (K, N).
-        log_volumes: (K, N) sums of the logarithms of the scales.
-    """
+    """Contributions of N Gaussians at K moments."""
 
     fractions: Tensor
     slopes: Tensor | None

@@ -43,8 +43,6 @@ class Pruned:
     """Result of the pruning stage of a run.
 
     Attributes:
-        before, after: numbers of Gaussians.
-        loss: dB on training images, before anything is trained again.
         active: mean fraction of the kept that masks let through; 1 without masks.
     """
 

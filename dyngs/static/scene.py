@@ -20,7 +20,6 @@ class StaticScene(GaussianScene):
     """The same N Gaussians at every time.
 
     Attributes:
-        filter_std: (N,) standard deviations of Mip-Splatting's 3D filter, world units; None without one.
         seen_at: distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing moves.
     """
 
@@ -29,11 +28,7 @@ class StaticScene(GaussianScene):
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
-        """Return the scene of a state that ``state`` returned.
-
-        Raises:
-            ValueError: a tensor does not fit the Gaussians.
-        """
+        """Return the scene of a state that ``state`` returned."""
         return StaticScene(
             gaussians=gaussians, filter_std=stored_filter(tensors, len(gaussians)), seen_at=stored_times(tensors)
         )

@@ -25,7 +25,6 @@ MOTION = 2.0
 DETAIL = 0.5
 """Power of the images' side with which the number of Gaussians grows: 2 to 4.7 times were seen from 1/4 to full."""
 SAMPLES = 64
-"""Steps whose costs stand for those of many."""
 
 
 class Stopwatch:
@@ -86,13 +85,7 @@ class _Mark:
 
 
 class Forecast:
-    """Prediction of the seconds that a run still takes, by its pace so far.
-
-    Args:
-        done: steps done.
-        seconds: on the clock now.
-        num_gaussians: there are now; 0: not known.
-    """
+    """Prediction of the seconds that a run still takes, by its pace so far."""
 
     def __init__(self, done: int, seconds: float, num_gaussians: int = 0) -> None:
         self._pixels = 0.0
@@ -107,28 +100,14 @@ class Forecast:
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 
     def observe(self, config: Config | None, step: int, seconds: float, num_gaussians: int, drawn: int = 0) -> None:
-        """Take in how far the run is.
-
-        Args:
-            config: as it is now, whose schedule decides the cost of steps; None: all are alike.
-            step: steps done.
-            seconds: on the clock now.
-            num_gaussians: there are now.
-            drawn: pixels of the image drawn last.
-        """
+        """Take in how far the run is."""
         last = self._marks[-1]
         self._pixels = full_pixels(config, step, drawn)
         cost = last.cost + (step - last.step) * step_cost(config, step, self._pixels, num_gaussians)
         self._marks.append(_Mark(step, seconds, cost, num_gaussians))
 
     def seconds(self, config: Config | None, total: int, done: int | None = None) -> float:
-        """Return the seconds until step ``total`` of a run of ``config``, by the pace of the second half so far.
-
-        Args:
-            config: as for ``observe``; its schedules may be others than those so far.
-            total: the last step.
-            done: steps done; None: those observed.
-        """
+        """Return the seconds until step ``total`` of a run of ``config``, by the pace of the second half so far."""
         first, now = self._marks[0], self._marks[-1]
         done = now.step if done is None else done
         if done >= total or now.cost == 0:

@@ -26,8 +26,6 @@ class StepReport:
 
     Attributes:
         step: its number, from 1.
-        loss: regularizers included.
-        image: what was trained on.
         rendered, truth: (H, W, 3) on the same background.
         finding: lines about what was found out after the step, or None.
     """
@@ -99,7 +97,7 @@ class StepDone:
 
 @dataclass(frozen=True)
 class TopologyChanged:
-    """The set of Gaussians has changed outside the strategy: pruned, or limited."""
+    """The set of Gaussians has changed outside the strategy."""
 
     step: int
     before: int

@@ -45,11 +45,7 @@ def require_possible(config: Config) -> None:
 
 
 def shared(config: Config, processes: Processes) -> Config:
-    """Return ``config`` for so many processes: with one view for each of them where one per step was asked for.
-
-    Raises:
-        DyngsError: what is asked for needs one process, or the views of a step cannot be shared evenly.
-    """
+    """Return ``config`` for so many processes: with one view for each of them where one per step was asked for."""
     if processes.size == 1:
         return config
     for key, value in {"train.minutes": config.train.minutes, "budget.min_fps": config.budget.min_fps}.items():
@@ -79,15 +75,7 @@ def _require_batch(config: Config) -> None:
 
 
 def within_cap(config: Config, num_times: int) -> Config:
-    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where it has none.
-
-    Args:
-        config: of a run.
-        num_times: distinct times of training; fewer than two: nothing will move.
-
-    Raises:
-        DyngsError: a size that has no room for a scene.
-    """
+    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where it has none."""
     cap, changes = most_gaussians(config, num_times), {}
     if cap is None:
         return config
@@ -100,15 +88,7 @@ def within_cap(config: Config, num_times: int) -> Config:
 
 
 def most_gaussians(config: Config, num_times: int) -> int | None:
-    """Return the largest number of Gaussians at the end by the limits of the run; None without one.
-
-    Args:
-        config: of a run.
-        num_times: distinct times of training.
-
-    Raises:
-        DyngsError: a size that has no room for a scene.
-    """
+    """Return the largest number of Gaussians at the end by the limits of the run; None without one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     if config.budget.max_mb is not None and not config.model.is_posed:
         limits.append(room(config, num_times, config.budget.max_mb))

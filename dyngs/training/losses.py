@@ -11,11 +11,7 @@ from dyngs.ops.loss import l1_ssim_loss
 
 
 class ImageLoss(Loss):
-    """L1 and D-SSIM of the image (3DGS).
-
-    Args:
-        ssim_weight: of D-SSIM; L1 has the rest.
-    """
+    """L1 and D-SSIM of the image (3DGS)."""
 
     def __init__(self, ssim_weight: float) -> None:
         self._ssim_weight = ssim_weight
@@ -28,7 +24,6 @@ class SilhouetteLoss(Loss):
     """Mean error of alpha, where the images have any.
 
     Args:
-        weight: 0 or more.
         masked: only pixels that count in the image do so here.
     """
 

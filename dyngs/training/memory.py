@@ -70,20 +70,14 @@ class MemoryForecast:
     """Bytes that a run is expected to take at its peak.
 
     Attributes:
-        program: taken already.
         images: that decoded ones will take, in the cache or on their way to it.
-        drawing: for a step.
         field: of what all Gaussians share: grids and networks of a deformation field.
         count: Gaussians that may be expected.
         most: Gaussians that the strategy allows.
         least: Gaussians that there will certainly be at some time.
-        each: bytes of a Gaussian.
-        least_each: bytes that a Gaussian certainly takes.
         free: of this machine and this process's limits, beside what is taken already; None: not known.
         whole: of this machine with its swap, or the limit of its container; None: not known.
         all_kept: every image has its place in the cache.
-        processes: on this machine that take as much.
-        longest_side: of the images, px.
         on_gpu: it is the memory of a GPU, where images take no more than their share.
         limits: key that limits the number of Gaussians, and its value at ``count`` of them.
     """
@@ -139,11 +133,7 @@ class MemoryForecast:
         return f"about {_gb(needed)} GB of {self._place} are needed, and {self._there}: give {self._advice()}"
 
     def require_possible(self) -> None:
-        """Raise where the run certainly needs more than this machine, or its container, can ever give it.
-
-        Raises:
-            DyngsError: says what to set to which value.
-        """
+        """Raise where the run certainly needs more than this machine, or its container, can ever give it."""
         needed = self.program + self.processes * (self.certain - self.program)
         if self.whole is None or needed <= self.whole:
             return
@@ -209,10 +199,6 @@ def memory_forecasts(trainer: Trainer, processes: int = 1) -> list[MemoryForecas
     """Return the memory that the run of ``trainer``, which has not begun to step, is expected to take.
 
     On a GPU first that of the GPU, with the scene, and then that of the machine, with what stays on the CPU.
-
-    Args:
-        trainer: of the run.
-        processes: on this machine that train it together.
     """
     whole = memory_forecast(trainer, processes)
     gpu = gpu_memory(trainer.device)
@@ -272,11 +258,7 @@ def _limit_of_gaussians(config: Config) -> tuple[str, int]:
 
 
 def require_room(config: Config) -> None:
-    """Raise where the random Gaussians that a run is to begin with cannot fit on this machine.
-
-    Raises:
-        DyngsError: says how many can.
-    """
+    """Raise where the random Gaussians that a run is to begin with cannot fit on this machine."""
     if not config.model.made_of_gaussians:
         return
     whole, each = whole_memory(), 4 * NEEDED_COPIES * stored_values(config)
@@ -337,13 +319,7 @@ def num_changes(config: Config, steps: int | None = None) -> int:
 
 
 def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE) -> int:
-    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before anything is seen.
-
-    Args:
-        config: of the run.
-        now: Gaussians at its beginning.
-        longest_side: of its images, px.
-    """
+    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before anything is seen."""
     match config.strategy:
         case McmcStrategy():
             return _mcmc_gaussians(config, config.strategy, now)

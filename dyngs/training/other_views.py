@@ -32,8 +32,6 @@ class OtherViews:
     """Mean colours of the cells of all training images, and where cells of one are found in the others.
 
     Args:
-        images: of training.
-        cameras: V cameras of their full size.
         corrected: returns the camera of a view as it is by now, see ``ImageLoader``; None: it stays.
     """
 
@@ -62,14 +60,7 @@ class OtherViews:
         return cells[:3] + (1 - cells[3]) * background[:, None, None], cells[4] > SOLID
 
     def difference(self, index: int, which: Tensor, drawn: Tensor, background: Tensor) -> Tensor:
-        """Return (P,) the median difference of other views from the rendering; infinite where too few see a place.
-
-        Args:
-            index: of the image.
-            which: (h, w) bool, P of its cells.
-            drawn: (5, h, w) colour, expected depth and alpha of the rendering.
-            background: (3,) behind all images.
-        """
+        """Return (P,) the median difference of other views from the rendering; infinite where too few see a place."""
         shown, others = drawn[:, which], self._asked(index)
         if not len(others) or not shown.shape[1]:
             return torch.full_like(shown[0], torch.inf)

@@ -55,10 +55,7 @@ _LOWEST = 1e-3
 
 @dataclass
 class Filmed:
-    """A person to train on: images, and the choices of those that are predicted from, with their maps once known.
-
-    All that is observed is observed on the CPU.
-    """
+    """A person to train on: images, and the choices of those that are predicted from, with their maps once known."""
 
     sitter: CapturedPerson
     images: ImageLoader
@@ -88,8 +85,6 @@ class PersonPredictor(Predictor):
     """A network that predicts the person of a capture.
 
     Attributes:
-        config: of the network's run.
-        model: its section.
         network: may be trained on images of the person before, see ``adapt``.
         mean: (3, S, S) colours of the people that it was trained on.
         person: with images.
@@ -106,13 +101,7 @@ class PersonPredictor(Predictor):
         return self._scene(self.person.look(views))
 
     def adapt(self, views: Sequence[int], steps: int, report: ReportProgress = report_nothing) -> None:
-        """Train the network until its prediction shows the images better that it is predicted from.
-
-        Args:
-            views: predicted from, and compared with.
-            steps: 0 changes nothing.
-            report: is told how far it has come.
-        """
+        """Train the network until its prediction shows the images better that it is predicted from."""
         options = replace(render_options(self.model), nonfinite="trust")
         background = evaluation_background(self.config.data.background, True)[1]
         images, maps = [self.person.images[i] for i in views], self.person.look(views)
@@ -139,12 +128,6 @@ class NetworkTrainer:
     """A run in memory, as ``Trainer``.
 
     Attributes:
-        people: to train on, at least one.
-        network: what is trained.
-        mean: (3, S, S) colours of the people.
-        background: "white", "black" or "random".
-        generator: the only source of randomness.
-        done: steps done.
         num_gaussians: of the last person.
         device: of the network and the scenes that it predicts.
     """
@@ -170,11 +153,7 @@ class NetworkTrainer:
         return self.num_gaussians
 
     def step(self) -> StepReport:
-        """Train on one person: predicted from one choice of images, compared with others of one moment.
-
-        Raises:
-            DyngsError: the loss is not finite.
-        """
+        """Train on one person: predicted from one choice of images, compared with others of one moment."""
         step = self.done + 1
         person = self.people[self.sampler.next(self.generator, lambda _: True)]
         choice = self._draw(len(person.choices))
@@ -210,11 +189,7 @@ class NetworkTrainer:
         return Checkpoint(info, {name: x.detach().cpu() for name, x in tensors.items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken.
-
-        Raises:
-            DyngsError: it belongs to another network.
-        """
+        """Go back to where ``checkpoint`` was taken."""
         self.mean = load_network(self.network, checkpoint, self.model.resolution).to(self.device)
         with reading(checkpoint.name, OTHER_CONFIG):
             self.sampler.load_state(checkpoint.part("sampler"))
@@ -272,11 +247,7 @@ def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config
 
 
 def trainer(config: Config) -> NetworkTrainer:
-    """Return the trainer of ``model.kind: human_predictor``: captures read, nothing trained.
-
-    Raises:
-        DyngsError: ``data.root`` has no captures of people, or settings that do not go together.
-    """
+    """Return the trainer of ``model.kind: human_predictor``: captures read, nothing trained."""
     device, model = device_for(config.run.device), config.model
     if not isinstance(model, HumanPredictorModel):
         raise TypeError(f"not a network: {model!r}")
@@ -306,11 +277,7 @@ def restore(_: HumanPredictorModel, checkpoint: Checkpoint) -> Renderable:
 
 
 def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
-    """Return the untrained network of ``model``.
-
-    Raises:
-        DyngsError: widths or a resolution that do not suit it.
-    """
+    """Return the untrained network of ``model``."""
     factor = 2 ** len(model.widths)
     if model.resolution % factor:
         raise DyngsError(
@@ -321,11 +288,7 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
-    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``.
-
-    Raises:
-        DyngsError: the checkpoint is of something else, or of another network.
-    """
+    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``."""
     weights, mean = checkpoint.part("model.network"), checkpoint.tensors.get("model.mean")
     own = network.state_dict()
     if mean is None or {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
@@ -346,11 +309,7 @@ def human_options(model: HumanPredictorModel) -> HumanModel:
 
 
 def captures_in(data: DataConfig) -> list[DataConfig]:
-    """Return the paths of the captures in the folders of ``data.root``, by name.
-
-    Raises:
-        DyngsError: there is no folder in it.
-    """
+    """Return the paths of the captures in the folders of ``data.root``, by name."""
     root = data.root
     folders = sorted(f for f in root.iterdir() if f.is_dir() and not f.name.startswith(".")) if root.is_dir() else []
     if not folders:
@@ -359,11 +318,7 @@ def captures_in(data: DataConfig) -> list[DataConfig]:
 
 
 def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> Filmed:
-    """Return the person of one capture, without choices of images.
-
-    Raises:
-        DyngsError: no capture there, or not one of a person.
-    """
+    """Return the person of one capture, without choices of images."""
     capture = read_capture(data)
     return Filmed(captured_person(capture, model, body), ImageLoader(capture.splits["train"], data), [])
 

@@ -53,8 +53,6 @@ class Processes:
 
     Args:
         rank: number of this process, from 0.
-        size: number of processes; 1: nothing is exchanged.
-        local_size: number of those on this machine.
     """
 
     def __init__(self, rank: int = 0, size: int = 1, local_size: int = 1) -> None:
@@ -72,11 +70,7 @@ class Processes:
         return self.rank == 0
 
     def __enter__(self) -> Processes:
-        """Connect the processes.
-
-        Raises:
-            DyngsError: the others cannot be reached.
-        """
+        """Connect the processes."""
         if self.size == 1:
             return self
         backend = "gloo"
@@ -103,11 +97,7 @@ class Processes:
             distributed.destroy_process_group()
 
     def share(self, batch: int) -> range:
-        """Return which of the ``batch`` views of a step this process takes.
-
-        Raises:
-            DyngsError: they cannot be shared evenly.
-        """
+        """Return which of the ``batch`` views of a step this process takes."""
         each, rest = divmod(batch, self.size)
         if rest or not each:
             raise DyngsError(
@@ -159,15 +149,7 @@ class Processes:
                 distributed.broadcast(values, 0)
 
     def require_same(self, tensors: Mapping[str, Tensor], when: str) -> None:
-        """Raise unless the tensors have the same bytes in all processes.
-
-        Args:
-            tensors: name to value.
-            when: begins the message.
-
-        Raises:
-            DyngsError: one has others than the first.
-        """
+        """Raise unless the tensors have the same bytes in all processes."""
         if self.size == 1:
             return
         own = torch.tensor([_checksum(tensors)], dtype=torch.int64, device="cpu")

@@ -65,9 +65,7 @@ def log_gains(images: ImageLoader, which: Sequence[int], draw: Draw) -> Tensor:
     """Return (V, 3) log gains of the images ``which``, of mean 0; 0 of all others.
 
     Args:
-        images: V of training.
         which: indices of those that may be looked at.
-        draw: the scene, as far as it is learned.
     """
     cells = [_cells_of(images, index, draw) for index in which]
     centres = torch.cat([x.camera.centers for x in cells]).cpu()

@@ -43,16 +43,11 @@ class Trainer(Generic[M]):
     """A run in memory: everything that a step reads and changes.
 
     Attributes:
-        model: what is trained.
-        capture: that is trained on.
         background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
         alpha: how much silhouettes count in the loss.
-        generator: the only source of randomness, on the CPU.
-        priors: what the user knows about the capture.
         robust: masks of what disagrees with the other views; None: all pixels count.
         exposures: affine colours of the training images; None: they agree.
         refinement: of the cameras; None: they stay as the capture has them.
-        done: steps done.
         bad_gradients: how often something was left out of a step because its gradient was not finite.
         held_out: indices of the training views that are not trained on.
         processes: that take a fraction of the views of each step; one: this.
@@ -104,12 +99,7 @@ class Trainer(Generic[M]):
         return self.model.num_moving
 
     def step(self) -> StepReport:
-        """Train on this process's fraction of the images of a step; the report is of the first of them.
-
-        Raises:
-            DyngsError: the loss is not finite; says which term, and leaves the parameters as they were. Other processes
-                have come to other Gaussians.
-        """
+        """Train on this process's fraction of the images of a step; the report is of the first of them."""
         step = self.done + 1
         reports = []
         for index, seed in self._next_views(step):
@@ -183,11 +173,7 @@ class Trainer(Generic[M]):
         return Checkpoint(self.info, {name: x.cpu() for name, x in tensors_of(state).items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken.
-
-        Raises:
-            DyngsError: it belongs to another model or strategy, or its tensors do not fit together.
-        """
+        """Go back to where ``checkpoint`` was taken."""
         with reading(checkpoint.name, OTHER_CONFIG):
             try:
                 self.model.restore(checkpoint)

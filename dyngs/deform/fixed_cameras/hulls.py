@@ -40,7 +40,6 @@ class Blob:
         center: (3,) mean of the cubes.
         radius: of a ball of that volume, world units.
         cubes: (C, 3) centres.
-        side: of the cubes.
         color: (3,) mean colour in the images, 0 to 1.
     """
 

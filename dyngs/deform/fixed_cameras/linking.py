@@ -26,12 +26,7 @@ what hops turns back, too, but less often than noise does."""
 
 @dataclass(frozen=True)
 class Track:
-    """A thing followed over time.
-
-    Attributes:
-        times: ascending, at which it was found.
-        blobs: it at each of them.
-    """
+    """A thing followed over time."""
 
     times: tuple[float, ...]
     blobs: tuple[Blob, ...]

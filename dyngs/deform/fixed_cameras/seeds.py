@@ -50,13 +50,7 @@ COVERED = 0.1
 
 @dataclass(frozen=True)
 class Seeds:
-    """Gaussians of one thing at the time ``time``, and how it moves from there.
-
-    Attributes:
-        track: that they come from.
-        time: at which the Gaussians lie where they are.
-        gaussians: S.
-    """
+    """Gaussians of one thing at the time ``time``, and how it moves from there."""
 
     track: Track
     time: float
@@ -80,7 +74,6 @@ def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: in
     seed is the mean over all images in which it is on the side of the camera and the image changes there.
 
     Args:
-        num_terms: of the spherical harmonics; the first is set.
         others: (M, 3) other things that move: the Gaussians begin where the track is apart from them, so that none
             follows the nodes of another thing.
     """

@@ -29,16 +29,7 @@ def fitted_to_image(
     options: RenderOptions | None = None,
     weights: Tensor | None = None,
 ) -> Image:
-    """Return ``image`` with its camera moved to where the scene looks most like it; the lens stays.
-
-    Args:
-        scene: stays as it is.
-        image: with a camera that is nearly right.
-        background: (3,) behind both.
-        size: of the scene, world units.
-        options: as in training; None: those of the scene.
-        weights: (H, W) weights of the pixels beside the image's mask; None: 1.
-    """
+    """Return ``image`` with its camera moved to where the scene looks most like it; the lens stays."""
     options, truth = options or scene.options, image.composite(background)
     counts = image.mask if weights is None or image.mask is None else weights * image.mask
     counts = weights if counts is None else counts

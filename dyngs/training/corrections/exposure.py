@@ -66,13 +66,7 @@ def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | N
 
 
 class ViewExposures(Loss):
-    """An affine colour per training image, and their Adam.
-
-    Args:
-        neighbours: for each of V views, the views before and after it in a video; empty: none.
-        steps: of the run.
-        images: of training, from which all gains are found at once; None: each is found from its rendering.
-    """
+    """An affine colour per training image, and their Adam."""
 
     def __init__(self, neighbours: Sequence[Sequence[int]], steps: int, images: ImageLoader | None = None) -> None:
         count = len(neighbours)
@@ -88,13 +82,7 @@ class ViewExposures(Loss):
         self._weights = MIXING_WEIGHT + (GAIN_WEIGHT - MIXING_WEIGHT) * is_gain
 
     def begin(self, step: int, which: Callable[[int], bool], draw: Draw) -> None:
-        """Find the gains of all images at once, if it is time to.
-
-        Args:
-            step: that is being done.
-            which: whether an image may be looked at.
-            draw: the scene, as far as it is learned.
-        """
+        """Find the gains of all images at once, if it is time to."""
         if step != self._begins + 1 or self._images is None:
             return
         looked_at = [i for i in range(len(self._visits)) if which(i)]
@@ -110,14 +98,7 @@ class ViewExposures(Loss):
         return deviation + torch.eye(3, 4, dtype=deviation.dtype, device=deviation.device)
 
     def applied(self, view: tuple[int, int], image: Image, rendering: Rendering, background: Tensor) -> Tensor:
-        """Return (H, W, 3) the rendering of a view as its camera would have made it, for the loss.
-
-        Args:
-            view: its index, and the step that is being done.
-            image: of the view; may be smaller than that of the loader.
-            rendering: of the view.
-            background: (3,) behind both.
-        """
+        """Return (H, W, 3) the rendering of a view as its camera would have made it, for the loss."""
         index, step = view
         if step <= self._begins:
             return rendering.rgb[0]
@@ -164,7 +145,6 @@ class ViewExposures(Loss):
         return {"values": self._values.detach(), "visits": self._visits} | moments
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the state that ``state()`` returned. Raises KeyError, or ValueError for that of other images."""
         visits = require_tensor("visits", state["visits"], self._visits.shape, torch.int64)
         values = require_tensor("values", state["values"], self._values.shape, torch.float32)
         self._adam = AdamState.restored(state, {"values": values})

@@ -45,14 +45,7 @@ _OCTAVES, _PER_OCTAVE = 12, 16
 
 
 class RobustMasks:
-    """Masks of the pixels that count, one per training image, brought up to date as it is trained on.
-
-    Args:
-        images: of training.
-        cameras: theirs, V cameras of their full size.
-        steps: of the run.
-        corrected: see ``OtherViews``.
-    """
+    """Masks of the pixels that count, one per training image, brought up to date as it is trained on."""
 
     def __init__(
         self,
@@ -75,16 +68,7 @@ class RobustMasks:
         background: Tensor,
         with_depth: Callable[[Cameras], Rendering],
     ) -> Image:
-        """Return ``image``, of which only those pixels count that agree with the other views; call once a step.
-
-        Args:
-            index: of the view.
-            step: that is being done.
-            image: may be smaller than that of the loader.
-            drawn: (H, W, 3) its rendering.
-            background: (3,) behind both.
-            with_depth: draws the same scene with its expected depth.
-        """
+        """Return ``image``, of which only those pixels count that agree with the other views; call once a step."""
         if step <= self._begins:
             return image
         if int(self._visits[index]) % EVERY == 0:

@@ -29,13 +29,7 @@ _RANGE = 6.0
 
 @dataclass(frozen=True)
 class Agreement:
-    """Mean photometric errors (0 to 1) over pairs of images.
-
-    Attributes:
-        error: with the prior.
-        without: with its best substitute.
-        pairs: number of pairs compared.
-    """
+    """Mean photometric errors (0 to 1) over pairs of images."""
 
     error: float
     without: float
@@ -52,9 +46,6 @@ def flow_agreement(pairs: Sequence[tuple[Image, Image]]) -> Agreement:
 
     Only where images change most: elsewhere no motion is always right. There, displacements at random help a little,
     too, which is why they are a substitute.
-
-    Args:
-        pairs: images with flow, and those that it leads to.
     """
     sums = torch.zeros(4, device="cpu")
     count = 0
@@ -78,11 +69,7 @@ def flow_agreement(pairs: Sequence[tuple[Image, Image]]) -> Agreement:
 
 
 def track_agreement(pairs: Sequence[tuple[Image, Image, Tensor, Tensor]]) -> Agreement:
-    """Compare colours at both ends of tracks with those at the ends of other tracks.
-
-    Args:
-        pairs: two images, and (P, 2) px of points in each.
-    """
+    """Compare colours at both ends of tracks with those at the ends of other tracks."""
     given = shuffled = 0.0
     for first, second, start, end in pairs:
         before, after = (_blurred(p.rgb_premultiplied) for p in (first, second))
@@ -98,10 +85,6 @@ def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: flo
 
     Scale and shift, and the one depth, are those that warp the first image's second neighbour onto it best; the
     third one then judges them.
-
-    Args:
-        triples: images with depth, each with two others that see the same from elsewhere at about its time.
-        distance: of cameras from what they look at, world units.
     """
     sums = torch.zeros(3, device="cpu")
     count = 0
@@ -126,10 +109,6 @@ def mask_agreement(pairs: Sequence[tuple[Image, Image]], distance: float) -> Agr
 
     Each pixel may choose its depth. What stands is found on its epipolar line in the other image; from a camera that
     stands, too, at its own place.
-
-    Args:
-        pairs: images with masks, and others of another time.
-        distance: of cameras from what they look at, world units.
     """
     still = moving = 0.0
     count = 0

@@ -45,13 +45,6 @@ def depth_error(drawn: Tensor, alpha: Tensor, given: Tensor, kind: Kind, mask: T
 
     The map is aligned by scale and shift to what is drawn, without a gradient; |difference| over the median of the
     aligned values (in depth or inverse depth, see ``Kind``).
-
-    Args:
-        drawn: (H, W) expected depth.
-        alpha: (H, W).
-        given: (H, W) map, 0 where unknown.
-        kind: see ``Kind``.
-        mask: (H, W), 0 does not count.
     """
     counts = (given > 0) & (drawn > 0) & (alpha.detach() > _SOLID)
     if mask is not None:

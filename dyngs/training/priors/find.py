@@ -33,17 +33,7 @@ _BASELINE = 0.1
 
 
 def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves: bool) -> UsedPriors:
-    """Return the priors of a capture that agree with its images; nothing is read where it has none.
-
-    Args:
-        config: names the priors that may be used.
-        capture: of the run.
-        images: of its training views, with maps.
-        moves: whether anything may move in the model: without that, depth alone is of use.
-
-    Raises:
-        DyngsError: a file that is damaged.
-    """
+    """Return the priors of a capture that agree with its images; nothing is read where it has none."""
     wanted, views, lines = config.train.priors, images.views, list[str]()
     kind: Kind | None = None
     flow_to: dict[int, Glance] = {}

@@ -33,13 +33,6 @@ def displacements(start: Gaussians, end: Gaussians, here: Cameras, there: Camera
     """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights it stands for.
 
     Differentiable in the means of both, not in how much each Gaussian covers.
-
-    Args:
-        start: N Gaussians at the time of this image.
-        end: the same ones at the time of the other image.
-        here: camera of this image.
-        there: camera of the other image.
-        options: how to draw.
     """
     (from_px, from_z), (to_px, to_z) = _projected(start.means, here), _projected(end.means, there)
     seen = (from_z > options.near) & (to_z > options.near)

@@ -40,13 +40,7 @@ class PointTracks:
     def pair(
         self, index: int, may_use: Callable[[float], bool], generator: torch.Generator
     ) -> tuple[Glance, Tensor, Tensor] | None:
-        """Return another view at random among the nearest in time, and P' points here and there; None: there is none.
-
-        Args:
-            index: of this view.
-            may_use: whether a time may be looked at.
-            generator: chooses.
-        """
+        """Return another view at random among the nearest in time, and P' points here and there; None: there is none."""
         now = self.glances[index].time
         shared = (self.visible & self.visible[index]).sum(1)
         others = [
