@@ -36,7 +36,7 @@ from dyngs.data.synthetic.raytrace import Scene as TrueScene
 from dyngs.data.synthetic.scenes import SceneName, scene_at
 from dyngs.data.times import evenly_spaced
 from dyngs.data.tracks import read_true_tracks
-from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.regions import Regions
@@ -98,7 +98,7 @@ class Motion:
         return torch.tensor([w, x, y, z], dtype=torch.float32, device="cpu")
 
 
-class TrueMotion(NetworkField):
+class TrueMotion(DeformationField):
     """The motion of a synthetic scene as a field of which only the base colours over time are learned.
 
     Args:

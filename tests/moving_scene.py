@@ -14,7 +14,7 @@ from dyngs.config import Config, ControlNodesField, DataConfig, DynamicModel, St
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, FieldSetup, NetworkField, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.fields import field_state
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -32,7 +32,7 @@ SETUP = FieldSetup(torch.zeros(3), torch.ones(3), len(TRAIN_TIMES), len(MOVING_R
 
 
 @dataclass
-class Sliding(NetworkField):
+class Sliding(DeformationField):
     """Everything goes ``speed`` along x from time 0 to 1; counts how often it is asked."""
 
     speed: float = 1.0
@@ -57,7 +57,7 @@ class Blinking(Sliding):
         return Offsets(torch.zeros(len(means), 3), colors=torch.full((len(means), 3), self.speed * odd))
 
 
-class Lines(NetworkField):
+class Lines(DeformationField):
     """Each of M Gaussians goes along a line of its own, from -x at time 0 to x at time 1; what is learned is x."""
 
     def __init__(self, setup: FieldSetup = SETUP) -> None:

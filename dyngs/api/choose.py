@@ -73,22 +73,17 @@ class OpenSetting:
 
 @dataclass(frozen=True)
 class Choice:
-    """What small runs said about a setting.
-
-    Attributes:
-        without, gain: mean PSNR without it, and mean gain by it, dB.
-        error: standard error of the gain, dB.
-        taken: whether the setting is used.
-    """
+    """What small runs said about a setting."""
 
     setting: str
     views: int
+    # without, gain: mean PSNR without it, and mean gain by it, dB
     without: float
     gain: float
-    error: float
+    error: float  # standard error of the gain, dB
     steps: int
     seconds: float
-    taken: bool
+    taken: bool  # whether the setting is used
 
     def __str__(self) -> str:
         return (
@@ -206,18 +201,12 @@ def _requested(given: Section, usual: Section) -> Section:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Small runs that keep within their part of a run's work.
+    """Small runs that keep within their part of a run's work."""
 
-    Attributes:
-        folds: sets of the training views held out; small runs are made once for each.
-        runs: number of configurations that can be tried.
-        first_side: longest side of the images that the run itself begins with, px; small runs begin with no less.
-    """
-
-    folds: Sequence[frozenset[int]]
+    folds: Sequence[frozenset[int]]  # sets of the training views held out; small runs are made once for each
     steps: int
-    runs: int
-    first_side: float
+    runs: int  # number of configurations that can be tried
+    first_side: float  # longest side of the images that the run itself begins with, px; small runs begin with no less
 
     @staticmethod
     def of(config: Config, capture: Capture, num_settings: int) -> _Plan:

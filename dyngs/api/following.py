@@ -68,7 +68,7 @@ class Leader:
 
 
 def together(lead: Callable[[Processes], int]) -> int:
-    """Return the exit code of the processes that ``torchrun`` has started: the first calls ``lead``, the others follow."""
+    """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``, the others follow."""
     with Processes.of_torchrun() as processes:
         if not processes.is_first:
             follow(processes)

@@ -31,19 +31,13 @@ _FAINT = 0.02
 
 @dataclass(frozen=True)
 class Prediction:
-    """Result of ``predict_person``.
-
-    Attributes:
-        views: names of the images that were predicted from.
-        seconds_steps: training the network on these images.
-        seconds: of the prediction itself.
-    """
+    """Result of ``predict_person``."""
 
     run_dir: Path
-    views: tuple[str, ...]
+    views: tuple[str, ...]  # names of the images that were predicted from
     num_gaussians: int
-    seconds_steps: float
-    seconds: float
+    seconds_steps: float  # training the network on these images
+    seconds: float  # of the prediction itself
 
 
 def predict_person(

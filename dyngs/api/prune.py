@@ -35,23 +35,16 @@ SEARCH_STEPS = 1000
 
 @dataclass(frozen=True)
 class Promise:
-    """Result of pruning for a given loss.
+    """Result of pruning for a given loss."""
 
-    Attributes:
-        folder: of the new run; its file is in ``EXPORT_FOLDER`` there.
-        asked: largest loss on the views held out, dB.
-        before: mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest.
-        cut: what was taken away, for people; "nothing" where nothing could be.
-        views: that losses were measured on, for people.
-    """
-
-    folder: Path
-    asked: float
+    folder: Path  # of the new run; its file is in ``EXPORT_FOLDER`` there
+    asked: float  # largest loss on the views held out, dB
+    # mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest
     before: float
     after: float
-    cut: str
+    cut: str  # what was taken away, for people; "nothing" where nothing could be
     limits: tuple[Limit, ...]
-    views: str
+    views: str  # that losses were measured on, for people
     trials: int
 
     def __str__(self) -> str:

@@ -403,7 +403,7 @@ def _owes_file(config: Config, folder: Path) -> bool:
 
 
 def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint | None:
-    """Return the checkpoint to go on from, or None for a run that begins: a new one, or one stopped before its first."""
+    """Return the checkpoint to go on from; None for a run that begins, or that was stopped before its first."""
     if not resuming:
         require_startable(folder, config)
         return None

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes
-from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, NetworkField, Offsets
+from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
 from dyngs.deform.spline_fit import SPAN, cubic_fractions, refitted
 from dyngs.gaussians import TopologyEdit
@@ -41,7 +41,7 @@ SMOOTHNESS = 0.01
 """Weight of the nodes' squared acceleration, in node spacings."""
 
 
-class ControlNodes(NetworkField):
+class ControlNodes(DeformationField):
     """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that follow them.
 
     Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that nothing follows are

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
-from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen, key_times
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen, key_times
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
@@ -21,7 +21,7 @@ SPACE_RANGE = (0.1, 0.5)
 """Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
 
 
-class Hexplane(NetworkField):
+class Hexplane(DeformationField):
     """Features from six planes per level, decoded into offsets.
 
     Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the field starts as the

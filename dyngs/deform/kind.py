@@ -7,10 +7,9 @@ from collections.abc import Callable
 from dyngs.config import DynamicModel
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
-from dyngs.deform.given_masks import moving_fraction_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
-from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
+from dyngs.deform.still_error import StillErrors, cameras_in_place, moving_fractions, still_errors, views_to_compare
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.training import ColourTraining
@@ -62,7 +61,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
         shown = [images.shrunk(i, divisor) for i in looked_at]
         if any(image.moves is not None for image in shown):
-            return moving_fraction_of(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
+            return moving_fractions(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
         return still_errors(gaussians_at, shown, options, background, shader)
 
     in_place = cameras_in_place(views)

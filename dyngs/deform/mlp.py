@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dyngs.config import MlpField
 from dyngs.deform.decoder import Decoder, split_heads
-from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.gaussians.parameters import Parameters
 
 SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6
@@ -18,7 +18,7 @@ SKIP_LAYER = 5
 """The input is fed once more into this layer (counted from 0), where there are that many hidden ones."""
 
 
-class Mlp(NetworkField):
+class Mlp(DeformationField):
     """Offsets by a deep network; starts as the identity, because its last layer starts at zero.
 
     Differs from Deformable-3DGS in two small ways: time is encoded like position instead of by a network of its own,

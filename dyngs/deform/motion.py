@@ -19,15 +19,10 @@ MAX_SAMPLES = 24
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of M Gaussians over time.
+    """Motion of M Gaussians over time."""
 
-    Attributes:
-        pixels: (M,) farthest stray from the mean position, turning and growing of the outline included, in pixels.
-        mean: the offsets' means over time.
-    """
-
-    pixels: Tensor
-    mean: Offsets
+    pixels: Tensor  # (M,) farthest stray from the mean position, turning and growing of the outline included, in pixels
+    mean: Offsets  # the offsets' means over time
 
 
 @torch.no_grad()

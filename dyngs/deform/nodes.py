@@ -24,17 +24,11 @@ FOLLOWED = 4
 
 @dataclass(frozen=True)
 class Nodes:
-    """Control nodes, and the ones that each of M points follows.
+    """Control nodes, and the ones that each of M points follows."""
 
-    Attributes:
-        positions: (S, 3) canonical.
-        radii: (S,) of influence, world units: the mean distance to the nearest other nodes.
-        followed: (M, B) indices of the nodes that each point follows, nearest first.
-    """
-
-    positions: Tensor
-    radii: Tensor
-    followed: Tensor
+    positions: Tensor  # (S, 3) canonical
+    radii: Tensor  # (S,) of influence, world units: the mean distance to the nearest other nodes
+    followed: Tensor  # (M, B) indices of the nodes that each point follows, nearest first
 
     def followed_by(self, rows: Tensor) -> Nodes:
         """Return the nodes with only the points ``rows`` following them."""

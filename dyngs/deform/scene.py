@@ -24,16 +24,11 @@ _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
 @dataclass(frozen=True, kw_only=True)
 class DynamicScene(GaussianScene):
-    """N canonical Gaussians of which a field moves M.
+    """N canonical Gaussians of which a field moves M."""
 
-    Attributes:
-        seen_at: distinct training times in [0, 1], ascending.
-        moving: (M,) ascending indices of the Gaussians that it moves.
-    """
-
-    seen_at: tuple[float, ...]
+    seen_at: tuple[float, ...]  # distinct training times in [0, 1], ascending
     field: DeformationField | None = None
-    moving: Tensor = _NONE
+    moving: Tensor = _NONE  # (M,) ascending indices of the Gaussians that it moves
     filter_std: Tensor | None = None
 
     @staticmethod
@@ -144,18 +139,10 @@ def field_scene_of(scene: GaussianScene) -> DynamicScene | None:
 
 @dataclass(frozen=True)
 class _Part:
-    """Gaussians drawn around a time.
+    """Gaussians drawn around a time."""
 
-    Attributes:
-        gaussians: A canonical ones.
-        filter_std: (A,) of theirs, or None.
-        moving_means: (M, 3) canonical means of all that move.
-        asked: which of the M are drawn; None: all.
-        rows: their places among the A; None: all of them, in order.
-    """
-
-    gaussians: Gaussians
-    filter_std: Tensor | None
-    moving_means: Tensor
-    asked: Tensor | None
-    rows: Tensor | None
+    gaussians: Gaussians  # A canonical ones
+    filter_std: Tensor | None  # (A,) of theirs, or None
+    moving_means: Tensor  # (M, 3) canonical means of all that move
+    asked: Tensor | None  # which of the M are drawn; None: all
+    rows: Tensor | None  # their places among the A; None: all of them, in order

@@ -1,4 +1,4 @@
-"""Errors of a static model in the images: the first measure of what may move."""
+"""What may move: errors of a static model in the images, or motion masks that the capture has in place of these."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced, static_cameras
@@ -26,19 +28,16 @@ MOMENTS = 8
 """Images of one camera that are compared."""
 SHOWS = 1e-3
 """Sum of weights, in pixels, from which a Gaussian counts as visible in an image."""
+SURE_FRACTION = 0.5
+"""Fraction of a Gaussian in motion masks, where it is seen, from which it surely moves."""
 
 
 @dataclass(frozen=True)
 class StillErrors:
-    """Errors of a static scene in the images, per Gaussian.
+    """Errors of a static scene in the images, per Gaussian."""
 
-    Attributes:
-        most: (N,) large where anything moves, be it this Gaussian or what hides it at times.
-        usual: (N,) large where this moves.
-    """
-
-    most: Tensor
-    usual: Tensor
+    most: Tensor  # (N,) large where anything moves, be it this Gaussian or what hides it at times
+    usual: Tensor  # (N,) large where this moves
 
 
 def still_errors(
@@ -69,29 +68,62 @@ def still_errors(
             with torch.no_grad():
                 shader = shader_at(image.time or 0.0)
                 shown = render(gaussians, image.cameras, options, background=background, shader=shader).rgb[0]
-        signed, weight = signed_errors(gaussians, image, options, background, shown)
-        found.append((signed.abs().mean(1), weight))
+        counts = torch.ones(shown.shape[:2], device=shown.device) if image.mask is None else image.mask
+        error = (shown - image.composite(background)) * counts[..., None]
+        weights = counts[..., None].expand_as(error).contiguous()
+        signed, weight = weighted_sums(gaussians, image.cameras, options, [error, weights])
+        found.append((signed.abs().mean(1), weight[:, 0]))
     errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
     if not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
         return StillErrors(mean, mean)
     shows = weights > SHOWS
-    ordered = torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0).sort(dim=0, descending=True).values
-    usual = ((1 - USUAL) * shows.sum(0)).long()
-    return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
+    return _ranked(torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0), shows)
 
 
-def signed_errors(
-    gaussians: Gaussians, image: Image, options: RenderOptions, background: Tensor, expected: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return, per Gaussian, sums over pixels of its blending weight times the signed error, and of the weight alone."""
-    counts = torch.ones(expected.shape[:2], device=expected.device) if image.mask is None else image.mask
-    error = (expected - image.composite(background)) * counts[..., None]
+def moving_fractions(
+    gaussians_at: Callable[[float], Gaussians], images: Sequence[Image], options: RenderOptions, sure: float
+) -> StillErrors:
+    """Return the fraction of each Gaussian that lies in motion masks where it is seen, scaled as ``still_errors``.
+
+    s_vi = sum_p w_vip m_vp / sum_p w_vip with w = alpha T and m the mask of image v. What stands behind is covered in
+    fewer images. Those without a mask do not count; ``sure`` is the error that ``SURE_FRACTION`` stands for.
+    """
+    sums, weights = [], []
+    for image in images:
+        if image.moves is None:
+            continue
+        counts = torch.ones_like(image.moves) if image.mask is None else image.mask
+        # One pass sums both weights, each in a channel of its own.
+        both = torch.stack([image.moves * counts, counts, 0 * counts], dim=-1)
+        gaussians = gaussians_at(image.time or 0.0).detach()
+        (found,) = weighted_sums(gaussians, image.cameras, options, [both])
+        sums.append(found[:, 0])
+        weights.append(found[:, 1])
+    weight = torch.stack(weights)
+    seen = SH_C0 * SHOWS  # weights come out times the constant harmonic
+    shows = weight > seen
+    fraction = torch.where(shows, torch.stack(sums) / weight.clamp_min(seen), 0.0)
+    return _ranked(fraction * (sure / SURE_FRACTION), shows)
+
+
+def weighted_sums(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions, images: Sequence[Tensor]
+) -> list[Tensor]:
+    """Return, for each image (H, W, 3), the (N, 3) sums over its pixels, times the blending weight of each Gaussian.
+
+    By passes back through the blending of a constant colour.
+    """
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
-    blended = render(gaussians.replace(sh=flat), image.cameras, options).rgb[0]
-    (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
-    (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())
-    return signed[:, 0], weight[:, 0, 0]
+    blended = render(gaussians.replace(sh=flat), cameras, options).rgb[0]
+    return [torch.autograd.grad(blended, flat, image, retain_graph=True)[0][:, 0] for image in images]
+
+
+def _ranked(errors: Tensor, shows: Tensor) -> StillErrors:
+    """Return the largest and the ``USUAL`` quantile of ``errors`` (V, N) over the images in which a Gaussian shows."""
+    ordered = errors.sort(dim=0, descending=True).values
+    usual = ((1 - USUAL) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
+    return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
 
 
 def cameras_in_place(views: Sequence[View]) -> list[list[int]]:

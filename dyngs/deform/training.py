@@ -44,40 +44,28 @@ MIN_MOVING_FRACTION = 0.02
 
 @dataclass(frozen=True)
 class DeformSchedule:
-    """The steps at which the phases of training begin.
+    """The steps at which the phases of training begin."""
 
-    Attributes:
-        fine: last step without motion.
-        opens, full: steps between which the window of times grows, to all of them.
-        decays: step from which the field's rates fall.
-        splits: steps after which Gaussians that do not move are frozen.
-    """
-
-    fine: int
+    fine: int  # last step without motion
+    # opens, full: steps between which the window of times grows, to all of them
     opens: int
     full: int
-    decays: int
-    splits: tuple[int, ...]
+    decays: int  # step from which the field's rates fall
+    splits: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
     rates: Rates
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Properties of the capture that training a dynamic scene needs.
+    """Properties of the capture that training a dynamic scene needs."""
 
-    Attributes:
-        times: of the training views, in [0, 1], ascending; at least two differ.
-        still_errors: how far its images disagree with what is still, where N Gaussians are seen.
-        cameras_stay: in place, so that images show what is still exactly alike.
-        standing: returns what those cameras show.
-    """
-
-    times: tuple[float, ...]
+    times: tuple[float, ...]  # of the training views, in [0, 1], ascending; at least two differ
     cameras: Sequence[Cameras]
     extent: float
+    # how far its images disagree with what is still, where N Gaussians are seen
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
-    cameras_stay: bool = False
-    standing: Callable[[], Sequence[Footage]] = tuple
+    cameras_stay: bool = False  # in place, so that images show what is still exactly alike
+    standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):

@@ -28,18 +28,14 @@ MAX_LOG_VARIANCE = 60.0
 
 @dataclass(frozen=True)
 class DensifySchedule:
-    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with its length).
+    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with its length)."""
 
-    Attributes:
-        start, stop: changes happen strictly between the two.
-        prune_scale_after: from this step on, Gaussians that are too large are removed.
-    """
-
+    # start, stop: changes happen strictly between the two
     start: int
     stop: int
     every: int
     resets: tuple[int, ...] = ()
-    prune_scale_after: int = 0
+    prune_scale_after: int = 0  # from this step on, Gaussians that are too large are removed
 
     def densifies_at(self, step: int) -> bool:
         return self.start < step < self.stop and step % self.every == 0

@@ -28,17 +28,11 @@ CANDIDATES = 4
 
 @dataclass(frozen=True)
 class StartValues:
-    """Scales and opacities of the first Gaussians, by strategy.
+    """Scales and opacities of the first Gaussians, by strategy."""
 
-    Attributes:
-        opacity: in (0, 1).
-        scale_factor: multiplies the distance to the nearest neighbours.
-        max_gaussians: more points than this are thinned at random.
-    """
-
-    opacity: float = START_OPACITY
-    scale_factor: float = 1.0
-    max_gaussians: int = 3_000_000
+    opacity: float = START_OPACITY  # in (0, 1)
+    scale_factor: float = 1.0  # multiplies the distance to the nearest neighbours
+    max_gaussians: int = 3_000_000  # more points than this are thinned at random
 
     @staticmethod
     def for_strategy(strategy: Strategy) -> StartValues:
@@ -54,16 +48,12 @@ class StartValues:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Cameras and extent of a scene before training, in world units.
-
-    Attributes:
-        points: (P, 3) sparse points, or None.
-        around_origin: by convention the scene lies around the origin (Blender scenes), where the cameras look there.
-    """
+    """Cameras and extent of a scene before training, in world units."""
 
     views: Sequence[View]
-    points: np.ndarray | None = None
+    points: np.ndarray | None = None  # (P, 3) sparse points, or None
     points_rgb: np.ndarray | None = None
+    # by convention the scene lies around the origin (Blender scenes), where the cameras look there
     around_origin: bool = False
 
     @property

@@ -85,13 +85,9 @@ class RenderOptions(DrawOptions):
 
 @dataclass(frozen=True)
 class GaussianRendering(Rendering):
-    """V rendered images of N Gaussians.
+    """V rendered images of N Gaussians."""
 
-    Attributes:
-        radii: (V, N, 2) int32 half extents in px, 0 = not drawn.
-    """
-
-    radii: Tensor
+    radii: Tensor  # (V, N, 2) int32 half extents in px, 0 = not drawn
 
 
 def render(

@@ -33,16 +33,12 @@ S = TypeVar("S", bound="GaussianScene")
 
 @dataclass(frozen=True)
 class GaussianTimeStep(TimeStep):
-    """Gaussians at one time.
-
-    Attributes:
-        frame: where the Gaussians are at rest, if colours follow a body.
-        penalties: differentiable regularizers, weighted, by name; empty outside training.
-    """
+    """Gaussians at one time."""
 
     gaussians: Gaussians
     time: float | None = None
-    frame: Frame | None = None
+    frame: Frame | None = None  # where the Gaussians are at rest, if colours follow a body
+    # differentiable regularizers, weighted, by name; empty outside training
     penalties: dict[str, Tensor] = field(default_factory=dict)
 
 

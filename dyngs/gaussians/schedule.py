@@ -33,14 +33,10 @@ REWIND = 0.3
 
 @dataclass(frozen=True)
 class Rates:
-    """The course of all learning rates that fall over a run.
-
-    Attributes:
-        tuning: steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``.
-    """
+    """The course of all learning rates that fall over a run."""
 
     steps: int
-    tuning: int = 0
+    tuning: int = 0  # steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``
 
     def progress(self, step: int, since: int = 0) -> float:
         """Return 0 up to step ``since``, rising to 1 at the end: the progress of rates that fall from ``since`` on."""

@@ -19,17 +19,11 @@ BITS = 8
 
 @dataclass(frozen=True)
 class VisibilityMasks:
-    """Visibility of N Gaussians at K >= 2 key times.
+    """Visibility of N Gaussians at K >= 2 key times."""
 
-    Attributes:
-        times: distinct, ascending, in [0, 1].
-        bits: (K, ceil(N / 8)) uint8; Gaussian i is bit i % 8 of byte i // 8.
-        count: N.
-    """
-
-    times: tuple[float, ...]
-    bits: Tensor
-    count: int
+    times: tuple[float, ...]  # distinct, ascending, in [0, 1]
+    bits: Tensor  # (K, ceil(N / 8)) uint8; Gaussian i is bit i % 8 of byte i // 8
+    count: int  # N
 
     @staticmethod
     def pack(times: tuple[float, ...], seen: Tensor) -> VisibilityMasks:

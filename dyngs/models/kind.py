@@ -24,16 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunStart:
-    """What a model begins with.
-
-    Attributes:
-        asked: the same without limits: a run may begin with more Gaussians than it may end with.
-        capture: that is trained on, with its first points.
-    """
+    """What a model begins with."""
 
     config: Config
-    asked: Config
-    capture: Capture
+    asked: Config  # the same without limits: a run may begin with more Gaussians than it may end with
+    capture: Capture  # that is trained on, with its first points
     images: ImageLoader
     background: str
     extent: float
@@ -42,15 +37,11 @@ class RunStart:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of model.
+    """A kind of model."""
 
-    Attributes:
-        section: class of its configuration.
-        home: module with its ``start`` and ``restore``, and ``trainer`` of a network; imported when first needed, so
-            that reading a configuration imports no model.
-    """
-
-    section: type[ModelSection]
+    section: type[ModelSection]  # class of its configuration
+    # module with its ``start`` and ``restore``, and ``trainer`` of a network; imported when first needed, so that
+    # reading a configuration imports no model
     home: str
 
     def start(self, start: RunStart) -> Model[Any]:

@@ -26,35 +26,24 @@ def nothing() -> None:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A training image as a model draws it.
+    """A training image as a model draws it."""
 
-    Attributes:
-        rendering: of the image's camera.
-        penalties: differentiable regularizers of what was drawn, weighted, by name.
-        moved: tensors that something learned has moved, by name: one that is not finite would not be drawn, so that a
-            diverging field could go unseen; empty: nothing was.
-        after_backward: takes in gradients once they are there.
-    """
-
-    rendering: Rendering
+    rendering: Rendering  # of the image's camera
+    # differentiable regularizers of what was drawn, weighted, by name
     penalties: Mapping[str, Tensor] = field(default_factory=dict)
+    # tensors that something learned has moved, by name: one that is not finite would not be drawn, so that a diverging
+    # field could go unseen; empty: nothing was
     moved: Mapping[str, Tensor] = field(default_factory=dict)
-    after_backward: Callable[[], None] = nothing
+    after_backward: Callable[[], None] = nothing  # takes in gradients once they are there
 
 
 @dataclass(frozen=True)
 class Updated:
-    """What an update has done.
+    """What an update has done."""
 
-    Attributes:
-        bad: number of rows left out because their gradient was not finite.
-        finding: lines about what was found out, or None.
-        is_rearranged: there are other rows now: several processes must have come to the same.
-    """
-
-    bad: Count = 0
-    finding: str | None = None
-    is_rearranged: bool = False
+    bad: Count = 0  # number of rows left out because their gradient was not finite
+    finding: str | None = None  # lines about what was found out, or None
+    is_rearranged: bool = False  # there are other rows now: several processes must have come to the same
 
 
 class Model(ABC, Generic[S_co]):
@@ -134,18 +123,13 @@ class Model(ABC, Generic[S_co]):
 
 @dataclass(frozen=True)
 class Look:
-    """A training image next to its rendering, for terms of the loss.
+    """A training image next to its rendering, for terms of the loss."""
 
-    Attributes:
-        index: of the view.
-        image: what was trained on, with a mask of the pixels that count.
-        rendered, truth: (H, W, 3) that are compared, on the same background.
-    """
-
-    index: int
+    index: int  # of the view
     step: int
-    image: Image
+    image: Image  # what was trained on, with a mask of the pixels that count
     drawn: Drawn
+    # rendered, truth: (H, W, 3) that are compared, on the same background
     rendered: Tensor
     truth: Tensor
     model: Model[Any]

@@ -21,14 +21,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """How any scene is drawn.
+    """How any scene is drawn."""
 
-    Attributes:
-        near: what is nearer to the camera is not drawn, world units (3DGS: 0.2).
-        depth: none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha).
-    """
-
-    near: float = 0.2
+    near: float = 0.2  # what is nearer to the camera is not drawn, world units (3DGS: 0.2)
+    # none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha)
     depth: Literal["none", "accumulated", "expected"] = "none"
 
 

@@ -31,14 +31,10 @@ IMAGES = 12
 
 @dataclass(frozen=True)
 class AlphaWeight:
-    """Weight of the mean error of alpha in the loss.
-
-    Attributes:
-        finding: a line about why, if that was measured.
-    """
+    """Weight of the mean error of alpha in the loss."""
 
     weight: float = 0.0
-    finding: str | None = None
+    finding: str | None = None  # a line about why, if that was measured
 
 
 def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> AlphaWeight:

@@ -30,18 +30,12 @@ class FieldSize:
 
 @dataclass(frozen=True)
 class Cut:
-    """A choice of parts to take away; the defaults take nothing.
+    """A choice of parts to take away; the defaults take nothing."""
 
-    Attributes:
-        fraction: of the Gaussians that is removed.
-        alpha_min: pixels skip Gaussians with a lower alpha; None: as the run has it.
-        field: size of the field of control nodes; None: as it is.
-        harmonics: PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay.
-    """
-
-    fraction: float = 0.0
-    alpha_min: float | None = None
-    field: FieldSize | None = None
+    fraction: float = 0.0  # of the Gaussians that is removed
+    alpha_min: float | None = None  # pixels skip Gaussians with a lower alpha; None: as the run has it
+    field: FieldSize | None = None  # size of the field of control nodes; None: as it is
+    # PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay
     harmonics: float = 0.0
 
     def __str__(self) -> str:

@@ -51,22 +51,15 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A run after a cut and fine-tuning.
-
-    Attributes:
-        checkpoint: at its end.
-        psnr: mean on the views held out, dB.
-        loss: that of what it is compared with, minus ``psnr``.
-        trained_loss: of views that the run and fine-tuning see, against the run as it is, dB.
-    """
+    """A run after a cut and fine-tuning."""
 
     cut: Cut
     config: Config
-    checkpoint: Checkpoint
+    checkpoint: Checkpoint  # at its end
     num_gaussians: int
-    psnr: float
-    loss: float
-    trained_loss: float = 0.0
+    psnr: float  # mean on the views held out, dB
+    loss: float  # that of what it is compared with, minus ``psnr``
+    trained_loss: float = 0.0  # of views that the run and fine-tuning see, against the run as it is, dB
 
     @property
     def worst(self) -> float:
@@ -76,17 +69,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Limit:
-    """Why no more of one kind of thing was taken.
+    """Why no more of one kind of thing was taken."""
 
-    Attributes:
-        kind: of thing, a key of ``ALLOWED``.
-        taken: what goes, of this kind.
-        refused: the next step, and its loss in dB; None where there is no next step.
-    """
-
-    kind: str
-    taken: str
-    refused: tuple[str, float] | None = None
+    kind: str  # of thing, a key of ``ALLOWED``
+    taken: str  # what goes, of this kind
+    refused: tuple[str, float] | None = None  # the next step, and its loss in dB; None where there is no next step
 
     def __str__(self) -> str:
         if self.refused is None:
@@ -97,19 +84,13 @@ class Limit:
 
 @dataclass(frozen=True)
 class Found:
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes:
-        accepted: candidates that keep the promise, each smaller than the one before; the first is the run as it is.
-        limits: why no more was taken, by kind of thing.
-        views: that losses were measured on, for people.
-        trials: number of fine-tuned candidates, the run as it is included.
-    """
-
+    # candidates that keep the promise, each smaller than the one before; the first is the run as it is
     accepted: tuple[Candidate, ...]
-    limits: tuple[Limit, ...]
-    views: str
-    trials: int
+    limits: tuple[Limit, ...]  # why no more was taken, by kind of thing
+    views: str  # that losses were measured on, for people
+    trials: int  # number of fine-tuned candidates, the run as it is included
 
 
 @dataclass(frozen=True)

@@ -40,16 +40,12 @@ MASKED_BELOW = 0.5
 
 @dataclass(frozen=True)
 class Pruned:
-    """Result of the pruning stage of a run.
-
-    Attributes:
-        active: mean fraction of the kept that masks let through; 1 without masks.
-    """
+    """Result of the pruning stage of a run."""
 
     before: int
     after: int
     loss: float
-    active: float
+    active: float  # mean fraction of the kept that masks let through; 1 without masks
 
     def __str__(self) -> str:
         masks = "" if self.active == 1 else f"; masks let {self.active:.0%} of them through"

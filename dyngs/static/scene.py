@@ -17,13 +17,10 @@ from dyngs.state import State
 
 @dataclass(frozen=True, kw_only=True)
 class StaticScene(GaussianScene):
-    """The same N Gaussians at every time.
-
-    Attributes:
-        seen_at: distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing moves.
-    """
+    """The same N Gaussians at every time."""
 
     filter_std: Tensor | None = None
+    # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing moves
     seen_at: tuple[float, ...] = ()
 
     @staticmethod

@@ -22,20 +22,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StepReport:
-    """One step of training.
+    """One step of training."""
 
-    Attributes:
-        step: its number, from 1.
-        rendered, truth: (H, W, 3) on the same background.
-        finding: lines about what was found out after the step, or None.
-    """
-
-    step: int
+    step: int  # its number, from 1
     loss: float
     image: Image
+    # rendered, truth: (H, W, 3) on the same background
     rendered: Tensor
     truth: Tensor
-    finding: str | None = None
+    finding: str | None = None  # lines about what was found out after the step, or None
 
     @cached_property
     def psnr(self) -> float:
@@ -53,15 +48,10 @@ class Started:
 
 @dataclass(frozen=True)
 class StepDone:
-    """A step is done. Values outside the report are current when read: an earlier listener may have changed them.
+    """A step is done. Values outside the report are current when read: an earlier listener may have changed them."""
 
-    Attributes:
-        report: of the step.
-        loop: that did it; a viewer finds what is trained in ``loop.trainer``.
-    """
-
-    report: StepReport
-    loop: Loop
+    report: StepReport  # of the step
+    loop: Loop  # that did it; a viewer finds what is trained in ``loop.trainer``
 
     @property
     def step(self) -> int:

@@ -67,36 +67,24 @@ _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in
 
 @dataclass(frozen=True)
 class MemoryForecast:
-    """Bytes that a run is expected to take at its peak.
-
-    Attributes:
-        images: that decoded ones will take, in the cache or on their way to it.
-        field: of what all Gaussians share: grids and networks of a deformation field.
-        count: Gaussians that may be expected.
-        most: Gaussians that the strategy allows.
-        least: Gaussians that there will certainly be at some time.
-        free: of this machine and this process's limits, beside what is taken already; None: not known.
-        whole: of this machine with its swap, or the limit of its container; None: not known.
-        all_kept: every image has its place in the cache.
-        on_gpu: it is the memory of a GPU, where images take no more than their share.
-        limits: key that limits the number of Gaussians, and its value at ``count`` of them.
-    """
+    """Bytes that a run is expected to take at its peak."""
 
     program: int
-    images: int
+    images: int  # that decoded ones will take, in the cache or on their way to it
     drawing: int
-    field: int
-    count: int
-    most: int
-    least: int
+    field: int  # of what all Gaussians share: grids and networks of a deformation field
+    count: int  # Gaussians that may be expected
+    most: int  # Gaussians that the strategy allows
+    least: int  # Gaussians that there will certainly be at some time
     each: int
     least_each: int
-    free: int | None
-    whole: int | None
-    all_kept: bool
+    free: int | None  # of this machine and this process's limits, beside what is taken already; None: not known
+    whole: int | None  # of this machine with its swap, or the limit of its container; None: not known
+    all_kept: bool  # every image has its place in the cache
     processes: int = 1
     longest_side: int = 0
-    on_gpu: bool = False
+    on_gpu: bool = False  # it is the memory of a GPU, where images take no more than their share
+    # key that limits the number of Gaussians, and its value at ``count`` of them
     limits: tuple[str, int] = ("strategy.max_gaussians", 0)
 
     @property

@@ -82,19 +82,13 @@ class Filmed:
 
 @dataclass
 class PersonPredictor(Predictor):
-    """A network that predicts the person of a capture.
-
-    Attributes:
-        network: may be trained on images of the person before, see ``adapt``.
-        mean: (3, S, S) colours of the people that it was trained on.
-        person: with images.
-    """
+    """A network that predicts the person of a capture."""
 
     config: Config
     model: HumanPredictorModel
-    network: AtlasNetwork
-    mean: Tensor
-    person: Filmed
+    network: AtlasNetwork  # may be trained on images of the person before, see ``adapt``
+    mean: Tensor  # (3, S, S) colours of the people that it was trained on
+    person: Filmed  # with images
 
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> HumanScene:
@@ -125,12 +119,7 @@ class PersonPredictor(Predictor):
 
 @dataclass
 class NetworkTrainer:
-    """A run in memory, as ``Trainer``.
-
-    Attributes:
-        num_gaussians: of the last person.
-        device: of the network and the scenes that it predicts.
-    """
+    """A run in memory, as ``Trainer``."""
 
     config: Config
     model: HumanPredictorModel
@@ -142,10 +131,10 @@ class NetworkTrainer:
     background: str
     generator: torch.Generator
     done: int = 0
-    num_gaussians: int = 0
+    num_gaussians: int = 0  # of the last person
     bad_gradients: int = 0
     has_test_views: bool = False
-    device: torch.device = CPU
+    device: torch.device = CPU  # of the network and the scenes that it predicts
 
     @property
     def num_moving(self) -> int:

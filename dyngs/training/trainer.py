@@ -40,38 +40,26 @@ M = TypeVar("M", bound=Model[Any])
 
 @dataclass
 class Trainer(Generic[M]):
-    """A run in memory: everything that a step reads and changes.
-
-    Attributes:
-        background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
-        alpha: how much silhouettes count in the loss.
-        robust: masks of what disagrees with the other views; None: all pixels count.
-        exposures: affine colours of the training images; None: they agree.
-        refinement: of the cameras; None: they stay as the capture has them.
-        bad_gradients: how often something was left out of a step because its gradient was not finite.
-        held_out: indices of the training views that are not trained on.
-        processes: that take a fraction of the views of each step; one: this.
-        device: where the model is trained; see ``place``.
-    """
+    """A run in memory: everything that a step reads and changes."""
 
     config: Config
     model: M
     capture: Capture
     images: ImageLoader
     sampler: ViewSampler
-    background: str
+    background: str  # "white", "black" or "random" (a new colour in each step, behind render and truth alike)
     extent: float
-    alpha: AlphaWeight
+    alpha: AlphaWeight  # how much silhouettes count in the loss
     generator: torch.Generator
     priors: UsedPriors = field(default_factory=UsedPriors)
-    robust: RobustMasks | None = None
-    exposures: ViewExposures | None = None
-    refinement: CameraRefinement | None = None
+    robust: RobustMasks | None = None  # masks of what disagrees with the other views; None: all pixels count
+    exposures: ViewExposures | None = None  # affine colours of the training images; None: they agree
+    refinement: CameraRefinement | None = None  # of the cameras; None: they stay as the capture has them
     done: int = 0
-    bad_gradients: Count = 0
-    held_out: frozenset[int] = frozenset()
-    processes: Processes = field(default_factory=Processes)
-    device: torch.device = CPU
+    bad_gradients: Count = 0  # how often something was left out of a step because its gradient was not finite
+    held_out: frozenset[int] = frozenset()  # indices of the training views that are not trained on
+    processes: Processes = field(default_factory=Processes)  # that take a fraction of the views of each step; one: this
+    device: torch.device = CPU  # where the model is trained; see ``place``
 
     def __post_init__(self) -> None:
         """List the terms of the loss: an order that decides the last bits of its gradients."""

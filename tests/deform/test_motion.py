@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.deform.field import NetworkField, Offsets, deformed
+from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion
 from dyngs.gaussians.parameters import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))
 
 
-class Scripted(NetworkField):
+class Scripted(DeformationField):
     """A field that follows a function of time; keeps the times at which it was asked."""
 
     def __init__(self, script: Callable[[Tensor, float], Offsets]) -> None:

@@ -37,23 +37,14 @@ _DARK = 0.03
 
 @dataclass(frozen=True)
 class Footage:
-    """Images of one camera that stands still, and what changes in them.
+    """Images of one camera that stands still, and what changes in them."""
 
-    Attributes:
-        camera: (V = 1) of the images' size.
-        times: T, ascending.
-        images: (T, H, W, 3) uint8.
-        changed: (T, H, W) bool: shows something that is elsewhere, or not there, at most other times.
-        counted: (T, H, W) bool; False where the image is masked out.
-        median: (H, W, 3) uint8, what is still.
-    """
-
-    camera: Cameras
-    times: tuple[float, ...]
-    images: np.ndarray
-    changed: np.ndarray
-    counted: np.ndarray
-    median: np.ndarray
+    camera: Cameras  # (V = 1) of the images' size
+    times: tuple[float, ...]  # T, ascending
+    images: np.ndarray  # (T, H, W, 3) uint8
+    changed: np.ndarray  # (T, H, W) bool: shows something that is elsewhere, or not there, at most other times
+    counted: np.ndarray  # (T, H, W) bool; False where the image is masked out
+    median: np.ndarray  # (H, W, 3) uint8, what is still
 
 
 def footage_of(images: Iterable[Image], background: Tensor, total: int = 1) -> Footage:

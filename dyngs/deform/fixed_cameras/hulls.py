@@ -34,37 +34,25 @@ NEAR = 1e-3
 
 @dataclass(frozen=True)
 class Blob:
-    """A connected part of a visual hull at one time.
+    """A connected part of a visual hull at one time."""
 
-    Attributes:
-        center: (3,) mean of the cubes.
-        radius: of a ball of that volume, world units.
-        cubes: (C, 3) centres.
-        color: (3,) mean colour in the images, 0 to 1.
-    """
-
-    center: np.ndarray
-    radius: float
-    cubes: np.ndarray
+    center: np.ndarray  # (3,) mean of the cubes
+    radius: float  # of a ball of that volume, world units
+    cubes: np.ndarray  # (C, 3) centres
     side: float
-    color: np.ndarray
+    color: np.ndarray  # (3,) mean colour in the images, 0 to 1
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Change that one camera sees at one time.
+    """Change that one camera sees at one time."""
 
-    Attributes:
-        projection: (3, 4) matrix from the world to homogeneous pixels.
-        image: (H, W, 3) uint8.
-        changed, counted: (H, W) bool, see ``Footage``.
-        sums, masked: (H + 1, W + 1) summed areas of ``changed``, and of what is not counted.
-    """
-
-    projection: np.ndarray
-    image: np.ndarray
+    projection: np.ndarray  # (3, 4) matrix from the world to homogeneous pixels
+    image: np.ndarray  # (H, W, 3) uint8
+    # changed, counted: (H, W) bool, see ``Footage``
     changed: np.ndarray
     counted: np.ndarray
+    # sums, masked: (H + 1, W + 1) summed areas of ``changed``, and of what is not counted
     sums: np.ndarray
     masked: np.ndarray
 

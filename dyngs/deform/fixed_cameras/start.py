@@ -68,7 +68,7 @@ class FirstMotion:
 def first_motion(
     footage: Sequence[Footage], still: Gaussians, moving: Tensor, extent: float, limit: int
 ) -> FirstMotion:
-    """Return what travels before the cameras of ``footage``, wherever ``still`` Gaussians are or the cameras look on."""
+    """Return what travels before the cameras of ``footage``, where ``still`` Gaussians are or the cameras look."""
     if len(footage) < 2 or limit < 1:
         return FirstMotion()
     tracks = found_tracks(footage, *_box(footage, still, extent))

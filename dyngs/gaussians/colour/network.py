@@ -25,30 +25,21 @@ from dyngs.tensor_checks import require_positive, require_tensor
 
 @dataclass(frozen=True)
 class Frame:
-    """Rest pose of a moving body, which its colours follow.
+    """Rest pose of a moving body, which its colours follow."""
 
-    Attributes:
-        places: (N, 3) centres of the drawn Gaussians at rest.
-        turn: (3, 3) rotation of the body from rest to the world.
-    """
-
-    places: Tensor
-    turn: Tensor
+    places: Tensor  # (N, 3) centres of the drawn Gaussians at rest
+    turn: Tensor  # (3, 3) rotation of the body from rest to the world
 
 
 @dataclass(frozen=True)
 class ColourNetwork:
-    """F: what is added to the base colour of a Gaussian, by place, direction, normal and time.
-
-    Attributes:
-        box: (2, 3) centre and half sides of the scene, world units.
-        sees_normals: the cosine between the shortest axis of the Gaussian and the direction, and the direction mirrored
-            at that axis, are inputs.
-    """
+    """F: what is added to the base colour of a Gaussian, by place, direction, normal and time."""
 
     layers: tuple[Layer, ...]
-    box: Tensor
+    box: Tensor  # (2, 3) centre and half sides of the scene, world units
     sees_time: bool
+    # the cosine between the shortest axis of the Gaussian and the direction, and the direction mirrored at that axis,
+    # are inputs
     sees_normals: bool
 
     @property

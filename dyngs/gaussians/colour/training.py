@@ -34,32 +34,21 @@ _HELD_OUT = 5
 
 @dataclass(frozen=True)
 class TrainingLooks:
-    """The training views as the scene is drawn for them now.
+    """The training views as the scene is drawn for them now."""
 
-    Attributes:
-        indices: of the views that may be trained on.
-        views: those of some indices, one at a time.
-    """
-
-    indices: Sequence[int]
-    views: Callable[[Sequence[int]], Iterator[MeasuredView]]
+    indices: Sequence[int]  # of the views that may be trained on
+    views: Callable[[Sequence[int]], Iterator[MeasuredView]]  # those of some indices, one at a time
     options: RenderOptions
     background: Tensor
 
 
 @dataclass(frozen=True)
 class HarmonicsDropped:
-    """Gaussians whose harmonics are dropped for good.
+    """Gaussians whose harmonics are dropped for good."""
 
-    Attributes:
-        text: what was found, for people.
-        rows: (N,) bool, those without harmonics from now on; None: all keep theirs.
-        offsets: (N, 3) colour to add to their base.
-    """
-
-    text: str
-    rows: Tensor | None = None
-    offsets: Tensor | None = None
+    text: str  # what was found, for people
+    rows: Tensor | None = None  # (N,) bool, those without harmonics from now on; None: all keep theirs
+    offsets: Tensor | None = None  # (N, 3) colour to add to their base
 
 
 class ColourTraining:

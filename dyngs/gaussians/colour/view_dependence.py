@@ -30,31 +30,21 @@ _LIFT = 64.0
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One training image and the N Gaussians that are drawn for it.
+    """One training image and the N Gaussians that are drawn for it."""
 
-    Attributes:
-        gaussians: at its time.
-        truth: (H, W, 3) on the background.
-    """
-
-    gaussians: Gaussians
+    gaussians: Gaussians  # at its time
     camera: Cameras
-    truth: Tensor
+    truth: Tensor  # (H, W, 3) on the background
     mask: Tensor | None
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The Gaussians whose view dependence is worth its cost.
+    """The Gaussians whose view dependence is worth its cost."""
 
-    Attributes:
-        keeps: (N,) bool, Gaussians whose harmonics stay.
-        offsets: (N, 3) colour to add to the base of the others.
-        worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones bring.
-    """
-
-    keeps: Tensor
-    offsets: Tensor
+    keeps: Tensor  # (N,) bool, Gaussians whose harmonics stay
+    offsets: Tensor  # (N, 3) colour to add to the base of the others
+    # worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones bring
     worth_all: float
     worth_kept: float
 

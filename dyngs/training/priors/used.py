@@ -25,22 +25,16 @@ _NEAREST = 8
 
 @dataclass(frozen=True)
 class PointTracks:
-    """2D tracks in the training images.
+    """2D tracks in the training images."""
 
-    Attributes:
-        xy: (V, P, 2) px of the full training images.
-        visible: (V, P) bool; a view without tracks has none.
-        glances: camera and time of the V views.
-    """
-
-    xy: Tensor
-    visible: Tensor
-    glances: Sequence[Glance]
+    xy: Tensor  # (V, P, 2) px of the full training images
+    visible: Tensor  # (V, P) bool; a view without tracks has none
+    glances: Sequence[Glance]  # camera and time of the V views
 
     def pair(
         self, index: int, may_use: Callable[[float], bool], generator: torch.Generator
     ) -> tuple[Glance, Tensor, Tensor] | None:
-        """Return another view at random among the nearest in time, and P' points here and there; None: there is none."""
+        """Return another view at random among the nearest in time, and P' points here and there, or None."""
         now = self.glances[index].time
         shared = (self.visible & self.visible[index]).sum(1)
         others = [
@@ -58,20 +52,14 @@ class PointTracks:
 
 @dataclass(frozen=True)
 class UsedPriors(Loss):
-    """Priors that agree with the images.
+    """Priors that agree with the images."""
 
-    Attributes:
-        depth: what the depth maps are affine in; None: none are used.
-        flow_to: by training view, the camera and time that its flow leads to; empty: no flow is used.
-        tracks: None: none are used.
-        masks: whether motion masks say what may move.
-        lines: what was found, for people, told once; whoever tells them removes them.
-    """
-
-    depth: Kind | None = None
+    depth: Kind | None = None  # what the depth maps are affine in; None: none are used
+    # by training view, the camera and time that its flow leads to; empty: no flow is used
     flow_to: Mapping[int, Glance] = field(default_factory=dict)
-    tracks: PointTracks | None = None
-    masks: bool = False
+    tracks: PointTracks | None = None  # None: none are used
+    masks: bool = False  # whether motion masks say what may move
+    # what was found, for people, told once; whoever tells them removes them
     lines: list[str] = field(default_factory=list)
 
     def needs_depth(self, image: Image) -> bool:
