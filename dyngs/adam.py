@@ -77,12 +77,10 @@ class AdamState:
         return AdamState(first, second)
 
     def state(self) -> State:
-        """Return ``exp_avg.NAME`` and ``exp_avg_sq.NAME``."""
         parts = zip(MOMENTS, (self.exp_avg, self.exp_avg_sq), strict=True)
         return {k: x for part, moments in parts for k, x in prefixed(part, with_role(moments, Role.TRAINING)).items()}
 
     def to(self, device: torch.device | str) -> AdamState:
-        """Return the moments on ``device``."""
         return AdamState(moved_to(self.exp_avg, device), moved_to(self.exp_avg_sq, device))
 
 

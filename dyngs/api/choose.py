@@ -185,7 +185,6 @@ def as_static(config: Config) -> Config:
 
 
 def _at_rest(config: Config) -> Config:
-    """Return ``config`` with nothing that moves, and all else as it is."""
     shared = {key: getattr(config.model, key) for key in StaticModel.model_fields if key != "kind"}
     return config.model_copy(update={"model": StaticModel.model_validate(shared)})
 
@@ -240,7 +239,6 @@ def _trained(config: Config, capture: Capture, held_out: frozenset[int]) -> Gaus
 
 
 def _work_of_step(config: Config, view: View) -> float:
-    """Return the mean work of a step, in pixels."""
     width, height = target_size(view.width, view.height, config.data.downscale, config.data.longest_side)
     times = range(0, config.train.steps, max(1, config.train.steps // 50))
     drawn = fmean(image_divisor(config.train, step) ** -2 for step in times)
@@ -305,7 +303,6 @@ def _settings(config: Config) -> list[OpenSetting]:
 
 
 def _without_auto(config: Config) -> Config:
-    """Return ``config`` with all that small runs may decide left out."""
     if not isinstance(config.model, (StaticModel, DynamicModel)):
         return config
     for section, name in (("camera", "refine"), ("train", "exposure"), ("train", "robust")):
@@ -332,7 +329,6 @@ def _moving_opacities(config: Config) -> Config | None:
 
 
 def _with(config: Config, section: str, **values: object) -> Config:
-    """Return ``config`` with other ``values`` in a section."""
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 

@@ -98,7 +98,6 @@ def follow(processes: Processes) -> None:
 
 
 def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
-    """Follow a run to its end, and return what is to be done after it."""
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
         trainer = build(config, restored=True)

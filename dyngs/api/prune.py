@@ -139,7 +139,6 @@ def prune_within(
 
 
 def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequence[str]) -> Config:
-    """Return the configuration of a run that goes on from ``start`` in the folder ``out``."""
     defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
     done = [f"train.steps={start.info.step}", "train.minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
@@ -162,14 +161,12 @@ def _unseen(config: Config, device: torch.device) -> list[Image]:
 
 
 def _copy_start(run_dir: Path, folder: Path) -> None:
-    """Copy the training time and the log of a run."""
     for name in (TIMING_NAME, LOG_NAME):
         if (run_dir / name).is_file():
             shutil.copyfile(run_dir / name, folder / name)
 
 
 def _write(folder: Path, stored: Stored, seconds: float) -> None:
-    """Write the chosen candidate as a run, with its file in a folder of its own."""
     config = stored.candidate.config
     save_checkpoint(folder, stored.candidate.checkpoint, seconds)
     write_config(config, folder)

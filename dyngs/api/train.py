@@ -92,9 +92,7 @@ class Limit(Protocol):
 
     def restore(self, stored: dict[str, Tensor]) -> None: ...
 
-    def reached(self) -> str:
-        """Return the line about the limit after a run."""
-        ...
+    def reached(self) -> str: ...
 
 
 def train(
@@ -178,7 +176,6 @@ def _chosen(config: Config, *, begins: bool) -> tuple[Config, list[Choice], Capt
 
 
 def _told_again(config: Config, folder: Path) -> str:
-    """Return the line for a run that is asked for once more."""
     longer = "" if config.prune.is_wanted else f", go on with `dyngs train --resume {as_word(folder)} train.steps=N`"
     return (
         f"{folder} holds just this run, finished, and training again would end with the same bytes: nothing is done; "
@@ -274,7 +271,6 @@ class _Run:
             print(line, flush=True)
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
-        """Set up the limits of the configuration, with the measurements that they need before training."""
         budget, speed = run.config.budget, None
         if budget.min_fps is not None:
             speed = SpeedLimit(run, budget.min_fps)
@@ -308,7 +304,6 @@ class _Run:
             self.limits[_SPEED] = speed
 
     def _save_and_evaluate(self, event: Event) -> None:
-        """Save and evaluate when it is time to."""
         match event:
             case StepDone():
                 options, step = self.config.train, event.step
@@ -345,7 +340,6 @@ class _Run:
             self.limited.folder = folder
 
     def _evaluate(self, step: int) -> None:
-        """Tell the scores of the test split."""
         start = time.perf_counter()
         report = evaluate_run(self.folder, "test", capture=self._capture)
         seconds = time.perf_counter() - start

@@ -103,7 +103,6 @@ def _score_after_colour_fit(trainer: GaussianTrainer, index: int) -> float:
 
 
 def _chess_board(height: int, width: int) -> Tensor:
-    """Return (H, W) bool, one of the two colours of a chess board."""
     rows, columns = (torch.arange(size, device="cpu") * SQUARES // size for size in (height, width))
     return (rows[:, None] + columns) % 2 == 0
 

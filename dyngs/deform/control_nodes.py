@@ -103,7 +103,6 @@ class ControlNodes(DeformationField):
         return field
 
     def regroup(self) -> None:
-        """Place the nodes again, and assign Gaussians to them, when they are next needed."""
         self.buffers.pop("followed", None)
 
     def to(self, device: torch.device | str) -> ControlNodes:
@@ -137,12 +136,10 @@ class ControlNodes(DeformationField):
 
     @property
     def num_nodes(self) -> int:
-        """Number of nodes that are placed."""
         return len(self.buffers["positions"])
 
     @property
     def num_points(self) -> int:
-        """Number of control points of each spline."""
         return self.num_pieces + SPAN - 1
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
@@ -182,7 +179,6 @@ class ControlNodes(DeformationField):
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
     def at(self, time: float) -> Offsets:
-        """Return the nodes' offsets at ``time``."""
         place = min(max(time, 0.0), 1.0) * self.num_pieces
         piece = min(int(place), self.num_pieces - 1)
         fractions = sent(cubic_fractions(place - piece)[:, None], self.setup.center.device)
@@ -192,14 +188,12 @@ class ControlNodes(DeformationField):
         return Offsets(**parts)
 
     def _untrained(self, count: int) -> Parameters:
-        """Return the parameters of ``count`` nodes that stand still."""
         sizes, device = head_sizes(self.options), self.setup.center.device
         tensors = {name: torch.zeros(count, self.num_points, size, device=device) for name, size in sizes.items()}
         rates = {"means": self.options.lr_means * self.setup.extent} | LR
         return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
     def _splines(self) -> dict[str, Tensor]:
-        """Return the control points (S, P, size) by head."""
         return {name: self.parameters[name] for name in head_sizes(self.options)}
 
     def nodes_for(self, means: Tensor) -> Nodes:
@@ -224,7 +218,6 @@ class ControlNodes(DeformationField):
         self._assign(torch.cat([old[kept], means[added]]), means)
 
     def _assign(self, positions: Tensor, means: Tensor) -> None:
-        """Let ``means`` (M, 3) follow the nodes at ``positions`` (S, 3)."""
         nodes, around = nodes_at(positions, means), nodes_at(positions, positions).followed[:, 1:]
         found = {"radii": nodes.radii, "followed": nodes.followed, "neighbours": around}
         self.buffers = {"positions": positions} | found

@@ -73,7 +73,6 @@ def fitted_curves(
 
 
 def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tensor]:
-    """Return the least-squares fit with so many pieces."""
     count = SAMPLES_PER_PIECE * pieces + 1
     times = torch.linspace(0, 1, count, dtype=torch.float64, device="cpu")
     solver = torch.linalg.pinv(spline_basis(times, pieces)).float()  # (P, count)
@@ -99,7 +98,6 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
 
 
 def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
-    """Return the splines of control nodes, which are exact."""
     nodes = field.nodes_for(means)
     followed, fractions = _padded(nodes.followed, nodes.weights(means))
     return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)

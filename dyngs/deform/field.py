@@ -38,7 +38,6 @@ class Offsets:
     colors: Tensor | None = None  # (M, 3) of the base colour, in units of the constant SH coefficient
 
     def select(self, index: Tensor | slice) -> Offsets:
-        """Return the offsets of the Gaussians at ``index``."""
         others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
         return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
 
@@ -105,13 +104,11 @@ class DeformationField:
         return self.with_parameters(self.parameters.restored(part_of(tensors, "learned")))
 
     def to(self: F, device: torch.device | str) -> F:
-        """Return the field on ``device``."""
         field = self.with_parameters(self.parameters.to(device))
         field.setup = moved_to(self.setup, device)
         return field
 
     def with_parameters(self: F, parameters: Parameters) -> F:
-        """Return a copy with other ``parameters``."""
         field = copy.copy(self)
         field.parameters = parameters
         return field

@@ -48,7 +48,6 @@ def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
 
 
 def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
-    """Return the properties of the capture that training a dynamic scene needs."""
     config, capture, images = run.config, run.capture, run.images
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)

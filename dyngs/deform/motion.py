@@ -18,7 +18,7 @@ MAX_SAMPLES = 24
 
 
 @dataclass(frozen=True)
-class Motion:
+class MeasuredMotion:
     """Motion of M Gaussians over time."""
 
     pixels: Tensor  # (M,) farthest stray from the mean position, turning and growing of the outline included, in pixels
@@ -26,7 +26,9 @@ class Motion:
 
 
 @torch.no_grad()
-def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor) -> Motion:
+def measure_motion(
+    field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor
+) -> MeasuredMotion:
     """Return the motion of M Gaussians over ``times``.
 
     The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size of a pixel, s being
@@ -55,7 +57,7 @@ def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequenc
         if sample.colors is not None and mean.colors is not None:
             pixels = pixels + PX_PER_OPACITY * (sample.colors - mean.colors).abs().amax(1)
         score = torch.maximum(score, pixels)
-    return Motion(score, mean)
+    return MeasuredMotion(score, mean)
 
 
 @torch.no_grad()
@@ -73,7 +75,6 @@ def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
 
 
 def _mean(samples: Sequence[Offsets]) -> Offsets:
-    """Return the mean of offsets that have the same heads."""
     return Offsets(
         torch.stack([s.means for s in samples]).mean(0),
         _mean_head([s.quats for s in samples]),

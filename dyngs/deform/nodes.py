@@ -31,7 +31,6 @@ class Nodes:
     followed: Tensor  # (M, B) indices of the nodes that each point follows, nearest first
 
     def followed_by(self, rows: Tensor) -> Nodes:
-        """Return the nodes with only the points ``rows`` following them."""
         return replace(self, followed=self.followed.index_select(0, rows))
 
     def weights(self, means: Tensor) -> Tensor:

@@ -33,7 +33,6 @@ class DynamicScene(GaussianScene):
 
     @staticmethod
     def restored(options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
-        """Return the scene of a state that ``state`` returned."""
         count = len(gaussians)
         own = part_of(tensors, "field")
         std, times = stored_filter(tensors, count), stored_times(tensors)

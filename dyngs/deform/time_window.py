@@ -28,11 +28,9 @@ class TimeWindow:
 
     @staticmethod
     def around_middle(times: Sequence[float], first: float, begins: int, opens: int, full: int) -> TimeWindow:
-        """Return the window over the times of all training views."""
         return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full)
 
     def num_views(self, step: int) -> int:
-        """Return the number of views in the window at ``step``."""
         start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
         progress = (step - self.opens) / max(self.full - self.opens, 1)
         return start + int(min(max(progress, 0.0), 1.0) * (len(self.strays) - start))

@@ -87,11 +87,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
-        """Return the scene of the first Gaussians: nothing moves yet."""
         return DynamicScene(gaussians=gaussians, seen_at=self.times, filter_std=self._update.of(gaussians))
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return whether ``time`` lies in the window of ``step``."""
         return self._window.holds(time or 0.0, step)
 
     def window(self, step: int) -> tuple[float, float]:
@@ -102,7 +100,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene.field.extend(seen, self._window.bounds(step))
 
     def time_step(self, scene: DynamicScene, image: Image, step: int) -> GaussianTimeStep:
-        """Return the moment drawn for ``image`` at its time, and the regularizers of motion."""
         if scene.field is None:
             return scene.time_step(image.time)
         time = image.time or 0.0
@@ -113,18 +110,15 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return GaussianTimeStep(gaussians, image.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
-        """Update the field."""
         if scene.field is None:
             return 0
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
         return scene.field.parameters.step(step - self.schedule.fine, progress)
 
     def learned(self, scene: DynamicScene) -> Parameters | None:
-        """Return what the field learns."""
         return None if scene.field is None else scene.field.parameters
 
     def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
-        """Return the scene with its filter up to date, the field extended to new times, static Gaussians frozen."""
         if self._update.is_due(step, edited):
             scene = replace(scene, filter_std=self._update.of(scene.gaussians))
         if scene.field is None:
@@ -179,7 +173,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return DynamicScene.restored(self.options, gaussians, tensors)
 
     def state(self) -> State:
-        """Return whether tracks are known, so that all times are trained on."""
         return with_role({"tracked": torch.ones(1, device="cpu")}, Role.TRAINING) if self._tracked else {}
 
     def _on_its_way(self, tracked: bool) -> None:

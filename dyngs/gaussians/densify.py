@@ -76,7 +76,6 @@ class Densifier:
         """Limit the number of Gaussians from now on; none are removed. Not part of the state."""
 
     def state(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint must hold, by name."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:

@@ -97,7 +97,6 @@ class FilterUpdate:
         self.cameras, self.steps = cameras, steps
 
     def of(self, gaussians: Gaussians) -> Tensor | None:
-        """Return the filter (N,) of the Gaussians; None where there is none."""
         return filter_std(gaussians.means, self.cameras) if self.cameras else None
 
     def is_due(self, step: int, edited: bool) -> bool:

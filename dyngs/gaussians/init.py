@@ -58,7 +58,6 @@ class Surroundings:
 
     @property
     def camera_centers(self) -> np.ndarray:
-        """(V, 3) centres of the training cameras."""
         poses = np.stack([view.cam_from_world for view in self.views])
         return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
 

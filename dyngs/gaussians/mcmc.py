@@ -128,6 +128,5 @@ def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> 
 
 
 def _binomials() -> Tensor:
-    """Return (51, 51) table of C(N, j), float64."""
     rows = [[float(math.comb(n, j)) for j in range(MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)]
     return torch.tensor(rows, dtype=torch.float64, device="cpu")

@@ -43,11 +43,9 @@ class SceneTraining(Generic[S]):
     moves_by: tuple[str, str] = ("", "")
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return whether an image of ``time`` may be trained on in ``step``."""
         return True
 
     def window(self, step: int) -> tuple[float, float]:
-        """Return the first and last time that are trained on at ``step``."""
         return 0.0, 1.0
 
     def extend(self, scene: S, seen: tuple[float, float], step: int) -> None:
@@ -62,7 +60,6 @@ class SceneTraining(Generic[S]):
         return 0
 
     def learned(self, scene: S) -> Parameters | None:
-        """Return what the scene learns; None: nothing."""
         return None
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
@@ -85,7 +82,6 @@ class SceneTraining(Generic[S]):
         raise NotImplementedError
 
     def state(self) -> State:
-        """Return the tensors that a checkpoint must hold beside the scene."""
         return {}
 
 
@@ -134,7 +130,6 @@ class GaussianModel(Model[GaussianScene]):
 
     @property
     def optimizer_state(self) -> State:
-        """The moments of Adam, by name."""
         return self._optimizer.state()
 
     @property
@@ -280,7 +275,6 @@ class GaussianModel(Model[GaussianScene]):
         self._scene = replace(scene, colour=self.colours.network)
 
     def _options(self, step: int) -> RenderOptions:
-        """Return how images are drawn in ``step``."""
         degree = active_sh_degree(self._config.train, step, self._scene.gaussians.sh_degree)
         return replace(self.options, sh_degree=degree)
 
@@ -304,7 +298,6 @@ class GaussianModel(Model[GaussianScene]):
         return None if found is None else found.text
 
     def _looks(self, step: int) -> TrainingLooks:
-        """Return the training views as they are drawn after ``step``."""
         images, colour = self._run.images, background_colour(self._run.background).to(self._scene.device)
 
         def views(indices: Sequence[int]) -> Iterator[MeasuredView]:

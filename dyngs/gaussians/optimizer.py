@@ -79,13 +79,11 @@ class GaussianOptimizer:
         )
 
     def to(self, device: torch.device | str) -> GaussianOptimizer:
-        """Return an optimizer of the same parameters and moments on ``device``."""
         moved = GaussianOptimizer(self.parameters.detach().to(device=device), self.options)
         moved._adam = self._adam.to(device)
         return moved
 
     def state(self) -> State:
-        """Return the moments by name: ``exp_avg.*``, ``exp_avg_sq.*``."""
         return self._adam.state()
 
     def restored(self, parameters: Gaussians, tensors: Mapping[str, Tensor]) -> GaussianOptimizer:

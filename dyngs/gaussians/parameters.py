@@ -40,7 +40,6 @@ class Parameters:
         return self._tensors[name]
 
     def get(self, name: str) -> Tensor | None:
-        """Return the tensor of that name, None without one."""
         return self._tensors.get(name)
 
     def __contains__(self, name: str) -> bool:
@@ -48,12 +47,10 @@ class Parameters:
 
     @property
     def leaves(self) -> list[Tensor]:
-        """The tensors, in a fixed order."""
         return list(self._tensors.values())
 
     @property
     def num_values(self) -> int:
-        """Number of values in all tensors."""
         return sum(x.numel() for x in self._tensors.values())
 
     def step(self, step: int, progress: float) -> Count:
@@ -83,11 +80,9 @@ class Parameters:
         return self._with(values, lambda x: _moments_of(x, source, is_new))
 
     def values(self) -> dict[str, Tensor]:
-        """Return name to value, detached."""
         return {name: x.detach() for name, x in self._tensors.items()}
 
     def state(self) -> State:
-        """Return values and moments by name."""
         return {name: StateTensor(x, self._roles[name]) for name, x in self.values().items()} | self._adam.state()
 
     def restored(self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None) -> Parameters:
@@ -110,7 +105,6 @@ class Parameters:
         return found
 
     def to(self, device: torch.device | str) -> Parameters:
-        """Return the parameters on ``device``."""
         found = Parameters(moved_to(self.values(), device), self.rates, self.decay, self._roles)
         found._adam = self._adam.to(device)
         return found

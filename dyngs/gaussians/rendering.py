@@ -73,13 +73,11 @@ class RenderOptions(DrawOptions):
 
     @property
     def projection(self) -> ProjectionOptions:
-        """The part that concerns the projection."""
         antialiased = self.mode == RasterizeMode.ANTIALIASED
         return ProjectionOptions(self.eps2d, self.near, self.far, self.alpha_min, antialiased=antialiased)
 
     @property
     def blending(self) -> BlendOptions:
-        """The part that concerns the blending."""
         return BlendOptions(self.alpha_min, self.alpha_max, self.transmittance_min, self.absgrad)
 
 
@@ -216,7 +214,6 @@ def sensitivities(
 def _colors(
     gaussians: Gaussians, cameras: Cameras, radii: Tensor, options: RenderOptions, shader: Shader | None
 ) -> Tensor:
-    """Return the colours (V, N, 3)."""
     if shader is not None:
         return shader(gaussians, cameras, radii)
     degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)

@@ -87,12 +87,10 @@ class GaussianScene(Renderable):
 
     @property
     def num_moving(self) -> int:
-        """M."""
         return len(self.rows)
 
     @property
     def moving_fraction(self) -> float:
-        """M / N, 0 where nothing moves."""
         return 0.0 if self.is_static else self.num_moving / max(len(self), 1)
 
     @property
@@ -115,7 +113,6 @@ class GaussianScene(Renderable):
 
     @property
     def num_mask_bytes(self) -> int:
-        """Number of bytes of the masks; 0 without any."""
         return 0 if self.masks is None else self.masks.bits.numel()
 
     @abstractmethod

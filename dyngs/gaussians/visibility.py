@@ -27,13 +27,11 @@ class VisibilityMasks:
 
     @staticmethod
     def pack(times: tuple[float, ...], seen: Tensor) -> VisibilityMasks:
-        """Return the masks of ``seen`` (K, N) bool."""
         padded = torch.nn.functional.pad(seen, (0, -seen.shape[1] % BITS)).unflatten(1, (-1, BITS))
         return VisibilityMasks(times, (padded * _places()).sum(2).to(torch.uint8), seen.shape[1])
 
     @property
     def seen(self) -> Tensor:
-        """Return (K, N) bool, whether each Gaussian is seen at each key time."""
         return _unpacked(self.bits, self.count)
 
     def interval(self, time: float) -> int:
@@ -46,11 +44,9 @@ class VisibilityMasks:
         return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
 
     def select(self, index: Tensor) -> VisibilityMasks:
-        """Return the masks of the Gaussians at ``index`` (long)."""
         return VisibilityMasks.pack(self.times, self.seen[:, index])
 
     def state(self) -> State:
-        """Return times, packed bits and the number of Gaussians."""
         times = torch.tensor(self.times, dtype=torch.float64, device="cpu")
         count = torch.tensor([self.count], device="cpu")
         return with_role({"times": times, "bits": self.bits, "count": count}, Role.SHARED)
@@ -83,6 +79,5 @@ def _places() -> Tensor:
 
 
 def _unpacked(bits: Tensor, count: int) -> Tensor:
-    """Return (K, N) bool of packed bits (K, ceil(N / 8))."""
     places = torch.arange(BITS, dtype=torch.uint8, device=bits.device)
     return ((bits[..., None] >> places) & 1).bool().flatten(1)[:, :count]

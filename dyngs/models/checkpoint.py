@@ -34,7 +34,6 @@ class Checkpoint:
 
     @property
     def name(self) -> str:
-        """Name for messages."""
         return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
 
     def part(self, prefix: str) -> dict[str, Tensor]:

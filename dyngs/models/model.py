@@ -86,7 +86,6 @@ class Model(ABC, Generic[S_co]):
         """Go on on ``device``."""
 
     def regularizers(self) -> Mapping[str, Tensor]:
-        """Return differentiable penalties on what is learned, weighted, by name."""
         return {}
 
     def tallies(self, step: int) -> Sequence[Tensor]:
@@ -117,7 +116,6 @@ class Model(ABC, Generic[S_co]):
 
     @property
     def num_moving(self) -> int:
-        """Number of Gaussians that depend on time or pose."""
         return 0
 
 

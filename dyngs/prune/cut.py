@@ -95,7 +95,6 @@ def apply_cut(trainer: GaussianTrainer, cut: Cut, scores: Tensor) -> None:
 
 
 def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
-    """Drop the harmonics of the Gaussians that need none, and keep them zero."""
     usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
@@ -107,7 +106,6 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
 
 
 def _looks(trainer: GaussianTrainer, indices: Sequence[int], background: Tensor) -> Iterator[MeasuredView]:
-    """Yield training views as they are drawn now."""
     for image in (trainer.images[i] for i in indices):
         with torch.no_grad():
             now = trainer.model.training.time_step(trainer.model.scene, image, trainer.done).gaussians.detach()

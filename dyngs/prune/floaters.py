@@ -41,7 +41,6 @@ class FloaterRemoval:
         self._loop, self._trainer = loop, trainer
 
     def __call__(self, event: Event) -> None:
-        """Remove them after the last step of training, before it is saved."""
         match event:
             case StepDone() if event.step == self._trainer().config.train.steps:
                 self._remove(event.step)

@@ -43,12 +43,10 @@ class Importance:
 
     @property
     def contribution(self) -> Tensor:
-        """(N,) sum of C over moments."""
         return self.fractions.sum(0)
 
     @property
     def temporal(self) -> Tensor:
-        """(N,) sum over moments of gamma g, see ``variation``."""
         return (self._volumes() * self._variation()).sum(0)
 
     @property

@@ -63,7 +63,6 @@ class Candidate:
 
     @property
     def worst(self) -> float:
-        """The larger of the two losses, dB."""
         return max(self.loss, self.trained_loss)
 
 
@@ -160,7 +159,6 @@ class Search:
         return psnr + max(cost, 0.0)
 
     def _others(self) -> list[Image]:
-        """Return some training images that are not held out."""
         others = [i for i in range(len(self.trainer.images)) if i not in self.held_out]
         return [self.trainer.images[others[i]] for i in evenly_spaced(len(others), PROBED_VIEWS)]
 
@@ -181,7 +179,6 @@ class Search:
         raise DyngsError(f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more")
 
     def _quality(self, scene: GaussianScene) -> float:
-        """Return the mean PSNR of the views that count, drawn of ``scene`` as it wants to be drawn, dB."""
         return quality_of(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
 
     def _knobs(self) -> dict[str, Callable[[Cut], Sequence[tuple[str, Cut]]]]:
@@ -213,7 +210,6 @@ class Search:
         return found, Limit(kind, levels[low - 1][0] if low else "nothing", refused)
 
     def _tried(self, cut: Cut) -> Candidate:
-        """Return the run after a cut and fine-tuning."""
         self.trials += 1
         trainer = self.trainer
         self._restart()

@@ -62,7 +62,6 @@ class PruneStage:
         self._loop, self._trainer = loop, trainer
 
     def __call__(self, event: Event) -> None:
-        """Prune before the first step after training."""
         match event:
             case Started() | StepDone() if event.step == self._trainer().config.train.steps < event.total:
                 done = prune_(self._trainer())

@@ -25,7 +25,6 @@ class StaticScene(GaussianScene):
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
-        """Return the scene of a state that ``state`` returned."""
         return StaticScene(
             gaussians=gaussians, filter_std=stored_filter(tensors, len(gaussians)), seen_at=stored_times(tensors)
         )

@@ -25,7 +25,6 @@ class StaticTraining(SceneTraining[StaticScene]):
         self._update = update
 
     def first_scene(self, gaussians: Gaussians) -> StaticScene:
-        """Return the scene of the first Gaussians."""
         return StaticScene(gaussians=gaussians, filter_std=self._update.of(gaussians))
 
     def after_step(self, scene: StaticScene, step: int, edited: bool) -> StaticScene:

@@ -96,11 +96,9 @@ class Forecast:
         self._marks = [_Mark(step, seconds, 0.0, num_gaussians)]
 
     def pause(self, seconds: float) -> None:
-        """Leave ``seconds`` out of the pace."""
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 
     def observe(self, config: Config | None, step: int, seconds: float, num_gaussians: int, drawn: int = 0) -> None:
-        """Take in how far the run is."""
         last = self._marks[-1]
         self._pixels = full_pixels(config, step, drawn)
         cost = last.cost + (step - last.step) * step_cost(config, step, self._pixels, num_gaussians)

@@ -34,7 +34,6 @@ class StepReport:
 
     @cached_property
     def psnr(self) -> float:
-        """PSNR of the image, dB, at most 100; NaN where its mask leaves nothing, or it is not finite."""
         return psnr(self.rendered, self.truth, self.image.mask)
 
 
@@ -59,7 +58,6 @@ class StepDone:
 
     @property
     def total(self) -> int:
-        """Steps there will be."""
         return self.loop.total
 
     @property
@@ -81,7 +79,6 @@ class StepDone:
 
     @property
     def seconds(self) -> float:
-        """Seconds of training so far, over all resumes."""
         return self.loop.watch.seconds
 
 

@@ -64,7 +64,6 @@ def with_length(config: Config, done: int, steps: int) -> Config:
 
 
 def _require_exposures_stay(config: Config, length: Length) -> None:
-    """Raise DyngsError where exposures were learned before a run of the new length begins with that."""
     begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
     if config.train.exposure == "always" and begun < length.done <= begins:
         raise DyngsError(
@@ -88,7 +87,6 @@ def told(before: Config, after: Config, done: int) -> str:
 
 
 def _train(options: TrainConfig, length: Length) -> TrainConfig:
-    """Return the section ``train``: images and harmonics go on where they are."""
     changed: dict[str, object] = {"steps": length.steps, "minutes": None}
     full_at = max(options.resolution_grows_from, options.resolution_full_at)
     if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
@@ -101,7 +99,6 @@ def _train(options: TrainConfig, length: Length) -> TrainConfig:
 
 
 def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicModel:
-    """Return the section ``model`` of a moving scene."""
     old = deform_schedule(model, Rates(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
     if length.done >= old.opens:

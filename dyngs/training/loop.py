@@ -68,11 +68,9 @@ class Loop:
         self._listeners: list[Listener] = []
 
     def subscribe(self, *listeners: Listener) -> None:
-        """Add listeners, after the present ones."""
         self._listeners += listeners
 
     def tell(self, event: Event) -> None:
-        """Tell all listeners."""
         for listener in self._listeners:
             listener(event)
 

@@ -89,7 +89,6 @@ class MemoryForecast:
 
     @property
     def total(self) -> int:
-        """Of a process."""
         return self.program + self.images + self.drawing + self.field + self.count * self.each
 
     @property
@@ -176,7 +175,6 @@ class MemoryForecast:
         return ", ".join(found) + (" and fewer processes" if self.processes > 1 else "")
 
     def _limit(self, count: int) -> str:
-        """Return the key with the value that makes it ``count`` Gaussians."""
         key, value = self.limits
         if key == "model.resolution":
             return f"{key}={max(int(value * (count / self.count) ** 0.5), 16)}"
@@ -233,7 +231,6 @@ def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
 
 
 def _limit_of_gaussians(config: Config) -> tuple[str, int]:
-    """Return the key that limits the number of Gaussians, and its value."""
     if isinstance(config.model, HumanModel):
         return "model.resolution", config.model.resolution
     match config.strategy:

@@ -70,13 +70,11 @@ class Filmed:
         return self._maps[choice]
 
     def sitter_on(self, device: torch.device) -> CapturedPerson:
-        """Return the person on ``device``; kept."""
         if self._there is None:
             self._there = fields_moved_to(self.sitter, device)
         return self._there
 
     def look(self, views: Sequence[int]) -> TexelMaps:
-        """Return the maps of these images."""
         return observe_texels(self.sitter, ((self.images[i], self.sitter.pose_in(self.sitter.views[i])) for i in views))
 
 
@@ -138,7 +136,6 @@ class NetworkTrainer:
 
     @property
     def num_moving(self) -> int:
-        """All of them: a person moves as a whole."""
         return self.num_gaussians
 
     def step(self) -> StepReport:
@@ -166,7 +163,6 @@ class NetworkTrainer:
         return StepReport(step, value, image, rendering.rgb[0].detach(), truth)
 
     def checkpoint(self) -> Checkpoint:
-        """Return everything that ``restore`` needs."""
         tensors = {f"model.network.{name}": x for name, x in self.network.state_dict().items()}
         tensors |= {"model.mean": self.mean, "rng": self.generator.get_state()}
         tensors |= {f"sampler.{name}": x for name, x in self.sampler.state().items()}
@@ -178,7 +174,6 @@ class NetworkTrainer:
         return Checkpoint(info, {name: x.detach().cpu() for name, x in tensors.items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken."""
         self.mean = load_network(self.network, checkpoint, self.model.resolution).to(self.device)
         with reading(checkpoint.name, OTHER_CONFIG):
             self.sampler.load_state(checkpoint.part("sampler"))

@@ -70,7 +70,6 @@ class Processes:
         return self.rank == 0
 
     def __enter__(self) -> Processes:
-        """Connect the processes."""
         if self.size == 1:
             return self
         backend = "gloo"
@@ -135,7 +134,6 @@ class Processes:
         self.sum_([x.grad for x in used if x.grad is not None])
 
     def agreed(self, choice: bool) -> bool:
-        """Return the choice of the first process."""
         if self.size == 1:
             return choice
         said = torch.tensor([int(choice)], device="cpu")
@@ -208,7 +206,6 @@ class Processes:
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> int:
-    """Return a number that changes with any bit of the tensors."""
     total = 0
     for name, x in sorted(tensors.items()):
         values = x.detach().contiguous().reshape(-1)

@@ -148,12 +148,10 @@ class Trainer(Generic[M]):
 
     @property
     def info(self) -> CheckpointInfo:
-        """Metadata of a checkpoint that is taken now."""
         x, y, z = (float(value) for value in self.capture.world_offset)
         return CheckpointInfo(self.done, self.extent, (x, y, z), self.background, self.model.rasterize_mode.value)
 
     def checkpoint(self) -> Checkpoint:
-        """Return everything that ``restore`` needs."""
         state = self.model.state()
         for name, part in self._parts().items():
             state |= prefixed(name, with_role(part.state(), Role.TRAINING))
@@ -192,7 +190,6 @@ class Trainer(Generic[M]):
         return {name: part for name, part in parts.items() if part is not None}
 
     def _drawn_with_depth(self, background: Tensor) -> Callable[[Cameras, float | None], Rendering]:
-        """Return what draws the scene with its expected depth."""
         scene = self.model.scene
         return partial(scene.render, options=replace(scene.options, depth="expected"), background=background)
 
@@ -221,7 +218,6 @@ class Trainer(Generic[M]):
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:
-        """Return which views may be trained on in ``step``."""
         times = self.images.times
 
         def may_train(index: int) -> bool:

@@ -321,6 +321,6 @@ def test_what_is_covered_at_times_only_is_not_usual() -> None:
     assert float(found.usual.max()) == 0
 
 
-def test_masked_pixels_do_not_count() -> None:
+def test_masked_pixels_are_in_no_motion_mask() -> None:
     found = moving_fractions(lambda _: two_balls(), [masked_image(left(), torch.zeros(18, 24))], RenderOptions(), 0.06)
     assert found.most.tolist() == [0, 0]

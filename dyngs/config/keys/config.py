@@ -48,7 +48,6 @@ class PruneConfig(Section):
 
     @property
     def is_wanted(self) -> bool:
-        """Whether Gaussians are to be pruned or masked."""
         return self.fraction > 0 or self.mask_times > 1
 
 
@@ -105,10 +104,8 @@ class Config(Section):
 
     @property
     def total_steps(self) -> int:
-        """Steps of training and of the last stage, if there is one."""
         return self.train.steps + (self.prune.steps if self.prune.is_wanted and self.model.made_of_gaussians else 0)
 
     @property
     def stored_sh_degree(self) -> int:
-        """Degree of the harmonics that training begins with."""
         return self.colour.stored_degree(self.model.sh_degree)

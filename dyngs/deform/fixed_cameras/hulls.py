@@ -58,7 +58,6 @@ class Silhouette:
 
     @property
     def center(self) -> np.ndarray:
-        """Return the (3,) camera centre."""
         return -np.linalg.solve(self.projection[:, :3], self.projection[:, 3])
 
     @property

@@ -33,12 +33,10 @@ class Track:
 
     @property
     def centers(self) -> np.ndarray:
-        """(L, 3) places."""
         return np.stack([blob.center for blob in self.blobs])
 
     @property
     def radius(self) -> float:
-        """Median over time, world units."""
         return float(np.median([blob.radius for blob in self.blobs]))
 
     @property
@@ -58,7 +56,6 @@ class Track:
         return float((steps[1:] * steps[:-1]).sum()) > SAME_WAY * float((steps**2).sum())
 
     def predicted(self, time: float) -> np.ndarray:
-        """Return the (3,) place at ``time`` at constant velocity, that of the last two places."""
         last = self.blobs[-1].center
         if len(self.blobs) < 2:
             return last
@@ -66,7 +63,6 @@ class Track:
         return last + (time - self.times[-1]) * pace
 
     def extended(self, time: float, blob: Blob) -> Track:
-        """Return the track with one blob more."""
         return Track((*self.times, time), (*self.blobs, blob))
 
 

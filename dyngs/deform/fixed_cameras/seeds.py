@@ -58,11 +58,9 @@ class Seeds:
 
     @property
     def center(self) -> np.ndarray:
-        """Return the (3,) place of the track at that time."""
         return self.track.centers[self.track.times.index(self.time)]
 
     def placed(self, index: int) -> Gaussians:
-        """Return the Gaussians where the track is at its ``index``-th time."""
         shift = self.track.centers[index] - self.center
         return self.gaussians.replace(means=self.gaussians.means + torch.from_numpy(shift).float())
 
@@ -151,7 +149,6 @@ def _misfit(track: Track, points: Tensor) -> float:
 
 
 def _basis(times: Sequence[float], pieces: int) -> np.ndarray:
-    """Return the (L, P) weights of the control points at ``times``."""
     basis = np.zeros((len(times), pieces + SPAN - 1))
     for row, time in enumerate(times):
         piece = min(int(time * pieces), pieces - 1)
@@ -183,7 +180,6 @@ def _surface(track: Track) -> tuple[np.ndarray, float]:
 
 
 def _colors(points: np.ndarray, track: Track, footage: Sequence[Footage]) -> np.ndarray:
-    """Return (S, 3) mean colours of the ``points`` of a thing, from 0 to 1."""
     total, count = np.zeros((len(points), 3)), np.zeros((len(points), 1))
     outward = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
     for time, center in zip(track.times, track.centers, strict=True):

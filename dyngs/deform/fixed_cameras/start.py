@@ -40,7 +40,6 @@ class FirstMotion:
 
     @property
     def gaussians(self) -> list[Gaussians]:
-        """Return the Gaussians of each thing."""
         return [one.gaussians for one in self.seeds]
 
     def nodes(self, others: Tensor, most: int, pieces: range) -> tuple[Tensor, Tensor]:

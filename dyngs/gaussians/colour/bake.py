@@ -61,7 +61,6 @@ def sphere(count: int) -> Tensor:
 
 
 def _eye(center: Tensor) -> Cameras:
-    """Return a camera at ``center`` (3,)."""
     pose = torch.eye(4, dtype=center.dtype, device=center.device)
     pose[:3, 3] = -center
     return Cameras(pose[None], torch.eye(3, dtype=center.dtype, device=center.device)[None], 1, 1)

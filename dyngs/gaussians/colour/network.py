@@ -44,11 +44,9 @@ class ColourNetwork:
 
     @property
     def num_values(self) -> int:
-        """Number of values that the network stores."""
         return self.box.numel() + sum(layer.weight.numel() + layer.bias.numel() for layer in self.layers)
 
     def state(self) -> State:
-        """Return the weights and the description of their inputs, for ``network_of``."""
         tensors = {"box": self.box, "sees": torch.tensor([self.sees_time, self.sees_normals], device="cpu")}
         for i, layer in enumerate(self.layers):
             tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}

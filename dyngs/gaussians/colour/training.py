@@ -64,11 +64,9 @@ class ColourTraining:
 
     @property
     def learned(self) -> Parameters | None:
-        """What ``optimize`` updates; None: nothing."""
         return None
 
     def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
-        """Return differentiable regularizers, weighted, by name."""
         if self.entropy_weight == 0:
             return {}
         return {"opacity entropy": self.entropy_weight * opacity_entropy(gaussians.logit_opacities)}
@@ -96,7 +94,6 @@ class ColourTraining:
         """Go on on ``device``."""
 
     def state(self) -> State:
-        """Return the tensors that a checkpoint must hold beside the scene's colours."""
         return {}
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:

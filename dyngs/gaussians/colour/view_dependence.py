@@ -132,5 +132,4 @@ def _squared_error(
 
 
 def _decibels(before: float, after: float) -> float:
-    """Return the gain in dB of an image with the squared error ``after``."""
     return 10 * math.log10(max(before, 1e-12) / max(after, 1e-12))

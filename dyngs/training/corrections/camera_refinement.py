@@ -84,7 +84,6 @@ class CameraCorrections:
         return replace(view, cam_from_world=camera.cam_from_world[0].numpy(), intrinsics=camera.intrinsics[0].numpy())
 
     def remove_common_motion(self) -> None:
-        """Remove from the corrections how all cameras together move, turn and grow."""
         flat = self.poses.view(-1)
         flat -= self._common @ (self._common.T @ flat)
 
@@ -200,7 +199,6 @@ class CameraRefinement:
         return FIRST_RATE * (LAST_RATE / FIRST_RATE) ** min(progress, 1.0)
 
     def state(self) -> dict[str, Tensor]:
-        """Return everything that ``load_state`` needs."""
         state = dict(self._values())
         for name, updates in self._updates.items():
             state |= {f"updates.{name}": updates}

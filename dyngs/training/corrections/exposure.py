@@ -109,11 +109,9 @@ class ViewExposures(Loss):
         return up_to_white(shown, image.composite(background))
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
-        """Return the penalty on an image's affine: far from the identity, or from those next to it in time."""
         return self.penalties(look.index)
 
     def penalties(self, index: int) -> dict[str, Tensor]:
-        """Return the penalty on the affine of an image."""
         value = self._values[index]
         total = (self._weights * value.square()).mean()
         beside = self._beside(index)

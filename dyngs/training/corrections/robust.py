@@ -106,7 +106,6 @@ class RobustMasks:
         background: Tensor,
         with_depth: Callable[[Cameras], Rendering],
     ) -> None:
-        """Find anew what is left out of an image."""
         grid = grid_of(cameras.width, cameras.height)
         drawn = adaptive_avg_pool2d(drawn.permute(2, 0, 1), grid)
         seen, keeps = self._others.cells_of(index, background)
@@ -144,7 +143,6 @@ class RobustMasks:
 
 
 def _as_cells(cameras: Cameras, grid: tuple[int, int]) -> Cameras:
-    """Return ``cameras`` with one pixel per cell."""
     scale = cameras.intrinsics.new_tensor([grid[1] / cameras.width, grid[0] / cameras.height, 1.0])
     return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, grid[1], grid[0])
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.training.priors.depth_maps import Kind, values_of
+from dyngs.training.priors.depth_maps import DepthForm, values_of
 
 PAIRS = 12
 """Pairs of images that are compared."""
@@ -80,7 +80,7 @@ def track_agreement(pairs: Sequence[tuple[Image, Image, Tensor, Tensor]]) -> Agr
     return Agreement(given / count, shuffled / count, len(pairs))
 
 
-def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: float) -> tuple[Kind, Agreement]:
+def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: float) -> tuple[DepthForm, Agreement]:
     """Compare depth maps with one depth for a whole image; return what they are affine in, and the agreement.
 
     Scale and shift, and the one depth, are those that warp the first image's second neighbour onto it best; the
@@ -88,7 +88,7 @@ def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: flo
     """
     sums = torch.zeros(3, device="cpu")
     count = 0
-    kinds: tuple[Kind, Kind] = ("depth", "inverse")
+    kinds: tuple[DepthForm, DepthForm] = ("depth", "inverse")
     for views in triples:
         first, second, third = (_small(p) for p in views)
         if first.depth is None or not bool((first.depth > 0).any()):
@@ -133,7 +133,7 @@ def _depths(distance: float) -> list[float]:
     return [distance * _RANGE ** (2 * i / (_DEPTHS - 1) - 1) for i in range(_DEPTHS)]
 
 
-def _aligned_guesses(given: Tensor, kind: Kind, distance: float) -> Iterator[Tensor]:
+def _aligned_guesses(given: Tensor, kind: DepthForm, distance: float) -> Iterator[Tensor]:
     """Yield the map aligned so that its near and far end lie at every pair of guesses."""
     known = given > 0
     values = values_of(given, kind)
@@ -147,7 +147,6 @@ def _aligned_guesses(given: Tensor, kind: Kind, distance: float) -> Iterator[Ten
 
 
 def _warp_error(first: Image, second: Image, depth: Tensor) -> float:
-    """Return the mean of ``_warp_errors``."""
     return float(_warp_errors(first, second, depth).mean())
 
 
@@ -178,13 +177,11 @@ def _small(image: Image) -> Image:
 
 
 def _centers(pixels: Tensor) -> Tensor:
-    """Return the (H * W, 2) centres of pixels, px."""
     y, x = (torch.arange(n, device=pixels.device) + 0.5 for n in pixels.shape[:2])
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
 
 
 def _sampled(pixels: Tensor, places: Tensor) -> Tensor:
-    """Return the (P, 3) bilinear colours of (H, W, 3) ``pixels`` at ``places`` (P, 2) px."""
     height, width = pixels.shape[:2]
     grid = (2 * places / places.new_tensor([width, height]) - 1)[None, None]
     image = pixels.permute(2, 0, 1)[None]
@@ -192,7 +189,6 @@ def _sampled(pixels: Tensor, places: Tensor) -> Tensor:
 
 
 def _blurred(pixels: Tensor) -> Tensor:
-    """Return the (H, W, 3) means over 3x3 pixels."""
     image = torch.nn.functional.pad(pixels.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")
     return torch.nn.functional.avg_pool2d(image, 3, 1)[0].permute(1, 2, 0)
 

@@ -22,7 +22,7 @@ from dyngs.training.priors.agreement import (
     spread_pairs,
     track_agreement,
 )
-from dyngs.training.priors.depth_maps import Kind
+from dyngs.training.priors.depth_maps import DepthForm
 from dyngs.training.priors.point_motion import Glance
 from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
 
@@ -35,7 +35,7 @@ _BASELINE = 0.1
 def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves: bool) -> UsedPriors:
     """Return the priors of a capture that agree with its images; nothing is read where it has none."""
     wanted, views, lines = config.train.priors, images.views, list[str]()
-    kind: Kind | None = None
+    kind: DepthForm | None = None
     flow_to: dict[int, Glance] = {}
     tracks: PointTracks | None = None
     if "depth" in wanted and any(view.depth_path for view in views):
@@ -58,7 +58,7 @@ def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves:
     return UsedPriors(kind, flow_to, tracks, masks, lines)
 
 
-_NAMES: dict[Kind, str] = {"depth": "depth", "inverse": "inverse depth"}
+_NAMES: dict[DepthForm, str] = {"depth": "depth", "inverse": "inverse depth"}
 
 
 def _line(what: str, found: Agreement, substitute: str) -> str:
@@ -69,7 +69,7 @@ def _line(what: str, found: Agreement, substitute: str) -> str:
     return f"{what}: {verdict} ({errors})"
 
 
-def _judged_depth(config: Config, images: ImageLoader) -> tuple[Kind, Agreement]:
+def _judged_depth(config: Config, images: ImageLoader) -> tuple[DepthForm, Agreement]:
     views = images.views
     cameras = training_cameras(views, config.data)
     distance = distance_to_scene(cameras)

@@ -75,12 +75,10 @@ def track_error(drawn: Tensor, start: Tensor, end: Tensor) -> Tensor | None:
 
 
 def _charbonnier(errors: Tensor) -> Tensor:
-    """Return (P,) robust lengths of ``errors`` (P, 2) px."""
     return (errors.square().sum(-1) + _SOFT_PX**2).sqrt() - _SOFT_PX
 
 
 def _projected(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return (N, 2) positions in px and (N,) depths."""
     pose, k = cameras.cam_from_world[0], cameras.intrinsics[0]
     local = means @ pose[:3, :3].T + pose[:3, 3]
     depth = local[:, 2]

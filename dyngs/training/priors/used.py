@@ -12,7 +12,7 @@ from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.model import Look, Loss
-from dyngs.training.priors.depth_maps import Kind, depth_error
+from dyngs.training.priors.depth_maps import DepthForm, depth_error
 from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
 
 MIN_POINTS = 4
@@ -54,7 +54,7 @@ class PointTracks:
 class UsedPriors(Loss):
     """Priors that agree with the images."""
 
-    depth: Kind | None = None  # what the depth maps are affine in; None: none are used
+    depth: DepthForm | None = None  # what the depth maps are affine in; None: none are used
     # by training view, the camera and time that its flow leads to; empty: no flow is used
     flow_to: Mapping[int, Glance] = field(default_factory=dict)
     tracks: PointTracks | None = None  # None: none are used
@@ -116,6 +116,5 @@ def _scale(cameras: Cameras, here: Cameras) -> Tensor:
 
 
 def _sized_as(here: Cameras, cameras: Cameras) -> Cameras:
-    """Return ``cameras`` for images as large as those of ``here``."""
     scale = torch.cat([_scale(cameras, here), here.intrinsics.new_ones(1)])
     return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, here.width, here.height)
