@@ -43,8 +43,7 @@ from dyngs.training.priors.used import UsedPriors
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.trainer import Trainer
 
-GaussianTrainer = Trainer[GaussianModel]
-"""The trainer of a scene of Gaussians."""
+GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
 
 def build(config: Config, capture: Capture | None = None, *, restored: bool = False) -> Trainable:

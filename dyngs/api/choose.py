@@ -43,19 +43,14 @@ from dyngs.runs.folder import CHOICES_NAME
 from dyngs.section import Section
 from dyngs.training.interrupt import Interrupts
 
-SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
-"""Of small runs: longest side of the images, px, and most Gaussians."""
-STEPS, FEWEST_STEPS = 2000, 1000
-"""Most steps of a small run; with fewer than the latter it says nothing."""
-SPENT = 0.1
-"""Most of a run's work that small runs may take."""
-STEP_COST, GAUSSIAN_COST = 20_000, 2
-"""Work of a step beside its images, and of a Gaussian in it, in pixels."""
+SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000  # Of small runs: longest side of the images, px, and most Gaussians
+STEPS, FEWEST_STEPS = 2000, 1000  # Most steps of a small run; with fewer than the latter it says nothing
+SPENT = 0.1  # Most of a run's work that small runs may take
+STEP_COST, GAUSSIAN_COST = 20_000, 2  # Work of a step beside its images, and of a Gaussian in it, in pixels
 FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
-LEAST_GAIN = 0.05
-"""Mean gain, dB, up to which two settings tie."""
+LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
 MIN_DIFFERING = 0.001
 """Fraction of the pixels of fixed cameras that differ from their median from which something moves."""
 LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24

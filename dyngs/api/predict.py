@@ -25,8 +25,7 @@ from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import new_folder, require_empty
 from dyngs.training.prediction import PersonPredictor, filmed, human_options, load_network, new_network
 
-_FAINT = 0.02
-"""Opacity below which a predicted Gaussian is left out, as the preset for one person has it."""
+_FAINT = 0.02  # Opacity below which a predicted Gaussian is left out, as the preset for one person has it
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from dyngs.runs.folder import EXPORT_FOLDER, new_folder, require_empty
 from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
 
-SEARCH_STEPS = 1000
-"""Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise."""
+SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise
 
 
 @dataclass(frozen=True)

@@ -74,8 +74,7 @@ from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
-_COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
-"""Names of the limits' states in a checkpoint."""
+_COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"  # Names of the limits' states in a checkpoint
 
 
 @contextmanager

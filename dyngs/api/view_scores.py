@@ -16,8 +16,7 @@ from dyngs.training.corrections.camera_fit import fitted_to_image
 
 EXPLAINED = 0.8
 """Fraction of the pixels of a view that count: those where the smaller of two models' errors is smallest."""
-SQUARES = 8
-"""The halves of an image are the two colours of a chess board of so many squares a side."""
+SQUARES = 8  # The halves of an image are the two colours of a chess board of so many squares a side
 
 PairScore = Callable[[GaussianTrainer, GaussianTrainer, int], tuple[float, float]]
 """PSNR, dB, of the training view at an index by two models."""

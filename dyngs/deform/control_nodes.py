@@ -29,16 +29,13 @@ from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 NOTHING = torch.zeros(0, 3, device="cpu")
-COMPARED_TIMES = 16
-"""Times at which the paths of nodes are compared where some of them are to go."""
+COMPARED_TIMES = 16  # Times at which the paths of nodes are compared where some of them are to go
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
 """Learning rates of the nodes' attributes other than positions."""
-LR_DECAY = 0.2
-"""Ratio of the last to the first learning rate."""
+LR_DECAY = 0.2  # Ratio of the last to the first learning rate
 PIECES_PER_TIME = 0.3
 """Pieces of the splines per training time. With more, poses follow single images; with fewer, they lag behind."""
-SMOOTHNESS = 0.01
-"""Weight of the nodes' squared acceleration, in node spacings."""
+SMOOTHNESS = 0.01  # Weight of the nodes' squared acceleration, in node spacings
 
 
 class ControlNodes(DeformationField):

@@ -18,11 +18,9 @@ from dyngs.deform.field import DeformationField, Offsets
 from dyngs.deform.nodes import FOLLOWED
 from dyngs.deform.spline_fit import SPAN, spline_basis
 
-SAMPLES_PER_PIECE = 3
-"""Times per piece at which a motion is looked at."""
+SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
 FEWEST_PIECES, MOST_PIECES = 8, 256
-CHECKED = 0.95
-"""Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance."""
+CHECKED = 0.95  # Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance
 
 
 @dataclass(frozen=True)

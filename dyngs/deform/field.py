@@ -22,8 +22,7 @@ from dyngs.state import State, moved_to, part_of, prefixed
 
 F = TypeVar("F", bound="DeformationField")
 
-MAX_KEY_TIMES = 256
-"""Limit on the default number of key times; longer clips may set more, which takes memory."""
+MAX_KEY_TIMES = 256  # Limit on the default number of key times; longer clips may set more, which takes memory
 
 
 @dataclass(frozen=True)

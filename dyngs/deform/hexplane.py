@@ -15,8 +15,7 @@ from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
 WEIGHTS = (1e-4, 0.01, 1e-4)
 """Of the smoothness of space planes, of that along time, and of the sparsity of planes with time (Wu et al.)."""
-LR_DECAY = 0.01
-"""Ratio of the last to the first learning rate."""
+LR_DECAY = 0.01  # Ratio of the last to the first learning rate
 SPACE_RANGE = (0.1, 0.5)
 """Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
 

@@ -24,8 +24,7 @@ from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 from dyngs.static.training import start as start_static
 
-MAX_STANDING = 12
-"""Fixed cameras from which tracks are found, at most."""
+MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 
 
 def start(run: RunStart) -> GaussianModel:

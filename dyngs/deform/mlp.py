@@ -10,12 +10,9 @@ from dyngs.deform.decoder import Decoder, split_heads
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.gaussians.parameters import Parameters
 
-SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6
-"""Octaves of the positional encodings."""
-LR_DECAY = 0.002
-"""Ratio of the last to the first learning rate."""
-SKIP_LAYER = 5
-"""The input is fed once more into this layer (counted from 0), where there are that many hidden ones."""
+SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # Octaves of the positional encodings
+LR_DECAY = 0.002  # Ratio of the last to the first learning rate
+SKIP_LAYER = 5  # The input is fed once more into this layer (counted from 0), where there are that many hidden ones
 
 
 class Mlp(DeformationField):

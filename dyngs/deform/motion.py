@@ -13,8 +13,7 @@ from dyngs.gaussians import Gaussians
 
 PX_PER_OPACITY = 6.0
 """A change of opacity, or of a colour in units of SH, by x counts as much as a motion by 6 x pixels."""
-MAX_SAMPLES = 24
-"""Largest number of times at which motion is measured."""
+MAX_SAMPLES = 24  # Largest number of times at which motion is measured
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from dyngs.ops.skinning import blend_skinning
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-FOLLOWED = 4
-"""Nodes that a Gaussian follows."""
+FOLLOWED = 4  # Nodes that a Gaussian follows
 
 
 @dataclass(frozen=True)

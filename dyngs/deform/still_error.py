@@ -18,18 +18,12 @@ from dyngs.deform.fixed_cameras.changes import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
-DIFFERS = 0.06
-"""Difference from the median image, mean over channels, from which a pixel shows something else."""
-MIN_SAME = 3
-"""Fewest images of one camera whose median shows what is still."""
-USUAL = 0.7
-"""What moves differs from the median in three of ten images or more; what is hidden at times, in fewer."""
-MOMENTS = 8
-"""Images of one camera that are compared."""
-SHOWS = 1e-3
-"""Sum of weights, in pixels, from which a Gaussian counts as visible in an image."""
-SURE_FRACTION = 0.5
-"""Fraction of a Gaussian in motion masks, where it is seen, from which it surely moves."""
+DIFFERS = 0.06  # Difference from the median image, mean over channels, from which a pixel shows something else
+MIN_SAME = 3  # Fewest images of one camera whose median shows what is still
+USUAL = 0.7  # What moves differs from the median in three of ten images or more; what is hidden at times, in fewer
+MOMENTS = 8  # Images of one camera that are compared
+SHOWS = 1e-3  # Sum of weights, in pixels, from which a Gaussian counts as visible in an image
+SURE_FRACTION = 0.5  # Fraction of a Gaussian in motion masks, where it is seen, from which it surely moves
 
 
 @dataclass(frozen=True)

@@ -34,12 +34,10 @@ from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, fields_moved_to, with_role
 
-SURELY_MOVING = 1.5
-"""Multiple of ``motion_threshold`` above which an error always counts as motion."""
+SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
-MIN_MOVING_FRACTION = 0.02
-"""Fraction of surely moving Gaussians up to which the scene counts as still."""
+MIN_MOVING_FRACTION = 0.02  # Fraction of surely moving Gaussians up to which the scene counts as still
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from torch import Tensor
 from dyngs.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.tensor_checks import require_tensor
 
-LARGEST_LOG_SCALE = 88
-"""Natural logarithm of the largest size that float32 can hold, rounded down."""
+LARGEST_LOG_SCALE = 88  # Natural logarithm of the largest size that float32 can hold, rounded down
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,11 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import rotate
 from dyngs.tensor_checks import require_tensor
 
-DENSE_FRACTION = 0.01
-"""Scale, in scene extents, up to which Gaussians are cloned; larger ones are split."""
-PRUNE_SCALE = 0.1
-"""Scale, in scene extents, from which Gaussians are removed after the first opacity reset."""
+DENSE_FRACTION = 0.01  # Scale, in scene extents, up to which Gaussians are cloned; larger ones are split
+PRUNE_SCALE = 0.1  # Scale, in scene extents, from which Gaussians are removed after the first opacity reset
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
-MAX_LOG_VARIANCE = 60.0
-"""Random offsets stay finite whatever the scales."""
+MAX_LOG_VARIANCE = 60.0  # Random offsets stay finite whatever the scales
 
 
 @dataclass(frozen=True)

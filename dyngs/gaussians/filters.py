@@ -13,11 +13,9 @@ from dyngs.gaussians import Gaussians
 from dyngs.state import Role, State, StateTensor
 from dyngs.tensor_checks import require_tensor
 
-FILTER_VARIANCE = 0.2
-"""Variance of the filter in squared sampling intervals."""
+FILTER_VARIANCE = 0.2  # Variance of the filter in squared sampling intervals
 NEAR = 0.2
-MARGIN = 0.15
-"""Cameras count as seeing what lies within the image enlarged by this fraction on each side."""
+MARGIN = 0.15  # Cameras count as seeing what lies within the image enlarged by this fraction on each side
 
 
 def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:

@@ -18,12 +18,10 @@ from dyngs.data.scene_space import MIN_VIEWS, outside_of_cube, points_in_frusta
 from dyngs.gaussians import Gaussians
 
 START_OPACITY = 0.1
-MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1
-"""Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with."""
+MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with
 MIN_SQUARED_DISTANCE = 1e-7
 EXTENT_MARGIN = 1.1
-CANDIDATES = 4
-"""Random points that are drawn per one that is taken, where what the cameras see decides."""
+CANDIDATES = 4  # Random points that are drawn per one that is taken, where what the cameras see decides
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 
-FOCAL_LENGTHS = (1e-6, 1e12)
-"""Smallest and largest allowed, px; beyond them gradients leave the range of float32."""
+FOCAL_LENGTHS = (1e-6, 1e12)  # Smallest and largest allowed, px; beyond them gradients leave the range of float32
 ROTATION_TOLERANCE = 0.01
 """Largest entry of ``R^T R - I`` of a pose that is drawn; half precision rounds by a tenth of that."""
 

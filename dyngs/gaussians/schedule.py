@@ -18,12 +18,9 @@ from dyngs.config import (
 from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 
-MIN_START = 100
-"""Densification never starts earlier: the first gradients say little."""
-MIN_RESET_GAP = 400
-"""Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)."""
-RESET_FRACTION = 0.2
-"""Fraction of a short run between opacity resets."""
+MIN_START = 100  # Densification never starts earlier: the first gradients say little
+MIN_RESET_GAP = 400  # Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)
+RESET_FRACTION = 0.2  # Fraction of a short run between opacity resets
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100

@@ -16,17 +16,13 @@ from dyngs.data.images.images import target_size
 from dyngs.data.loader import Image
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
-OPAQUE = 0.99
-"""Alpha from which a pixel shows no background."""
-ALIKE = 0.1
-"""Largest difference of a channel up to which a colour counts as that of the background."""
+OPAQUE = 0.99  # Alpha from which a pixel shows no background
+ALIKE = 0.1  # Largest difference of a channel up to which a colour counts as that of the background
 MANY_ALIKE = 0.05
 """Fraction of the opaque pixels of the background's colour from which silhouettes are trained on: with 0.12 (orbits)
 the whole image gains 0.8 dB, with 0 (flag) nothing; in between nothing was measured."""
-WEIGHT = 0.1
-"""Weight of the mean error of alpha there."""
-IMAGES = 12
-"""Number of images in which colours are compared with the background."""
+WEIGHT = 0.1  # Weight of the mean error of alpha there
+IMAGES = 12  # Number of images in which colours are compared with the background
 
 
 @dataclass(frozen=True)

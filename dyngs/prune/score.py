@@ -16,8 +16,7 @@ from dyngs.camera import Cameras
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
 
-STEEPNESS = 4.0
-"""Slope of the hyperbolic tangent: second differences of a profile are small numbers."""
+STEEPNESS = 4.0  # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 VOLUME_POWER = 0.1
 
 

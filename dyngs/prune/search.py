@@ -37,14 +37,12 @@ LEFT_GAUSSIANS = tuple(2 ** (-step / 2) for step in range(1, 13))
 CUT_OFFS = (0.01, 0.02, 0.03)
 FIELD_LOSSES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Losses of training images, dB, before fine-tuning, by fewer pieces and by fewer nodes each."""
-HARMONIC_LOSSES = (0.01, 0.03, 0.1)
-"""Losses of training images, dB, before fine-tuning, by dropping harmonics."""
+HARMONIC_LOSSES = (0.01, 0.03, 0.1)  # Losses of training images, dB, before fine-tuning, by dropping harmonics
 ALLOWED = {"cut-off": 0.1, "Gaussians": 0.65, "field": 0.8, "harmonics": 0.85}
 """Fraction of the allowed loss up to which each kind is taken, those before it included; the rest is for rounding."""
 FEWEST_NODES = 8
 
-SMALLEST_FILE_LOSS = 0.01
-"""Least loss of rounding that is allowed, dB: with 0 no file would be good enough."""
+SMALLEST_FILE_LOSS = 0.01  # Least loss of rounding that is allowed, dB: with 0 no file would be good enough
 
 Tell = Callable[[str], None]
 

@@ -29,11 +29,9 @@ from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 
-MOVING_VIEWS, MOVING_TIMES = 8, 24
-"""Numbers of training cameras and times whose pairs are scored in dynamic scenes."""
+MOVING_VIEWS, MOVING_TIMES = 8, 24  # Numbers of training cameras and times whose pairs are scored in dynamic scenes
 STILL_VIEWS = 100
-PROBED_VIEWS = 16
-"""Number of training images on which the loss is measured."""
+PROBED_VIEWS = 16  # Number of training images on which the loss is measured
 MASKED_BELOW = 0.5
 """At a key time, Gaussians that contribute no more px to all views together are masked (docs/prune.md)."""
 

@@ -20,8 +20,7 @@ from dyngs.models.schedule import image_divisor, scaled
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 18.0, 300.0, 9e-4
 """Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two cores."""
-MOTION = 2.0
-"""Factor by which steps cost more once things may move."""
+MOTION = 2.0  # Factor by which steps cost more once things may move
 DETAIL = 0.5
 """Power of the images' side with which the number of Gaussians grows: 2 to 4.7 times were seen from 1/4 to full."""
 SAMPLES = 64

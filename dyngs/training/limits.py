@@ -15,14 +15,11 @@ from dyngs.deform.fields import new_field
 from dyngs.errors import DyngsError
 from dyngs.training.processes import Processes
 
-RANDOM_FRACTION = 0.1
-"""Fraction of the limit that is kept free for the random Gaussians with which motion begins."""
+RANDOM_FRACTION = 0.1  # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
 """Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in docs/storage.md."""
-CLOSE = 0.8
-"""Fraction of the limit from which the limit counts as having held growth back."""
-FEWEST = 500
-"""Fewest Gaussians that a limit on the size must have room for."""
+CLOSE = 0.8  # Fraction of the limit from which the limit counts as having held growth back
+FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 
 def require_possible(config: Config) -> None:

@@ -33,33 +33,27 @@ from dyngs.training.trainer import Trainer
 COPIES = 7
 """Float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more when their set
 changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values take 0.24 kB."""
-NEEDED_COPIES = 4
-"""Of these, what is there in every step: value, gradient, two moments."""
+NEEDED_COPIES = 4  # Of these, what is there in every step: value, gradient, two moments
 POSING_BYTES = 2600
 """Bytes of a Gaussian of a person beside that, where the body fit is refined: its anchor, weights of joints, their
 gradients, and the Gaussian in a pose."""
-MOVING_BYTES = 200
-"""Bytes beside that of a Gaussian that control nodes move: the Gaussian at a time."""
-LOOKUP_COPIES = 12
-"""Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice."""
+MOVING_BYTES = 200  # Bytes beside that of a Gaussian that control nodes move: the Gaussian at a time
+LOOKUP_COPIES = 12  # Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice
 ACTIVATION_COPIES = 3
 """Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a gradient."""
 FIELD_COPIES = 5
 """Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for the penalties."""
-SHAPE_VALUES = 11
-"""Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity."""
+SHAPE_VALUES = 11  # Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity
 DRAWING_BYTES = 200
 """Bytes per pixel of the largest image that a step takes beside them: rendering, truth, windows of SSIM."""
-STEP_BYTES = 30_000_000
-"""Bytes of any step: code and buffers that the first one touches."""
+STEP_BYTES = 30_000_000  # Bytes of any step: code and buffers that the first one touches
 DECODING_BYTES = 45
 """Bytes per pixel of the file that decoding takes for a while: floats for shrinking and undistorting. Measured, as that
 above, on photos of 12 megapixels."""
 USUAL_GAUSSIANS, USUAL_CHANGES = 250_000, 34
 """Gaussians that photos led to in 7,000 steps (fox 268,000, cup 204,000, lego 173,000: docs/benchmarks.md), in which
 their set changes so often; fewer in proportion in shorter runs."""
-USUAL_SIDE = 400
-"""Longest side of the images, px, from which on that holds; below it goes with the root of the side."""
+USUAL_SIDE = 400  # Longest side of the images, px, from which on that holds; below it goes with the root of the side
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _SWAP = "/sys/fs/cgroup/memory.swap.max"
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")

@@ -11,12 +11,9 @@ from torch.nn.functional import adaptive_avg_pool2d
 from dyngs.camera import Cameras
 from dyngs.data.loader import ImageLoader
 
-CELLS = 40
-"""Cells along the longest side of an image."""
-NEAREST = 24
-"""Views that are asked, at most."""
-FEWEST = 3
-"""Views that must see a place, at least."""
+CELLS = 40  # Cells along the longest side of an image
+NEAREST = 24  # Views that are asked, at most
+FEWEST = 3  # Views that must see a place, at least
 SOLID = 0.5
 """Alpha from which the drawn depth means anything; and the fraction of a cell that its image's mask must keep."""
 _TINY = 1e-6

@@ -35,22 +35,16 @@ from dyngs.tensor_checks import require_tensor
 from dyngs.training.events import StepReport
 from dyngs.training.sampler import ViewSampler
 
-SQUARED_WEIGHT = 1.0
-"""Weight of the mean squared error in the loss, which counts edges more."""
-WARM_UP = 0.05
-"""Fraction of the run in which the highest learning rate is reached."""
-WEIGHT_DECAY = 1e-5
-"""Weight decay of AdamW."""
-MAX_GRADIENT = 1.0
-"""Norm to which gradients are clipped."""
-MEAN_VIEWS = 8
-"""Images of each person that the mean colours are taken from."""
+SQUARED_WEIGHT = 1.0  # Weight of the mean squared error in the loss, which counts edges more
+WARM_UP = 0.05  # Fraction of the run in which the highest learning rate is reached
+WEIGHT_DECAY = 1e-5  # Weight decay of AdamW
+MAX_GRADIENT = 1.0  # Norm to which gradients are clipped
+MEAN_VIEWS = 8  # Images of each person that the mean colours are taken from
 ADAPTING_RATE = 1e-4
 """Highest learning rate of Adam per image of one person, which falls linearly: a single one says little about the other
 sides."""
 
-_LOWEST = 1e-3
-"""Ratio of the last to the highest learning rate."""
+_LOWEST = 1e-3  # Ratio of the last to the highest learning rate
 
 
 @dataclass

@@ -20,14 +20,10 @@ from torch.distributed.rendezvous import rendezvous
 
 from dyngs.errors import DyngsError
 
-TIMEOUT = timedelta(days=30)
-"""The others wait while the first one reads, evaluates, or tries settings in small runs."""
-CHUNK = 2**22
-"""Most values that are summed at once: the memory that a sum takes for a while, twice."""
-FAILED = "dyngs/failed"
-"""Key of the store that counts the processes that have said why they end."""
-EXIT_FAILED = 2
-"""Exit code of a process that ends because another one has failed, which has said why."""
+TIMEOUT = timedelta(days=30)  # The others wait while the first one reads, evaluates, or tries settings in small runs
+CHUNK = 2**22  # Most values that are summed at once: the memory that a sum takes for a while, twice
+FAILED = "dyngs/failed"  # Key of the store that counts the processes that have said why they end
+EXIT_FAILED = 2  # Exit code of a process that ends because another one has failed, which has said why
 _NAMES = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
 
 

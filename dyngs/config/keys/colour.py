@@ -8,8 +8,7 @@ from pydantic import Field
 
 from dyngs.section import Positive, Section
 
-MEASURED_AT = 0.6
-"""Fraction of a run after which it is measured whose harmonics pay."""
+MEASURED_AT = 0.6  # Fraction of a run after which it is measured whose harmonics pay
 
 
 class ColourSection(Section):

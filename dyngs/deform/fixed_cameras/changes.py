@@ -19,20 +19,17 @@ from dyngs.data.loader import Image
 LONGEST_SIDE, IMAGES = 200, 2000
 """Pixels; larger images are shrunk: silhouettes need no more, and noise averages out. Of more images than that,
 each is smaller, so that all of them together take as much memory."""
-SMALLEST_CHANGE = 0.05
-"""Least difference in a channel, of 1, that counts as a change."""
+SMALLEST_CHANGE = 0.05  # Least difference in a channel, of 1, that counts as a change
 NOISE_MULTIPLE = 5.0
 """Differences below so many standard deviations of the noise, as estimated from the median, are no change."""
-SURE = 2.0
-"""A change must reach this multiple of its threshold somewhere, as in hysteresis thresholding (Canny 1986)."""
+SURE = 2.0  # A change must reach this multiple of its threshold somewhere, as in hysteresis thresholding (Canny 1986)
 FEWEST_PIXELS = 6
 DARKEST_SHADOW = 0.35
 SHADOW_TINT = 0.14
 """A shadow leaves at least that fraction of the light and changes no channel by more than this share beyond the
 others."""
 _MAD_TO_STD = 1.4826
-_DARK = 0.03
-"""Added to colours before they are divided."""
+_DARK = 0.03  # Added to colours before they are divided
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,13 @@ import numpy as np
 
 from dyngs.deform.fixed_cameras.changes import Footage
 
-FIRST_CUBES = 16
-"""Cubes along the longest side of the box that carving begins with."""
-MAX_CUBES = 300_000
-"""Carving stops to divide cubes at this number."""
-LARGEST_PX = 2.0
-"""Pixels that a side covers, in most cameras, when cubes are no longer divided."""
+FIRST_CUBES = 16  # Cubes along the longest side of the box that carving begins with
+MAX_CUBES = 300_000  # Carving stops to divide cubes at this number
+LARGEST_PX = 2.0  # Pixels that a side covers, in most cameras, when cubes are no longer divided
 MAX_LEVELS = 8
 MISSING_FRACTION = 0.25
 """Fraction of the cameras that see a place which may not see the thing there, because something still hides it."""
-ENOUGH_VIEWS = 3
-"""Cameras that must see a change at a place, or all there are."""
+ENOUGH_VIEWS = 3  # Cameras that must see a change at a place, or all there are
 FEWEST_CUBES = 12
 SOLID_FRACTION = 0.3
 """Of a blob, the cubes that most cameras agree on are kept, as long as they are this fraction of all."""

@@ -9,12 +9,9 @@ import numpy as np
 
 from dyngs.deform.fixed_cameras.hulls import Blob
 
-MAX_GAP = 3
-"""Times in a row at which a thing may be lost."""
-FEWEST_TIMES = 4
-"""Times at which a thing must be found."""
-FIRST_REACH = 6.0
-"""Radii within which a thing whose velocity is not known is looked for at the next time."""
+MAX_GAP = 3  # Times in a row at which a thing may be lost
+FEWEST_TIMES = 4  # Times at which a thing must be found
+FIRST_REACH = 6.0  # Radii within which a thing whose velocity is not known is looked for at the next time
 REACH, SPEED_REACH = 3.0, 1.5
 """Radii, and fractions of the last displacement, by which a thing may be away from where its velocity takes it."""
 COLOR_REACH, SIZE_REACH = 0.35, 1.2

@@ -23,29 +23,21 @@ from dyngs.gaussians.rendering import render
 
 USUAL_FRACTION = 0.4
 """Fraction of the times at which a cube of a thing's own frame lies in its hull, for it to belong to the thing."""
-WHOLE = 0.75
-"""Fraction of the usual radius from which a hull shows the whole thing."""
-SCALE = 0.6
-"""Standard deviation of a seed in distances between seeds."""
+WHOLE = 0.75  # Fraction of the usual radius from which a hull shows the whole thing
+SCALE = 0.6  # Standard deviation of a seed in distances between seeds
 THINNED, FEWEST = 4, 100
 """One seed for so many cubes of a surface, that is for some four pixels, but not fewer for a thing, if it has them."""
-LOGIT = 1.4
-"""Opacity 0.8: where a hull is, something is."""
-FIT = 0.1
-"""Mean error of a spline, in radii of the thing, that is small enough."""
+LOGIT = 1.4  # Opacity 0.8: where a hull is, something is
+FIT = 0.1  # Mean error of a spline, in radii of the thing, that is small enough
 BEND = 1e-4
 """Weight of squared second differences in a fit: it decides where a track has gaps, and straight on at its ends."""
-APART = 3.0
-"""Radii from the centre of a thing within which others are near."""
-PAYS = 0.9
-"""Fraction of the medians' squared error that may be left where seeds cover an image."""
+APART = 3.0  # Radii from the centre of a thing within which others are near
+PAYS = 0.9  # Fraction of the medians' squared error that may be left where seeds cover an image
 SHOWN = 0.4
 """Fraction of the pixels that seeds cover in which an image must change; else something still hides the thing;
 and of images that are not so."""
-JUDGED_TIMES = 8
-"""Times at which seeds are compared with the images."""
-COVERED = 0.1
-"""Opacity from which they cover a pixel."""
+JUDGED_TIMES = 8  # Times at which seeds are compared with the images
+COVERED = 0.1  # Opacity from which they cover a pixel
 
 
 @dataclass(frozen=True)

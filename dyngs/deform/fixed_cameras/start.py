@@ -20,15 +20,13 @@ from dyngs.deform.nodes import spread_out
 from dyngs.deform.random_gaussians import box_of
 from dyngs.gaussians import Gaussians
 
-ROOM = 0.25
-"""Room around the things that stand still and the cameras, in sides of their box."""
+ROOM = 0.25  # Room around the things that stand still and the cameras, in sides of their box
 LEAST_SHOWN = 0.05
 """Least area that a thing shows over its times, as a fraction of that of the largest: less is noise at things in
 place."""
 MAX_TRACKS = 24
 NODES_PER_TRACK = 40
-NODE_FRACTION = 0.5
-"""Nodes on things that are tracked, as a fraction of all, at most."""
+NODE_FRACTION = 0.5  # Nodes on things that are tracked, as a fraction of all, at most
 
 
 @dataclass(frozen=True)

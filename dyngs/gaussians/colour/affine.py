@@ -13,19 +13,16 @@ from torch import Tensor
 from dyngs.data.loader import Image
 from dyngs.models.renderable import Rendering
 
-SATURATED = 254.5 / 255
-"""A channel this bright may have been any brighter."""
+SATURATED = 254.5 / 255  # A channel this bright may have been any brighter
 GAIN_RIDGE, MIXING_RIDGE = 1e-5, 1e-2
 """Weights of squared deviations from the identity, of gains and of all else, against the mean squared error.
 
 They decide what the pixels do not: the channels of most images are so alike that mixtures of them can mean anything.
 With 3e-4 for the latter, halves of the cup in docs/benchmarks.md had 2 dB less after the fit than before it.
 """
-ROUNDS = 3
-"""Fits in turn, each without the saturated channels that the one before shows brighter still."""
+ROUNDS = 3  # Fits in turn, each without the saturated channels that the one before shows brighter still
 
-Shown = tuple[Image, Rendering]
-"""An image, and the rendering of its one view."""
+Shown = tuple[Image, Rendering]  # An image, and the rendering of its one view
 
 
 def recoloured(affine: Tensor, image: Image, rendering: Rendering, background: Tensor) -> Tensor:

@@ -14,11 +14,9 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import Shader
 from dyngs.ops.reference import harmonics_basis
 
-DIRECTIONS = 96
-"""Number of directions from which colours are sampled; degree 3 has 16 terms."""
+DIRECTIONS = 96  # Number of directions from which colours are sampled; degree 3 has 16 terms
 
-_FAR = 1e4
-"""Distance of the camera, in largest distances of a Gaussian from the origin."""
+_FAR = 1e4  # Distance of the camera, in largest distances of a Gaussian from the origin
 
 
 @dataclass(frozen=True)

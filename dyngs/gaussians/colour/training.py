@@ -23,13 +23,11 @@ from dyngs.ops.shading import num_inputs
 from dyngs.state import Role, State, StateTensor
 from dyngs.tensor_checks import require_tensor
 
-WARM_UP = 100
-"""Steps in which the network's rate is reached."""
+WARM_UP = 100  # Steps in which the network's rate is reached
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)
 """Fractions of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k steps)."""
 HELD_OUT_EVERY = 8
-_HELD_OUT = 5
-"""Index, in each eight views, of the one that is held out."""
+_HELD_OUT = 5  # Index, in each eight views, of the one that is held out
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions, render
 from dyngs.ops.harmonics import evaluate_harmonics
 
-_LIFT = 64.0
-"""Added to colours so that none is clamped; float32 keeps 4e-6 of them."""
+_LIFT = 64.0  # Added to colours so that none is clamped; float32 keeps 4e-6 of them
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from dyngs.ops.loss import l1_ssim_loss
 from dyngs.training.corrections.camera_refinement import corrected, slopes, watched
 
 UPDATES = 60
-FIRST_RATE, LAST_RATE = 2e-3, 1e-4
-"""Learning rates, rad, and as a fraction of the scene's size; log-linear between."""
+FIRST_RATE, LAST_RATE = 2e-3, 1e-4  # Learning rates, rad, and as a fraction of the scene's size; log-linear between
 SSIM_WEIGHT = 0.2
 
 

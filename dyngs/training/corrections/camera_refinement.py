@@ -28,10 +28,8 @@ FIRST_RATE, LAST_RATE = 3e-3, 1e-5
 """Learning rates after ``STARTS`` and at the end, rad, and as a fraction of the scene's size; log-linear between."""
 LENS_RATE = 0.01
 """Rate of focal lengths and principal points, as a fraction of that of poses: a lens is updated in every step."""
-LENS_STARTS = 0.3
-"""Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share."""
-MIN_POSES = 8
-"""Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is."""
+LENS_STARTS = 0.3  # Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share
+MIN_POSES = 8  # Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is
 POSES, LENSES = "poses", "lenses"
 
 

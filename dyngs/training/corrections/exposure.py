@@ -33,24 +33,18 @@ from dyngs.training.shared_places import Draw, log_gains
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little to compare with."""
-TRAVEL = 0.5
-"""How far a gain may move after it was found, at most: rates follow from how often an image is trained on."""
-LAST_RATE = 0.02
-"""Rate at the end over that at the beginning, log-linear between."""
+TRAVEL = 0.5  # How far a gain may move after it was found, at most: rates follow from how often an image is trained on
+LAST_RATE = 0.02  # Rate at the end over that at the beginning, log-linear between
 MAX_RATE = 0.01
-MIXING_RATE = 0.05
-"""Rate of what mixes channels, and of offsets, over that of gains."""
+MIXING_RATE = 0.05  # Rate of what mixes channels, and of offsets, over that of gains
 GAIN_WEIGHT, MIXING_WEIGHT = 0.3, 1.0
 """Weights of the mean squared deviation from the identity: gains differ, channels hardly mix."""
 CELLS, FEWEST_CELLS = 16, 8
 """The ratio is a median over so many cells a side; with fewer that say something there is none."""
-DARK, COVERED = 0.02, 0.1
-"""Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing."""
-ENOUGH = 100
-"""Pixels along the longer side from which only every second one is looked at, and so on."""
+DARK, COVERED = 0.02, 0.1  # Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing
+ENOUGH = 100  # Pixels along the longer side from which only every second one is looked at, and so on
 MAX_GAIN = 8.0
-SMOOTH_WEIGHT = 1.0
-"""Weight of the mean square of its difference from the images before and after, in a video."""
+SMOOTH_WEIGHT = 1.0  # Weight of the mean square of its difference from the images before and after, in a video
 
 
 def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | None:

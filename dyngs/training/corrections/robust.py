@@ -24,24 +24,18 @@ from dyngs.models.renderable import Rendering
 from dyngs.tensor_checks import require_indices, require_tensor
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 
-EVERY = 4
-"""An image is looked at each so many times that it is trained on; in between its mask stays."""
-WARM_UP = 0.05
-"""Fraction of the run in which everything counts."""
+EVERY = 4  # An image is looked at each so many times that it is trained on; in between its mask stays
+WARM_UP = 0.05  # Fraction of the run in which everything counts
 SEED, GROWN = 5.0, 3.0
 """Multiples of the median residual: from the first a cell is left out, from the second beside such cells."""
-REACH = 2
-"""Cells up to which a cell counts as beside another."""
-SUPPORT = 0.5
-"""Fraction of the 3 x 3 cells around that must be left out, too."""
+REACH = 2  # Cells up to which a cell counts as beside another
+SUPPORT = 0.5  # Fraction of the 3 x 3 cells around that must be left out, too
 CLEARLY = 0.5
 """A place disagrees where the other views differ from the rendering by less than this fraction of what it does."""
-RIM = 1
-"""Cells around what is left out that are left out with it."""
+RIM = 1  # Cells around what is left out that are left out with it
 DISCOUNT = 0.95
 """Weight of the histogram of all looks before against that of the present one: it remembers about twenty."""
-_OCTAVES, _PER_OCTAVE = 12, 16
-"""The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two."""
+_OCTAVES, _PER_OCTAVE = 12, 16  # The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two
 
 
 class RobustMasks:

@@ -14,17 +14,12 @@ from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.training.priors.depth_maps import DepthForm, values_of
 
-PAIRS = 12
-"""Pairs of images that are compared."""
-MARGIN = 0.97
-"""A prior must lower the error at least to this fraction of its substitute's."""
-_CHANGED = 0.1
-"""Flow is judged at this fraction of the pixels: those that change most."""
-_SIDE = 96
-"""Images are shrunk to about this for depth: hundreds of guesses are compared."""
+PAIRS = 12  # Pairs of images that are compared
+MARGIN = 0.97  # A prior must lower the error at least to this fraction of its substitute's
+_CHANGED = 0.1  # Flow is judged at this fraction of the pixels: those that change most
+_SIDE = 96  # Images are shrunk to about this for depth: hundreds of guesses are compared
 _DEPTHS = 14
-_RANGE = 6.0
-"""Nearest and farthest guess, as a factor of the distance to what the cameras look at."""
+_RANGE = 6.0  # Nearest and farthest guess, as a factor of the distance to what the cameras look at
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ DepthForm = Literal["depth", "inverse"]
 """Form of the map that is affine in the true depth: the map as it is, or its inverse (the nets of single images)."""
 
 _ROUNDS = 4
-_SOLID = 0.5
-"""Alpha from which the drawn depth means anything."""
+_SOLID = 0.5  # Alpha from which the drawn depth means anything
 _MIN_PIXELS = 16
 _TINY = 1e-6
 

@@ -26,8 +26,7 @@ from dyngs.training.priors.depth_maps import DepthForm
 from dyngs.training.priors.point_motion import Glance
 from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
 
-_NEAR_TIME = 0.1
-"""Depth is judged by images whose times differ by less; the less, the less has moved."""
+_NEAR_TIME = 0.1  # Depth is judged by images whose times differ by less; the less, the less has moved
 _BASELINE = 0.1
 """Best distance between the cameras of two images for that, as a fraction of their distance from the scene."""
 

@@ -17,8 +17,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 
 _SOLID = 0.5
-_SOFT_PX = 0.5
-"""Charbonnier's constant, px: smaller errors count quadratically."""
+_SOFT_PX = 0.5  # Charbonnier's constant, px: smaller errors count quadratically
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,9 @@ from dyngs.models.model import Look, Loss
 from dyngs.training.priors.depth_maps import DepthForm, depth_error
 from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
 
-MIN_POINTS = 4
-"""Fewest points that two images must share for their tracks to be compared."""
-WEIGHTS = {"depth": 0.1}
-"""Weight of a loss term where it is not 1."""
-_NEAREST = 8
-"""The other image of tracks is one of so many nearest in time."""
+MIN_POINTS = 4  # Fewest points that two images must share for their tracks to be compared
+WEIGHTS = {"depth": 0.1}  # Weight of a loss term where it is not 1
+_NEAREST = 8  # The other image of tracks is one of so many nearest in time
 
 
 @dataclass(frozen=True)
