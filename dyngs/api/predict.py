@@ -98,12 +98,7 @@ def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
 
 
 def write_run(
-    out: Path,
-    scene: HumanScene,
-    frames: tuple[int, ...],
-    data: DataConfig,
-    model: HumanPredictorModel,
-    seconds: float,
+    out: Path, scene: HumanScene, frames: tuple[int, ...], data: DataConfig, model: HumanPredictorModel, seconds: float
 ) -> None:
     """Write ``scene`` as a run of the preset for one person after no step."""
     preset = load_config(packaged_preset("human"), ["data.root=."])

@@ -25,11 +25,7 @@ class Parameters:
     """
 
     def __init__(
-        self,
-        tensors: Mapping[str, Tensor],
-        rates: Mapping[str, float],
-        decay: float = 1.0,
-        roles: Roles = Role.SHARED,
+        self, tensors: Mapping[str, Tensor], rates: Mapping[str, float], decay: float = 1.0, roles: Roles = Role.SHARED
     ) -> None:
         self.decay, self.rates = decay, dict(rates)
         self._roles = dict.fromkeys(tensors, roles) if isinstance(roles, Role) else dict(roles)

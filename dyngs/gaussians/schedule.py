@@ -7,14 +7,7 @@ from dataclasses import dataclass
 
 from typing_extensions import assert_never
 
-from dyngs.config import (
-    Config,
-    DefaultStrategy,
-    McmcStrategy,
-    OptimConfig,
-    Strategy,
-    TrainConfig,
-)
+from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
 from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing_extensions import assert_never
 
-from dyngs.config import (
-    AutoColour,
-    DefaultStrategy,
-    FixedStrategy,
-    McmcStrategy,
-    NetworkColour,
-    ShColour,
-)
+from dyngs.config import AutoColour, DefaultStrategy, FixedStrategy, McmcStrategy, NetworkColour, ShColour
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import box_around
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, NetworkTraining

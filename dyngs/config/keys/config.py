@@ -93,8 +93,7 @@ class Config(Section):
         ShColour | NetworkColour | AutoColour, Field(discriminator="kind", description="what colours are made of")
     ] = ShColour()
     strategy: Annotated[
-        Strategy,
-        Field(discriminator="kind", description="how Gaussians are added and removed during training"),
+        Strategy, Field(discriminator="kind", description="how Gaussians are added and removed during training")
     ] = DefaultStrategy()
     optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig()
