@@ -129,10 +129,6 @@ class GaussianModel(Model[GaussianScene]):
         return self._scene
 
     @property
-    def optimizer_state(self) -> State:
-        return self._optimizer.state()
-
-    @property
     def moves_by(self) -> tuple[str, str]:  # type: ignore[override]
         return self.training.moves_by
 

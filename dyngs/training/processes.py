@@ -129,13 +129,6 @@ class Processes:
             x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
         self.sum_([x.grad for x in used if x.grad is not None])
 
-    def agreed(self, choice: bool) -> bool:
-        if self.size == 1:
-            return choice
-        said = torch.tensor([int(choice)], device="cpu")
-        self.send_(said)
-        return bool(said)
-
     def send_(self, values: Tensor) -> None:
         """Replace the values of a tensor by those of the first process."""
         if self.size > 1:

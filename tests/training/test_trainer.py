@@ -187,7 +187,7 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
         trainer.step()
         counts.append(len(trainer.model.scene.gaussians))
         if trainer.done == 2:
-            moments = trainer.model.optimizer_state["exp_avg_sq.means"].tensor
+            moments = trainer.model.state()["exp_avg_sq.means"].tensor
             assert moments[:50].any()
             assert not moments[50:].any()
             other = _trained_by(_trainer(capture), _Growing())
