@@ -25,7 +25,6 @@ from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import (
     IMAGES,
-    AlphaWeight,
     background_colour,
     measured_alpha_weight,
     resolved_background,
@@ -38,6 +37,7 @@ from dyngs.training.corrections.exposure import exposures_of
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
+from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
 from dyngs.training.sampler import ViewSampler
@@ -83,6 +83,16 @@ def assemble(
     background, extent = resolved_background(config, capture), surroundings(capture).extent
     model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator))
     refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
+    robust, exposures = _robust(config, capture, images), exposures_of(config.train, images)
+    alpha_weight, findings = _alpha_weight(config, capture, images)
+    losses = [
+        ImageLoss(config.train.ssim_weight),
+        SilhouetteLoss(alpha_weight, masked=robust is not None),
+        PenaltyLoss(),
+        *([] if exposures is None else [exposures]),
+        priors,
+        RegularizerLoss(),
+    ]
     trainer = Trainer(
         config=config,
         model=model,
@@ -91,12 +101,12 @@ def assemble(
         sampler=ViewSampler(len(images)),
         background=background,
         extent=extent,
-        alpha=_alpha_weight(config, capture, images),
+        losses=losses,
         generator=generator,
         held_out=held_out,
-        priors=priors,
-        robust=_robust(config, capture, images),
-        exposures=exposures_of(config.train, images),
+        findings=[*([] if restored else findings), *priors.lines],
+        robust=robust,
+        exposures=exposures,
         refinement=refinement,
     )
     trainer.place(device_for(config.run.device))
@@ -169,13 +179,13 @@ def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefin
     return refinement
 
 
-def _alpha_weight(config: Config, capture: Capture, images: ImageLoader) -> AlphaWeight:
+def _alpha_weight(config: Config, capture: Capture, images: ImageLoader) -> tuple[float, list[str]]:
     """Return how much silhouettes count: what is requested, or what moving things before this background need."""
     requested, background = config.train.alpha_weight, resolved_background(config, capture)
     if requested is not None:
-        return AlphaWeight(requested)
+        return requested, []
     moves = config.model.may_move and len(set(training_times(capture))) > 1
     if not moves or not capture.has_alpha or background == "random":
-        return AlphaWeight()
+        return 0.0, []
     shown = (images[i] for i in evenly_spaced(len(images), IMAGES))
     return measured_alpha_weight(shown, background_colour(background))

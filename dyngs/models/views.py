@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -25,24 +24,16 @@ WEIGHT = 0.1  # Weight of the mean error of alpha there
 IMAGES = 12  # Number of images in which colours are compared with the background
 
 
-@dataclass(frozen=True)
-class AlphaWeight:
-    """Weight of the mean error of alpha in the loss."""
-
-    weight: float = 0.0
-    finding: str | None = None  # a line about why, if that was measured
-
-
-def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> AlphaWeight:
-    """Return the weight of the mean error of alpha that suits ``images`` on the colour ``background`` (3,)."""
+def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> tuple[float, list[str]]:
+    """Return the weight of the mean error of alpha that suits images on ``background`` (3,), and lines about why."""
     fraction = share_alike(images, background)
     if fraction is None:
-        return AlphaWeight()
+        return 0.0, []
     uses = fraction >= MANY_ALIKE
     text = f"{fraction:.1%} of the opaque pixels have nearly the background's colour: " + (
         f"silhouettes count, too (train.alpha_weight={WEIGHT:g})" if uses else "silhouettes are not needed"
     )
-    return AlphaWeight(WEIGHT if uses else 0.0, text)
+    return WEIGHT if uses else 0.0, [text]
 
 
 def share_alike(images: Iterable[Image], background: Tensor) -> float | None:

@@ -28,15 +28,15 @@ class SilhouetteLoss(Loss):
     """
 
     def __init__(self, weight: float, *, masked: bool) -> None:
-        self._weight, self._masked = weight, masked
+        self.weight, self._masked = weight, masked
 
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
-        if self._weight == 0 or look.image.alpha is None:
+        if self.weight == 0 or look.image.alpha is None:
             return {}
         error = (look.drawn.rendering.alpha[0] - look.image.alpha).abs()
         if self._masked and look.image.mask is not None:
             error = error * look.image.mask
-        return {"alpha": self._weight * error.mean()}
+        return {"alpha": self.weight * error.mean()}
 
 
 class PenaltyLoss(Loss):

@@ -20,7 +20,7 @@ from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.models.model import Look, Loss, Model
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
-from dyngs.models.views import AlphaWeight, background_colour
+from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import CPU
 from dyngs.ops.transfer import sent
@@ -29,8 +29,6 @@ from dyngs.training.corrections.camera_refinement import CameraRefinement, watch
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.events import StepReport
-from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.priors.used import UsedPriors
 from dyngs.training.processes import Processes
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.step_check import StepCheck
@@ -49,9 +47,9 @@ class Trainer(Generic[M]):
     sampler: ViewSampler
     background: str  # "white", "black" or "random" (a new colour in each step, behind render and truth alike)
     extent: float
-    alpha: AlphaWeight  # how much silhouettes count in the loss
+    losses: Sequence[Loss]  # terms of the loss, in an order that decides the last bits of its gradients
     generator: torch.Generator
-    priors: UsedPriors = field(default_factory=UsedPriors)
+    findings: list[str] = field(default_factory=list)  # lines that are told with the next step
     robust: RobustMasks | None = None  # masks of what disagrees with the other views; None: all pixels count
     exposures: ViewExposures | None = None  # affine colours of the training images; None: they agree
     refinement: CameraRefinement | None = None  # of the cameras; None: they stay as the capture has them
@@ -60,19 +58,6 @@ class Trainer(Generic[M]):
     held_out: frozenset[int] = frozenset()  # indices of the training views that are not trained on
     processes: Processes = field(default_factory=Processes)  # that take a fraction of the views of each step; one: this
     device: torch.device = CPU  # where the model is trained; see ``place``
-
-    def __post_init__(self) -> None:
-        """List the terms of the loss: an order that decides the last bits of its gradients."""
-        options = self.config.train
-        exposures = [] if self.exposures is None else [self.exposures]
-        self.losses: list[Loss] = [
-            ImageLoss(options.ssim_weight),
-            SilhouetteLoss(self.alpha.weight, masked=self.robust is not None),
-            PenaltyLoss(),
-            *exposures,
-            self.priors,
-            RegularizerLoss(),
-        ]
 
     @property
     def has_test_views(self) -> bool:
@@ -96,10 +81,10 @@ class Trainer(Generic[M]):
         loss = self._averaged(step, [report.loss for report in reports])
         updated = self.model.update(step)
         self.bad_gradients, self.done = self.bad_gradients + updated.bad, step
-        found = (self.alpha.finding if step == 1 else None, self.priors.told(updated.finding))
         if updated.is_rearranged:
             self.processes.require_same(tensors_of(self.model.scene.state()), f"after step {step}")
-        finding = "; ".join(text for text in found if text is not None) or None
+        finding = "\n".join([*self.findings, *([] if updated.finding is None else [updated.finding])]) or None
+        self.findings.clear()
         return replace(reports[0], loss=loss, finding=finding)
 
     def _averaged(self, step: int, losses: Sequence[float]) -> float:

@@ -54,7 +54,7 @@ def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves:
         agreement = _judged_masks(config, images)
         lines.append(_line("motion masks", agreement, "the same masks the other way round"))
         masks = agreement.holds
-    return UsedPriors(kind, flow_to, tracks, masks, lines)
+    return UsedPriors(kind, flow_to, tracks, masks, tuple(lines))
 
 
 _NAMES: dict[DepthForm, str] = {"depth": "depth", "inverse": "inverse depth"}

@@ -56,17 +56,10 @@ class UsedPriors(Loss):
     flow_to: Mapping[int, Glance] = field(default_factory=dict)
     tracks: PointTracks | None = None  # None: none are used
     masks: bool = False  # whether motion masks say what may move
-    # what was found, for people, told once; whoever tells them removes them
-    lines: list[str] = field(default_factory=list)
+    lines: tuple[str, ...] = ()  # what was found, for people
 
     def needs_depth(self, image: Image) -> bool:
         return self.depth is not None and image.depth is not None
-
-    def told(self, finding: str | None) -> str | None:
-        """Return the lines that have not been told yet, then ``finding``, and forget them; None: there are none."""
-        lines = [*self.lines, *([] if finding is None else [finding])]
-        self.lines.clear()
-        return "\n".join(lines) or None
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
         found: dict[str, Tensor | None] = {}
