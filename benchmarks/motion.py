@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from dyngs.api.train import train
-from dyngs.config import Config, PointsInit, RandomInit, StaticModel, TrajectoryField
+from dyngs.config import Config, PointsInit, RandomInit, StaticModel
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
 from dyngs.data.loader import ImageLoader
@@ -36,10 +36,9 @@ from dyngs.data.synthetic.raytrace import Scene as TrueScene
 from dyngs.data.synthetic.scenes import SceneName, scene_at
 from dyngs.data.times import evenly_spaced
 from dyngs.data.tracks import read_true_tracks
-from dyngs.deform.field import FieldSetup, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
-from dyngs.deform.trajectory import Trajectory
 from dyngs.evaluate.regions import Regions
 from dyngs.evaluate.report import evaluate_run, split_views
 from dyngs.evaluate.tracks import TrackScores, track_scores
@@ -47,13 +46,15 @@ from dyngs.evaluate.view_scores import score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.metrics import Lpips
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.state import Role
 from dyngs.static.training import StaticTraining
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
@@ -65,7 +66,8 @@ DRAWN, LOOKS = 20_000, 16
 """Points that are drawn per thing, of which those that one of so many training views sees are kept."""
 GONE = -30.0
 """Logit opacity by which what does not exist is dimmed."""
-COLOURS = TrajectoryField(polynomial=3, fourier=2, move_rotations=False, move_scales=False, move_colors=True)
+POWERS, FREQUENCIES = 3, 2
+"""Of time, in the base colours that are learned."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class Motion:
         return torch.tensor([w, x, y, z], dtype=torch.float32, device="cpu")
 
 
-class TrueMotion(Trajectory):
+class TrueMotion(DeformationField):
     """The motion of a synthetic scene as a field of which only the base colours over time are learned.
 
     Args:
@@ -106,17 +108,18 @@ class TrueMotion(Trajectory):
     """
 
     def __init__(self, name: SceneName, labels: Tensor, setup: FieldSetup) -> None:
-        super().__init__(COLOURS, setup, torch.Generator())
+        self.setup, terms = setup, POWERS + 2 * FREQUENCIES
+        start = {"colors": torch.zeros(setup.num_moving, terms, 3, device="cpu")}
+        self.parameters = Parameters(start, {"colors": 1e-3}, 0.01, Role.PER_MOVING)
         self.labels, self.rest = labels, scene_at(name, REST).primitives
         self.primitives_at = cache(lambda time: scene_at(name, time).primitives)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """See ``DeformationField.offsets``; differentiable in ``means``, as rotations turn what they learn."""
-        colors, labels, means = (
-            super().offsets(means, time, rows).colors,
-            chosen(self.labels, rows),
-            chosen(means, rows),
-        )
+        x, turns = 2 * time - 1, [2 * np.pi * k * time for k in range(1, FREQUENCIES + 1)]
+        terms = [x**k for k in range(1, POWERS + 1)] + [f(angle) for angle in turns for f in (np.sin, np.cos)]
+        colors = torch.einsum("b,mbd->md", means.new_tensor(terms), chosen(self.parameters["colors"], rows))
+        labels, means = chosen(self.labels, rows), chosen(means, rows)
         moved, quats = means.clone(), means.new_tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
         scales, opacities = means.new_zeros(len(means), 3), means.new_zeros(len(means))
         now = self.primitives_at(time)
@@ -135,8 +138,7 @@ class TrueMotion(Trajectory):
         return Offsets(moved - means, quats - quats.new_tensor([1.0, 0, 0, 0]), scales, opacities, colors)
 
     def edited(self, edit: TopologyEdit) -> TrueMotion:
-        field = super().edited(edit)
-        assert isinstance(field, TrueMotion)
+        field = self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
         field.labels = self.labels[edit.source]
         return field
 
@@ -161,7 +163,7 @@ class OracleTraining(StaticTraining):
         super().__init__(FilterUpdate())
         self._rates = Rates(steps)
 
-    def optimize(self, scene: Scene, step: int) -> int:
+    def optimize(self, scene: GaussianScene, step: int) -> int:
         assert isinstance(scene, DynamicScene)
         assert scene.field is not None
         return scene.field.parameters.step(step, self._rates.progress(step))
@@ -239,7 +241,7 @@ class Row:
         return f"| {scene} | {model} | {' | '.join(shown)} | {self.gaussians or ''} |"
 
 
-def measured(scene: Scene, config: Config) -> Row:
+def measured(scene: GaussianScene, config: Config) -> Row:
     """Return the scores of a scene in memory on the test split."""
     capture = read_capture(config.data)
     views = split_views(capture, "test")

@@ -70,7 +70,6 @@ MUTATIONS = (
     ("deform/motion.py", "2 * longest *", "longest *", "deform/test_motion.py"),
     ("deform/time_window.py", "oldest <= stray <= self.reach(step)", "oldest < stray <= self.reach(step)", "deform/test_time_window.py"),
     ("deform/time_window.py", "step % 2 == 0", "step % 2 == 1", "deform/test_time_window.py"),
-    ("deform/trajectory.py", "k * time) / k, math.cos", "k * time), math.cos", "deform/test_trajectory.py"),
     ("deform/still_error.py", "USUAL = 0.7", "USUAL = 0.3", "deform/test_still_error.py"),
     ("deform/still_error.py", "gap = gap - gap.flatten(1)", "gap = gap - 0 * gap.flatten(1)", "deform/test_still_error.py"),
     ("deform/scene.py", "rows = torch.nonzero(descent >= 0)", "rows = torch.nonzero(descent > 0)", "deform/test_scene.py"),

@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     from dyngs.errors import DyngsError
     from dyngs.gaussians import Gaussians
     from dyngs.gaussians.rendering import RenderOptions, contributions, render
-    from dyngs.gaussians.scene import Scene
+    from dyngs.gaussians.scene import GaussianScene
     from dyngs.models.renderable import Rendering
 
 __version__ = "0.1.0"
 __all__ = [
     "Cameras",
     "DyngsError",
+    "GaussianScene",
     "Gaussians",
     "RenderOptions",
     "Rendering",
-    "Scene",
     "contributions",
     "load",
     "load_config",
@@ -41,10 +41,10 @@ __all__ = [
 _HOMES = {
     "Cameras": "dyngs.camera",
     "DyngsError": "dyngs.errors",
+    "GaussianScene": "dyngs.gaussians.scene",
     "Gaussians": "dyngs.gaussians",
     "RenderOptions": "dyngs.gaussians.rendering",
     "Rendering": "dyngs.gaussians.rendering",
-    "Scene": "dyngs.gaussians.scene",
     "contributions": "dyngs.gaussians.rendering",
     "load": "dyngs.api.load",
     "load_config": "dyngs.config.io",

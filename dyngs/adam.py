@@ -16,11 +16,7 @@ MOMENTS = "exp_avg", "exp_avg_sq"
 
 
 class AdamState:
-    """First and second moments of named tensors.
-
-    Attributes:
-        exp_avg, exp_avg_sq: name to moment, of the shape of the tensor.
-    """
+    """First and second moments of named tensors."""
 
     def __init__(self, exp_avg: dict[str, Tensor], exp_avg_sq: dict[str, Tensor]) -> None:
         self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
@@ -33,12 +29,7 @@ class AdamState:
 
     @staticmethod
     def restored(stored: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> AdamState:
-        """Return the moments of ``tensors`` from what ``state`` returned.
-
-        Raises:
-            KeyError: a moment is missing.
-            ValueError: one is not like its tensor, or not finite.
-        """
+        """Return the moments of ``tensors`` from what ``state`` returned."""
         first, second = (
             {
                 name: require_tensor(f"{part}.{name}", stored[f"{part}.{name}"], tuple(x.shape), x.dtype)
@@ -58,11 +49,8 @@ class AdamState:
         Rows whose gradient is not finite are left out.
 
         Args:
-            name: of the tensor.
             x: (N, ...) with a gradient; nothing is done without one.
-            lr: one rate, or one per value of a row.
             step: number of this update, from 1, for the bias correction.
-            eps: added to the root of the second moment.
             rows: (N,) bool, the rows to update; None: all.
         """
         if x.grad is None:
@@ -89,12 +77,10 @@ class AdamState:
         return AdamState(first, second)
 
     def state(self) -> State:
-        """Return ``exp_avg.NAME`` and ``exp_avg_sq.NAME``."""
         parts = zip(MOMENTS, (self.exp_avg, self.exp_avg_sq), strict=True)
         return {k: x for part, moments in parts for k, x in prefixed(part, with_role(moments, Role.TRAINING)).items()}
 
     def to(self, device: torch.device | str) -> AdamState:
-        """Return the moments on ``device``."""
         return AdamState(moved_to(self.exp_avg, device), moved_to(self.exp_avg_sq, device))
 
 

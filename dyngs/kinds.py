@@ -1,4 +1,4 @@
-"""The kinds of model, and trainers and scenes of them. A new kind is one line here."""
+"""Trainers and scenes of every kind of model."""
 
 from __future__ import annotations
 
@@ -16,19 +16,15 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.kind import KIND as DYNAMIC
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians.init import surroundings
-from dyngs.gaussians.model import GaussianModel, gaussian_model
-from dyngs.gaussians.scene import Scene, require_gaussians
-from dyngs.human.avatar.kind import KIND as HUMAN
+from dyngs.gaussians.model import GaussianModel
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
-from dyngs.models.kind import Kind, Setting
-from dyngs.models.model import Model
+from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import (
     IMAGES,
-    AlphaWeight,
     background_colour,
     measured_alpha_weight,
     resolved_background,
@@ -36,56 +32,28 @@ from dyngs.models.views import (
     training_times,
 )
 from dyngs.ops.device import device_for
-from dyngs.static.training import KIND as STATIC
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import exposures_of
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
-from dyngs.training.prediction import KIND as HUMAN_PREDICTOR
+from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.trainer import Trainer
 
-KINDS: tuple[Kind[Any], ...] = (STATIC, DYNAMIC, HUMAN, HUMAN_PREDICTOR)
-"""All kinds, one for each section that ``Config.model`` may be."""
-
-
-GaussianTrainer = Trainer[GaussianModel]
-"""The trainer of a scene of Gaussians."""
-
-
-def kind_of(model: ModelSection) -> Kind[Any]:
-    """Return the kind of a section of the configuration."""
-    return next(kind for kind in KINDS if type(model) is kind.section)
+GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
 
 def build(config: Config, capture: Capture | None = None, *, restored: bool = False) -> Trainable:
     """Return what the loop steps; see ``assemble`` for arguments and errors."""
-    trainer = kind_of(config.model).trainer
-    return assemble_any(config, capture, restored=restored) if trainer is None else trainer(config)
+    if config.model.is_network:
+        return kind_of(config.model).trainer(config)
+    return assemble(config, capture, restored=restored)
 
 
 def assemble(
-    config: Config,
-    capture: Capture | None = None,
-    *,
-    restored: bool = False,
-    images: ImageLoader | None = None,
-    held_out: frozenset[int] = frozenset(),
-) -> GaussianTrainer:
-    """Return the trainer of a scene of Gaussians; see ``assemble_any``.
-
-    Raises:
-        DyngsError: the model is made of something else, too.
-    """
-    trainer = assemble_any(config, capture, restored=restored, images=images, held_out=held_out)
-    gaussian_model(trainer.model, f"model.kind={config.model.kind}")
-    return trainer
-
-
-def assemble_any(
     config: Config,
     capture: Capture | None = None,
     *,
@@ -96,14 +64,10 @@ def assemble_any(
     """Return the trainer of a scene: its model begun, nothing trained.
 
     Args:
-        config: of a run.
         capture: as ``prepared`` returned it; None: it is read now.
         restored: a checkpoint will be, so that it does not matter where the model begins: no points are triangulated.
         images: the training images of another trainer of the same ones; None: they are opened.
         held_out: indices of training views that are never trained on.
-
-    Raises:
-        DyngsError: a capture that cannot be read, a budget that is too small.
     """
     if capture is None:
         capture = read_capture(config.data) if restored else prepared(config)
@@ -111,17 +75,24 @@ def assemble_any(
     if config.model.made_of_gaussians:
         config = within_cap(config, len(set(training_times(capture))))
     generator = torch.Generator().manual_seed(config.run.seed)
-    views = capture.splits["train"]
     if images is None:
-        images = ImageLoader(views, config.data, with_maps=True, decoding_threads=usual_threads())
+        images = ImageLoader(capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads())
     priors = _priors(config, capture, images)
     if not priors.masks:
         images = images.without_motion_masks()
     background, extent = resolved_background(config, capture), surroundings(capture).extent
-    model: Model[Any] = kind_of(config.model).start(
-        Setting(config, asked, capture, images, background, extent, generator)
-    )
+    model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator))
     refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
+    robust, exposures = _robust(config, capture, images), exposures_of(config.train, images)
+    alpha_weight, findings = _alpha_weight(config, capture, images)
+    losses = [
+        ImageLoss(config.train.ssim_weight),
+        SilhouetteLoss(alpha_weight, masked=robust is not None),
+        PenaltyLoss(),
+        *([] if exposures is None else [exposures]),
+        priors,
+        RegularizerLoss(),
+    ]
     trainer = Trainer(
         config=config,
         model=model,
@@ -130,12 +101,12 @@ def assemble_any(
         sampler=ViewSampler(len(images)),
         background=background,
         extent=extent,
-        alpha=_alpha_weight(config, capture, images),
+        losses=losses,
         generator=generator,
         held_out=held_out,
-        priors=priors,
-        robust=_robust(config, capture, images),
-        exposures=exposures_of(config.train, images),
+        findings=[*([] if restored else findings), *priors.lines],
+        robust=robust,
+        exposures=exposures,
         refinement=refinement,
     )
     trainer.place(device_for(config.run.device))
@@ -155,12 +126,8 @@ def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
             raise DyngsError(f"{checkpoint.name} lacks {missing}; an earlier version wrote it: train anew") from None
 
 
-def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> Scene:
-    """Return the scene of a checkpoint of ``model``; see ``restored_model``.
-
-    Raises:
-        DyngsError: it is made of something else than Gaussians, too.
-    """
+def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
+    """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
     return require_gaussians(restored_model(checkpoint, model), checkpoint.name)
 
 
@@ -168,21 +135,12 @@ def prepared(config: Config) -> Capture:
     """Return the capture of a run with the points that its scene begins with, see ``with_first_points``.
 
     What is suspicious about the capture, and where the points are from, is printed to stderr.
-
-    Raises:
-        DyngsError: it cannot be read.
     """
     return with_points(read_capture(config.data), config)
 
 
 def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
-    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others need none.
-
-    Args:
-        capture: as it was read.
-        config: of a run.
-        quiet: nothing is printed.
-    """
+    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others need none."""
     lines: list[str] = []
     if config.model.begins_with_points:
         init = config.init
@@ -221,13 +179,13 @@ def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefin
     return refinement
 
 
-def _alpha_weight(config: Config, capture: Capture, images: ImageLoader) -> AlphaWeight:
+def _alpha_weight(config: Config, capture: Capture, images: ImageLoader) -> tuple[float, list[str]]:
     """Return how much silhouettes count: what is requested, or what moving things before this background need."""
     requested, background = config.train.alpha_weight, resolved_background(config, capture)
     if requested is not None:
-        return AlphaWeight(requested)
+        return requested, []
     moves = config.model.may_move and len(set(training_times(capture))) > 1
     if not moves or not capture.has_alpha or background == "random":
-        return AlphaWeight()
+        return 0.0, []
     shown = (images[i] for i in evenly_spaced(len(images), IMAGES))
     return measured_alpha_weight(shown, background_colour(background))

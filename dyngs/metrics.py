@@ -104,13 +104,7 @@ def masked(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
 
 @dataclass(frozen=True)
 class Lpips:
-    """LPIPS with one backbone, or the reason why it cannot be had here.
-
-    Attributes:
-        net: backbone.
-        reason: one line where ``distance`` is None.
-        distance: maps two images (1, 3, H, W) in [-1, 1] to the distance, or None.
-    """
+    """LPIPS with one backbone, or the reason why it cannot be had here."""
 
     net: LpipsNet
     reason: str | None = None

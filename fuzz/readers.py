@@ -30,7 +30,7 @@ from fuzz.seeds import (
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.gaussians.rendering import Rendering
-    from dyngs.gaussians.scene import Scene
+    from dyngs.gaussians.scene import GaussianScene
     from dyngs.human.template.body import BodyTemplate
 
 Read = Callable[[Path], object]
@@ -325,7 +325,7 @@ def drawn(gaussians: object, options: object) -> Rendering:
     return render(gaussians, camera(8, 6), options)  # type: ignore[arg-type]
 
 
-def played(scene: Scene, options: object) -> object:
+def played(scene: GaussianScene, options: object) -> object:
     """Render a scene at two times."""
     from moving_scene import camera
 
@@ -356,9 +356,7 @@ CAPTURES: dict[str, dict[str, Seed]] = {
 _NEEDS = {"people_snapshot": "h5py"}
 # USD is read in a process of its own, too slow for thousands of inputs.
 _PACKED = ("compressed-ply", "spz", "splat", "sog", "glb")
-_RUNS: dict[str, Seed] = {
-    kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes", "trajectory")
-}
+_RUNS: dict[str, Seed] = {kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes")}
 _JOINTS: dict[str, Seed] = {
     "npz": files.write_joints_npz,
     "json": files.write_joints_json,

@@ -21,7 +21,7 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.files.tensor_file import write_tensors
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.kinds import restored_scene
@@ -249,7 +249,7 @@ def write_scene_file_still(root: Path) -> None:
 
 def write_scene_file_moving(root: Path) -> None:
     """The same of a scene that moves, with steps."""
-    config, tensors = _moving("trajectory")
+    config, tensors = _moving("control_nodes")
     save_config(config, root / RESOLVED_NAME)
     steps = {f"gaussians.{name}": 0.01 for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")}
     (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(tensors, config.model), steps))
@@ -364,7 +364,7 @@ def _gaussians() -> dict[str, torch.Tensor]:
     return {f"gaussians.{name}": x.contiguous() for name, x in row_of_balls().tensors().items()}
 
 
-def _scene(tensors: dict[str, torch.Tensor], model: SceneModel) -> Scene:
+def _scene(tensors: dict[str, torch.Tensor], model: SceneModel) -> GaussianScene:
     return restored_scene(Checkpoint(_INFO, tensors), model)
 
 

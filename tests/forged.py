@@ -17,7 +17,7 @@ from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import prefixed, tensors_of
 from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, _Header, _Info, _stored, compressed
@@ -111,7 +111,7 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
     return body + hashlib.sha256(body).digest()
 
 
-def require_drawable(scene: Scene) -> None:
+def require_drawable(scene: GaussianScene) -> None:
     """Nothing, if the images of a scene are finite; raises what drawing it raises."""
     for time in (None, 0.0, 0.37, 1.0):
         for options in (RenderOptions(), RenderOptions(near=0.01, depth="expected")):
@@ -136,7 +136,7 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         colours = NetworkTraining(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
         state |= tensors_of(prefixed("colour", colours.network.state() | colours.state()))
     elif kind != "static":
-        field = "trajectory" if kind == "masked" else kind
+        field = "control_nodes" if kind == "masked" else kind
         model = DynamicModel(deform=tiny_options(field))
         state |= tensors_of(prefixed("field", field_state(stirred_field(field, len(_ROWS)))))
         state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}

@@ -10,16 +10,17 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, DynamicModel, StaticModel, TrainConfig, TrajectoryField
+from dyngs.config import Config, ControlNodesField, DataConfig, DynamicModel, StaticModel, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
-from dyngs.deform.field import DeformationField, FieldSetup, NetworkField, Offsets, chosen
-from dyngs.deform.fields import field_state, new_field
+from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
+from dyngs.deform.fields import field_state
 from dyngs.deform.scene import DynamicScene
-from dyngs.gaussians import Gaussians
+from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.state import tensors_of
+from dyngs.state import Role, tensors_of
 from dyngs.static.scene import StaticScene
 
 MOVING_ROWS = (1, 3)
@@ -31,7 +32,7 @@ SETUP = FieldSetup(torch.zeros(3), torch.ones(3), len(TRAIN_TIMES), len(MOVING_R
 
 
 @dataclass
-class Sliding(NetworkField):
+class Sliding(DeformationField):
     """Everything goes ``speed`` along x from time 0 to 1; counts how often it is asked."""
 
     speed: float = 1.0
@@ -56,12 +57,40 @@ class Blinking(Sliding):
         return Offsets(torch.zeros(len(means), 3), colors=torch.full((len(means), 3), self.speed * odd))
 
 
+class Lines(DeformationField):
+    """Each of M Gaussians goes along a line of its own, from -x at time 0 to x at time 1; what is learned is x."""
+
+    def __init__(self, setup: FieldSetup = SETUP) -> None:
+        self.setup = setup
+        start = {"means": torch.zeros(setup.num_moving, 1, 3)}
+        self.parameters = Parameters(start, {"means": 1.6e-4 * setup.extent}, 0.01, Role.PER_MOVING)
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        return Offsets((2 * time - 1) * chosen(self.parameters["means"], rows)[:, 0])
+
+    def edited(self, edit: TopologyEdit) -> Lines:
+        return self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+
+
 def row_of_balls(count: int = 5) -> Gaussians:
     """Grey balls side by side along x from -1 to 1."""
     means = torch.zeros(count, 3)
     means[:, 0] = torch.linspace(-1, 1, count)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
     return Gaussians(means, quats, torch.full((count, 3), -1.6), torch.full((count,), 3.0), torch.zeros(count, 1, 3))
+
+
+SLIDING = ControlNodesField(nodes=2, pieces=1, move_rotations=False, move_scales=False)
+
+
+def sliding_nodes() -> ControlNodes:
+    """Two of the balls go 1 along x over time, and are where they are at its middle."""
+    points = torch.zeros(2, 4, 3)
+    points[..., 0] = torch.arange(4) - 1.5  # the spline of these is t - 0.5
+    moved = row_of_balls().means[list(MOVING_ROWS)]
+    field = ControlNodes(SLIDING, SETUP, torch.Generator()).started(moved, {"means": points})
+    field.nodes_for(moved)
+    return field
 
 
 def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> StaticScene:
@@ -108,16 +137,13 @@ def write_moving_run(
 ) -> Path:
     """A run with a capture beside it: of five balls the second and fourth go 1 along x over time, if ``moves``."""
     root = write_timed_capture(folder / "capture", standing=standing)
-    options = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
-    model = DynamicModel(deform=options) if moves else StaticModel()
+    model = DynamicModel(deform=SLIDING) if moves else StaticModel()
     config = Config(data=DataConfig.model_validate({"root": root}), model=model, train=TrainConfig(steps=7))
     save_config(config, folder / "run" / RESOLVED_NAME)
     gaussians = row_of_balls()
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}
     if moves:
-        motion = new_field(options, SETUP, torch.Generator())
-        motion.parameters["means"].data[:, 0, 0] = 0.5  # times 2 t - 1
-        tensors |= {f"model.field.{name}": x for name, x in tensors_of(field_state(motion)).items()}
+        tensors |= {f"model.field.{name}": x for name, x in tensors_of(field_state(sliding_nodes())).items()}
         tensors["model.rows"] = torch.tensor(MOVING_ROWS)
         tensors["model.times"] = torch.tensor(TRAIN_TIMES, dtype=torch.float64)
     info = CheckpointInfo(7, 1.0, offset, "white", "classic")

@@ -12,7 +12,7 @@ from dyngs.config import DynamicModel, HumanModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import texel_gaussians
@@ -34,7 +34,7 @@ SEEN_AT = (0.0, 0.5, 1.0)
 PERSON = HumanModel(sh_degree=0)
 
 
-def scene_of_kind(kind: str) -> Scene:
+def scene_of_kind(kind: str) -> GaussianScene:
     """Nine Gaussians with a 3D filter, of which four may move, or a person; ``masked`` is a hexplane with masks."""
     std = 0.01 + torch.arange(9.0) / 100
     if kind == "static":
@@ -51,7 +51,7 @@ def scene_of_kind(kind: str) -> Scene:
     )
 
 
-def restored(kind: str, state: State) -> Scene:
+def restored(kind: str, state: State) -> GaussianScene:
     """The scene of what is stored, but for its colours."""
     tensors = {name: x.clone() for name, x in tensors_of(state).items()}
     gaussians, own = Gaussians.stored(part_of(tensors, "gaussians")), part_of(tensors, "model")

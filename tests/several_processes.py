@@ -126,8 +126,6 @@ def summed() -> int:
         assert somewhere.grad is not None
         assert somewhere.grad.tolist() == [1.0, 2.0, 3.0]
         assert nowhere.grad is None
-        assert processes.agreed(rank == 0)
-        assert not processes.agreed(rank != 0)
         processes.require_same({"x": values}, "after step 7")
         processes.require_same({"x": torch.tensor([float(rank == 1)])}, "after step 8")
     return 0

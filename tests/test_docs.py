@@ -73,10 +73,7 @@ KINDS = (
     ("colour.kind=network",),
     ("strategy.kind=mcmc",),
     ("init.kind=random",),
-    *(
-        ("model.kind=dynamic", f"model.deform.kind={kind}")
-        for kind in ("mlp", "hexplane", "trajectory", "control_nodes")
-    ),
+    *(("model.kind=dynamic", f"model.deform.kind={kind}") for kind in ("mlp", "hexplane", "control_nodes")),
 )
 PRESETS = ("static", "dynamic", "human", "human_predictor")
 PLACEHOLDER = re.compile(r"[A-Z]|\.\.\.|start:stop:step|value|X,Y")

@@ -19,14 +19,13 @@ from dyngs.config import (
     RandomInit,
     RunConfig,
     TrainConfig,
-    TrajectoryField,
 )
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians
 
-KINDS = ("hexplane", "mlp", "control_nodes", "trajectory")
+KINDS = ("hexplane", "mlp", "control_nodes")
 HEADS = ("move_rotations", "move_scales", "move_opacities", "move_colors")
 TIMES = (0.0, 0.37, 1.0)
 
@@ -36,8 +35,6 @@ def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
     heads = dict.fromkeys(HEADS, everything)
     if kind == "hexplane":
         return HexplaneField(channels=3, resolution=5, levels=(1, 2), width=8, **heads)
-    if kind == "trajectory":
-        return TrajectoryField(polynomial=2, fourier=1, **heads)
     if kind == "control_nodes":
         return ControlNodesField(nodes=5, pieces=3, **heads)
     return MlpField(depth=2, width=8, **heads)
@@ -94,10 +91,9 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         "hexplane": {"lr_planes": 1e-1, "lr_decoder": 5e-2},
         "mlp": {"lr": 1e-2},
         "control_nodes": {"lr_means": 1e-2},
-        "trajectory": {"lr_means": 1e-2},
     }
     field = tiny_options(kind).model_copy(update=rates[kind])
-    freeze_below_px = 1.5 if kind in ("control_nodes", "trajectory") else 0.3
+    freeze_below_px = 1.5 if kind == "control_nodes" else 0.3
     phases = {
         "motion_from": 8 / 24,
         "time_window": 0.4,

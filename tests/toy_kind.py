@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, Union
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from dyngs import kinds
 from dyngs.adam import AdamState
 from dyngs.camera import Cameras
-from dyngs.config import Config, DynamicModel, HumanModel, HumanPredictorModel, ModelSection, StaticModel
+from dyngs.config import Config, ModelSection
 from dyngs.data.loader import Image
+from dyngs.models import kind as kinds
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Kind, Setting
+from dyngs.models.kind import Kind, RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
 from dyngs.models.views import background_colour
@@ -94,11 +94,11 @@ class ToyScene(Renderable):
 class Toy(Model[ToyScene]):
     """A grid in training."""
 
-    def __init__(self, setting: Setting, model: ToyModel) -> None:
-        noise = 0.1 * torch.randn(1, 4, CELLS, CELLS, CELLS, generator=setting.generator)
+    def __init__(self, run: RunStart, model: ToyModel) -> None:
+        noise = 0.1 * torch.randn(1, 4, CELLS, CELLS, CELLS, generator=run.generator)
         self._grid, self._lr = (noise - torch.tensor([0.0, 0, 0, 2]).view(1, 4, 1, 1, 1)).requires_grad_(), model.lr
         self._adam = AdamState.zero({"grid": self._grid})
-        self._background = background_colour(setting.background)
+        self._background = background_colour(run.background)
 
     @property
     def scene(self) -> ToyScene:
@@ -133,25 +133,22 @@ def stored_grid(checkpoint: Checkpoint) -> Tensor:
     return require_tensor("grid", checkpoint.tensors["model.grid"], (1, 4, CELLS, CELLS, CELLS))
 
 
-def start(setting: Setting) -> Toy:
-    model = setting.config.model
+def start(run: RunStart) -> Toy:
+    model = run.config.model
     assert isinstance(model, ToyModel)
-    return Toy(setting, model)
+    return Toy(run, model)
 
 
 def restore(model: ToyModel, checkpoint: Checkpoint) -> ToyScene:
     return ToyScene(stored_grid(checkpoint), background=background_colour(checkpoint.info.background))
 
 
-TOY = Kind(ToyModel, start, restore)
-
-
 @contextmanager
 def registered() -> Iterator[None]:
-    """Let ``model.kind=toy`` be a kind: one line where sections are listed, one where kinds are."""
+    """Let ``model.kind=toy`` be a kind: one line more in the tuple of kinds, of which ``Config`` is made again."""
     info, before, known = Config.model_fields["model"], Config.model_fields["model"].annotation, kinds.KINDS
-    info.annotation = StaticModel | DynamicModel | HumanModel | HumanPredictorModel | ToyModel  # type: ignore[assignment]
-    kinds.KINDS = (*known, TOY)
+    kinds.KINDS = (*known, Kind(ToyModel, __name__))
+    info.annotation = Union[tuple(kind.section for kind in kinds.KINDS)]  # type: ignore[assignment]  # noqa: UP007
     Config.model_rebuild(force=True)
     try:
         yield

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from moving_scene import Sliding, camera, moving_scene
 
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened, opened_scene
 from dyngs.view.cameras import pose_of
 from dyngs.view.captured_views import Viewpoint
 from dyngs.view.session import Eye, Sent, Session
 
 
-def opened_at(scene: Scene, name: str = "balls") -> Opened:
+def opened_at(scene: GaussianScene, name: str = "balls") -> Opened:
     """A scene on white, looked at from 4 away."""
     opened = replace(opened_scene(replace(scene, background=torch.ones(3)), Path(name)), stated_up="-y")
     opened.once("viewpoint", lambda: Viewpoint(camera(), np.zeros(3), 4.0, np.array([0.0, -1, 0])))

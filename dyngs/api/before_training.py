@@ -14,16 +14,7 @@ from dyngs.human.fit.fitted_capture import with_fitted_body
 def with_capture(
     config: Config, *, say: Callable[[str], None] = print, report: ReportProgress = report_nothing
 ) -> Config:
-    """Return the configuration with a capture that can be trained on; what is found for it is kept for other runs.
-
-    Args:
-        config: of a run that has not begun.
-        say: is given lines about what is done.
-        report: is given how far that has come.
-
-    Raises:
-        DyngsError: poses that cannot be found, or a person without body parameters and silhouettes.
-    """
+    """Return the configuration with a capture that can be trained on; what is found for it is kept for other runs."""
     data, model = config.data, config.model
     if model.is_network:
         return config  # its folder holds a capture per person

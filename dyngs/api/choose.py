@@ -29,7 +29,6 @@ from dyngs.config import (
     StaticModel,
     TrainConfig,
 )
-from dyngs.config.keys.section import Section
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.images import target_size
 from dyngs.data.loader import ImageLoader
@@ -41,21 +40,17 @@ from dyngs.kinds import GaussianTrainer, assemble, with_points
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
+from dyngs.section import Section
 from dyngs.training.interrupt import Interrupts
 
-SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000
-"""Of small runs: longest side of the images, px, and most Gaussians."""
-STEPS, FEWEST_STEPS = 2000, 1000
-"""Most steps of a small run; with fewer than the latter it says nothing."""
-SPENT = 0.1
-"""Most of a run's work that small runs may take."""
-STEP_COST, GAUSSIAN_COST = 20_000, 2
-"""Work of a step beside its images, and of a Gaussian in it, in pixels."""
+SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000  # Of small runs: longest side of the images, px, and most Gaussians
+STEPS, FEWEST_STEPS = 2000, 1000  # Most steps of a small run; with fewer than the latter it says nothing
+SPENT = 0.1  # Most of a run's work that small runs may take
+STEP_COST, GAUSSIAN_COST = 20_000, 2  # Work of a step beside its images, and of a Gaussian in it, in pixels
 FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
-LEAST_GAIN = 0.05
-"""Mean gain, dB, up to which two settings tie."""
+LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
 MIN_DIFFERING = 0.001
 """Fraction of the pixels of fixed cameras that differ from their median from which something moves."""
 LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
@@ -63,14 +58,8 @@ LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
 
 
 @dataclass(frozen=True)
-class Setting:
-    """A setting that small runs decide about.
-
-    Attributes:
-        text: keys and values, as on the command line.
-        applied: returns a configuration with it; None where it means nothing.
-        score: compares two models on a view.
-    """
+class OpenSetting:
+    """A setting that small runs decide about."""
 
     text: str
     applied: Callable[[Config], Config | None]
@@ -79,26 +68,17 @@ class Setting:
 
 @dataclass(frozen=True)
 class Choice:
-    """What small runs said about a setting.
-
-    Attributes:
-        setting: keys and values.
-        views: number of views compared.
-        without, gain: mean PSNR without it, and mean gain by it, dB.
-        error: standard error of the gain, dB.
-        steps: of each small run.
-        seconds: that it took.
-        taken: whether the setting is used.
-    """
+    """What small runs said about a setting."""
 
     setting: str
     views: int
+    # without, gain: mean PSNR without it, and mean gain by it, dB
     without: float
     gain: float
-    error: float
+    error: float  # standard error of the gain, dB
     steps: int
     seconds: float
-    taken: bool
+    taken: bool  # whether the setting is used
 
     def __str__(self) -> str:
         return (
@@ -111,10 +91,6 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     """Return ``config`` with all decided that was not requested, and what small runs said; lines say so, too.
 
     The capture is returned with the points that the scene begins with.
-
-    Args:
-        config: as requested.
-        capture: as it was read.
 
     Raises:
         DyngsError: images that cannot be read, or a capture without times for a scene that is to move.
@@ -129,7 +105,7 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
             best = _with(best, "model", choose=False)
             if moves is None:
                 base, moving = _at_rest(plain_config), best
-                settings.insert(0, Setting("model.kind=dynamic", lambda _: moving))
+                settings.insert(0, OpenSetting("model.kind=dynamic", lambda _: moving))
             else:
                 base = best = best if moves else as_static(plain_config)
         case _ if settings:
@@ -153,7 +129,9 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     return found, choices, prepared
 
 
-def _decided(config: Config, settings: Sequence[Setting], plan: _Plan, capture: Capture) -> tuple[Config, list[Choice]]:
+def _decided(
+    config: Config, settings: Sequence[OpenSetting], plan: _Plan, capture: Capture
+) -> tuple[Config, list[Choice]]:
     """Return ``config`` with the settings that win, each tried on top of those before it, and all figures."""
     print(f"small runs of {counted(plan.steps, 'step')}, compared on training views that are held out:", flush=True)
     runs, found = plan.trained(config, capture), list[Choice]()
@@ -202,7 +180,6 @@ def as_static(config: Config) -> Config:
 
 
 def _at_rest(config: Config) -> Config:
-    """Return ``config`` with nothing that moves, and all else as it is."""
     shared = {key: getattr(config.model, key) for key in StaticModel.model_fields if key != "kind"}
     return config.model_copy(update={"model": StaticModel.model_validate(shared)})
 
@@ -218,19 +195,12 @@ def _requested(given: Section, usual: Section) -> Section:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Small runs that keep within their part of a run's work.
+    """Small runs that keep within their part of a run's work."""
 
-    Attributes:
-        folds: sets of the training views held out; small runs are made once for each.
-        steps: of each.
-        runs: number of configurations that can be tried.
-        first_side: longest side of the images that the run itself begins with, px; small runs begin with no less.
-    """
-
-    folds: Sequence[frozenset[int]]
+    folds: Sequence[frozenset[int]]  # sets of the training views held out; small runs are made once for each
     steps: int
-    runs: int
-    first_side: float
+    runs: int  # number of configurations that can be tried
+    first_side: float  # longest side of the images that the run itself begins with, px; small runs begin with no less
 
     @staticmethod
     def of(config: Config, capture: Capture, num_settings: int) -> _Plan:
@@ -264,7 +234,6 @@ def _trained(config: Config, capture: Capture, held_out: frozenset[int]) -> Gaus
 
 
 def _work_of_step(config: Config, view: View) -> float:
-    """Return the mean work of a step, in pixels."""
     width, height = target_size(view.width, view.height, config.data.downscale, config.data.longest_side)
     times = range(0, config.train.steps, max(1, config.train.steps // 50))
     drawn = fmean(image_divisor(config.train, step) ** -2 for step in times)
@@ -307,27 +276,28 @@ def _held_out(views: Sequence[View]) -> list[frozenset[int]]:
     return [frozenset(order[every // 2 :: every])]
 
 
-def _settings(config: Config) -> list[Setting]:
+def _settings(config: Config) -> list[OpenSetting]:
     """Return what is open in ``config``, by what it was worth in the past, the most first."""
-    model, found = config.model, list[Setting]()
+    model, found = config.model, list[OpenSetting]()
     if not isinstance(model, (StaticModel, DynamicModel)):
         return found
     if config.camera.refine == "auto":
-        found.append(Setting("camera.refine=always", lambda c: _with(c, "camera", refine="always"), after_pose_fit))
+        found.append(OpenSetting("camera.refine=always", lambda c: _with(c, "camera", refine="always"), after_pose_fit))
     if config.train.exposure == "auto":
-        found.append(Setting("train.exposure=always", lambda c: _with(c, "train", exposure="always"), after_colour_fit))
+        found.append(
+            OpenSetting("train.exposure=always", lambda c: _with(c, "train", exposure="always"), after_colour_fit)
+        )
     if config.train.robust == "auto":
-        found.append(Setting("train.robust=always", _robust, explained))
+        found.append(OpenSetting("train.robust=always", _robust, explained))
     if isinstance(model, DynamicModel) and model.choose:
         if config.colour == ShColour() and not config.colour.model_fields_set:
-            found.append(Setting("colour.kind=network", _network))
+            found.append(OpenSetting("colour.kind=network", _network))
         if "move_opacities" not in model.deform.model_fields_set:
-            found.append(Setting("model.deform.move_opacities=true", _moving_opacities))
+            found.append(OpenSetting("model.deform.move_opacities=true", _moving_opacities))
     return found
 
 
 def _without_auto(config: Config) -> Config:
-    """Return ``config`` with all that small runs may decide left out."""
     if not isinstance(config.model, (StaticModel, DynamicModel)):
         return config
     for section, name in (("camera", "refine"), ("train", "exposure"), ("train", "robust")):
@@ -354,7 +324,6 @@ def _moving_opacities(config: Config) -> Config | None:
 
 
 def _with(config: Config, section: str, **values: object) -> Config:
-    """Return ``config`` with other ``values`` in a section."""
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 

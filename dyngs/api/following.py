@@ -42,13 +42,7 @@ class Order(IntEnum):
 
 
 class Leader:
-    """The first process of a run: a listener, and what is to be called before each step of the loop.
-
-    Args:
-        processes: of the run.
-        config: that the trainer was built of.
-        threads: of the kernels in each process.
-    """
+    """The first process of a run: a listener, and what is to be called before each step of the loop."""
 
     def __init__(self, processes: Processes, config: Config, threads: int) -> None:
         self.processes, self._trainer, self._is_stale = processes, None, True
@@ -74,12 +68,7 @@ class Leader:
 
 
 def together(lead: Callable[[Processes], int]) -> int:
-    """Return the exit code of the processes that ``torchrun`` has started: the first calls ``lead``, the others follow.
-
-    Raises:
-        DyngsError: in the process that failed.
-        SystemExit: in the others.
-    """
+    """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``, the others follow."""
     with Processes.of_torchrun() as processes:
         if not processes.is_first:
             follow(processes)
@@ -95,11 +84,7 @@ def together(lead: Callable[[Processes], int]) -> int:
 
 
 def follow(processes: Processes) -> None:
-    """Do what the first process says until it says that all is done; nothing is printed.
-
-    Raises:
-        DyngsError: a step failed here.
-    """
+    """Do what the first process says until it says that all is done; nothing is printed."""
     keep_freed_memory()
     with (
         open(os.devnull, "w", encoding="utf-8") as nowhere,
@@ -113,7 +98,6 @@ def follow(processes: Processes) -> None:
 
 
 def _follow_run(processes: Processes, config: Config) -> tuple[Order, bytes]:
-    """Follow a run to its end, and return what is to be done after it."""
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
         trainer = build(config, restored=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import open_scene
 
 
-def load(path: Path | str) -> Scene:
+def load(path: Path | str) -> GaussianScene:
     """Load a scene, to be drawn from anywhere, at any time.
 
     Example::

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,40 +15,29 @@ from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import new_folder
 from dyngs.gaussians.schedule import Rates
+from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.fit.fitted_capture import with_fitted_body
-from dyngs.human.prediction.network import PredictedAvatar, predict_gaussians
 from dyngs.human.prediction.person import CapturedPerson, named_views, spread_views
 from dyngs.human.template.body_reader import load_template
 from dyngs.kinds import assemble
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import require_empty
-from dyngs.training.adaptation import adapt_network
-from dyngs.training.prediction import filmed, human_options, load_network, new_network, scene_of
+from dyngs.training.prediction import PersonPredictor, filmed, human_options, load_network, new_network
 
-_FAINT = 0.02
-"""Opacity below which a predicted Gaussian is left out, as the preset for one person has it."""
+_FAINT = 0.02  # Opacity below which a predicted Gaussian is left out, as the preset for one person has it
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Result of ``predict_person``.
-
-    Attributes:
-        run_dir: the run folder.
-        views: names of the images that were predicted from.
-        num_gaussians: N.
-        seconds_steps: training the network on these images.
-        seconds_maps: reading these images and bringing them to the atlas.
-        seconds_network: the network and its Gaussians.
-    """
+    """Result of ``predict_person``."""
 
     run_dir: Path
-    views: tuple[str, ...]
+    views: tuple[str, ...]  # names of the images that were predicted from
     num_gaussians: int
-    seconds_steps: float
-    seconds_maps: float
-    seconds_network: float
+    seconds_steps: float  # training the network on these images
+    seconds: float  # of the prediction itself
 
 
 def predict_person(
@@ -69,7 +58,7 @@ def predict_person(
             to these first, once, as by ``dyngs data fit``.
         out: a new run folder.
         views: how many of the training views to predict from, well spread; or their names.
-        steps: of training the network on these images before, see ``dyngs.training.adaptation``.
+        steps: of training the network on these images before, see ``PersonPredictor.adapt``.
         say: is told in a line that a body is fitted.
         report: is told how far that fit and these steps have come.
 
@@ -80,33 +69,26 @@ def predict_person(
         raise DyngsError(f"cannot train for {steps} steps; give 0 or more")
     config, model = network_config(network_run)
     require_empty(out)  # before the work
-    checkpoint = latest_checkpoint(network_run)
     network = new_network(model, torch.Generator())
-    mean = load_network(network, checkpoint, model.resolution)
+    mean = load_network(network, latest_checkpoint(network_run), model.resolution)
     data = config.data.model_copy(update={"root": capture.absolute()})
     if model.body is None:
         data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
     person = filmed(data, model, load_template(human_options(model)))
-    chosen = _chosen(person.sitter, views)
+    predictor, chosen = PersonPredictor(config, model, network, mean, person), _chosen(person.sitter, views)
     began = time.perf_counter()
-    adapt_network(network, person, chosen, mean, config, model, steps, report)
+    predictor.adapt(chosen, steps, report)
     start = time.perf_counter()
-    maps = person.look(chosen)
-    middle = time.perf_counter()
-    with torch.no_grad():
-        avatar = without_faint(predict_gaussians(person.sitter, maps, mean, network, model.min_silhouette_fraction))
+    scene = predictor.predict(chosen)
+    scene = scene.select(scene.gaussians.opacities >= _FAINT)
     end = time.perf_counter()
-    write_run(out, avatar, data, model, end - began)
+    write_run(out, scene, person.sitter.subject.motion.frames, data, model, end - began)
     names = tuple(person.sitter.views[i].name for i in chosen)
-    return Prediction(out, names, len(avatar.gaussians), start - began, middle - start, end - middle)
+    return Prediction(out, names, len(scene), start - began, end - start)
 
 
 def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
-    """Return the configuration of the run of a network, and its model section.
-
-    Raises:
-        DyngsError: the run is of something else.
-    """
+    """Return the configuration of the run of a network, and its model section."""
     config = load_resolved(run_dir)
     model = config.model
     if not isinstance(model, HumanPredictorModel):
@@ -116,8 +98,10 @@ def network_config(run_dir: Path) -> tuple[Config, HumanPredictorModel]:
     return config, model
 
 
-def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: HumanPredictorModel, seconds: float) -> None:
-    """Write ``avatar`` as a run of the preset for one person after no step; ``seconds`` is the time taken so far."""
+def write_run(
+    out: Path, scene: HumanScene, frames: tuple[int, ...], data: DataConfig, model: HumanPredictorModel, seconds: float
+) -> None:
+    """Write ``scene`` as a run of the preset for one person after no step."""
     preset = load_config(packaged_preset("human"), ["data.root=."])
     person = preset.model
     if not isinstance(person, HumanModel):
@@ -125,26 +109,13 @@ def write_run(out: Path, avatar: PredictedAvatar, data: DataConfig, model: Human
     same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
     given = human_options(model)
     human = person.model_copy(update={name: getattr(given, name) for name in same})
-    config = preset.model_copy(
-        update={
-            "data": data,
-            "model": human,
-            "run": preset.run.model_copy(update={"name": out.name, "dir": out}),
-        }
-    )
+    run = preset.run.model_copy(update={"name": out.name, "dir": out})
+    config = preset.model_copy(update={"data": data, "model": human, "run": run})
     trainer = assemble(config)
-    scene, training = scene_of(human, avatar, Rates(config.train.steps))
-    trainer.model.begin_with(scene, training)
+    trainer.model.begin_with(scene, HumanTraining(human, frames, Rates(config.train.steps)))
     with new_folder(out, require_empty) as started:
         write_config(config, started)
         save_checkpoint(started, trainer.checkpoint(), seconds)
-
-
-def without_faint(avatar: PredictedAvatar) -> PredictedAvatar:
-    """Return the avatar without nearly transparent Gaussians."""
-    kept = avatar.gaussians.opacities >= _FAINT
-    anchors = avatar.subject.anchors.select(kept)
-    return PredictedAvatar(avatar.gaussians.select(kept), replace(avatar.subject, anchors=anchors))
 
 
 def _chosen(sitter: CapturedPerson, views: int | tuple[str, ...]) -> list[int]:

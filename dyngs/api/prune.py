@@ -30,32 +30,21 @@ from dyngs.runs.folder import EXPORT_FOLDER, require_empty
 from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
 
-SEARCH_STEPS = 1000
-"""Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise."""
+SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise
 
 
 @dataclass(frozen=True)
 class Promise:
-    """Result of pruning for a given loss.
+    """Result of pruning for a given loss."""
 
-    Attributes:
-        folder: of the new run; its file is in ``EXPORT_FOLDER`` there.
-        asked: largest loss on the views held out, dB.
-        before: mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest.
-        after: that of the file.
-        cut: what was taken away, for people; "nothing" where nothing could be.
-        limits: why no more was.
-        views: that losses were measured on, for people.
-        trials: number of candidates that were fine-tuned.
-    """
-
-    folder: Path
-    asked: float
+    folder: Path  # of the new run; its file is in ``EXPORT_FOLDER`` there
+    asked: float  # largest loss on the views held out, dB
+    # mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest
     before: float
     after: float
-    cut: str
+    cut: str  # what was taken away, for people; "nothing" where nothing could be
     limits: tuple[Limit, ...]
-    views: str
+    views: str  # that losses were measured on, for people
     trials: int
 
     def __str__(self) -> str:
@@ -150,7 +139,6 @@ def prune_within(
 
 
 def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequence[str]) -> Config:
-    """Return the configuration of a run that goes on from ``start`` in the folder ``out``."""
     defaults = [f"prune.{key}={value}" for key, value in PruneConfig().model_dump().items()]
     done = [f"train.steps={start.info.step}", "train.minutes=null", f"run.dir={out}"]
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
@@ -173,14 +161,12 @@ def _unseen(config: Config, device: torch.device) -> list[Image]:
 
 
 def _copy_start(run_dir: Path, folder: Path) -> None:
-    """Copy the training time and the log of a run."""
     for name in (TIMING_NAME, LOG_NAME):
         if (run_dir / name).is_file():
             shutil.copyfile(run_dir / name, folder / name)
 
 
 def _write(folder: Path, stored: Stored, seconds: float) -> None:
-    """Write the chosen candidate as a run, with its file in a folder of its own."""
     config = stored.candidate.config
     save_checkpoint(folder, stored.candidate.checkpoint, seconds)
     write_config(config, folder)

@@ -74,8 +74,7 @@ from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 
-_COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"
-"""Names of the limits' states in a checkpoint."""
+_COUNT, _SPEED, _TIME = "budget.count", "budget.speed", "budget.time"  # Names of the limits' states in a checkpoint
 
 
 @contextmanager
@@ -92,9 +91,7 @@ class Limit(Protocol):
 
     def restore(self, stored: dict[str, Tensor]) -> None: ...
 
-    def reached(self) -> str:
-        """Return the line about the limit after a run."""
-        ...
+    def reached(self) -> str: ...
 
 
 def train(
@@ -181,7 +178,6 @@ def _chosen(config: Config, *, begins: bool) -> tuple[Config, list[Choice], Capt
 
 
 def _told_again(config: Config, folder: Path) -> str:
-    """Return the line for a run that is asked for once more."""
     longer = "" if config.prune.is_wanted else f", go on with `dyngs train --resume {as_word(folder)} train.steps=N`"
     return (
         f"{folder} holds just this run, finished, and training again would end with the same bytes: nothing is done; "
@@ -193,13 +189,9 @@ class _Run:
     """A run from the reading of its capture to its last line.
 
     Args:
-        config: of the run.
-        folder: of the run.
         resumed: what it goes on from; None: it begins.
         asked: the configuration that was asked for, from which this one was chosen.
-        capture: with its first points where the run begins; None: of a network.
         held: the lock of the folder, which knows where that is if it is renamed.
-        processes: that this one leads.
         threads: of the kernels in each of them.
     """
 
@@ -281,7 +273,6 @@ class _Run:
             print(line, flush=True)
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
-        """Set up the limits of the configuration, with the measurements that they need before training."""
         budget, speed = run.config.budget, None
         if budget.min_fps is not None:
             speed = SpeedLimit(run, budget.min_fps)
@@ -315,7 +306,6 @@ class _Run:
             self.limits[_SPEED] = speed
 
     def _save_and_evaluate(self, event: Event) -> None:
-        """Save and evaluate when it is time to."""
         match event:
             case StepDone():
                 options, step = self.config.train, event.step
@@ -352,7 +342,6 @@ class _Run:
             self.limited.folder = folder
 
     def _evaluate(self, step: int) -> None:
-        """Tell the scores of the test split."""
         start = time.perf_counter()
         report = evaluate_run(self.folder, "test", capture=self._capture)
         seconds = time.perf_counter() - start
@@ -383,11 +372,7 @@ class _Run:
 
 
 def _tell_memory(trainer: GaussianTrainer, processes: int) -> None:
-    """Print how much memory a run will take, and a warning where that is likely to be more than is there.
-
-    Raises:
-        DyngsError: it is certain to be more than this machine, or its GPU, can give.
-    """
+    """Print how much memory a run will take, and a warning where that is likely to be more than is there."""
     for forecast in memory_forecasts(trainer, processes):
         print(forecast, flush=True)
         forecast.require_possible()
@@ -414,11 +399,7 @@ def _owes_file(config: Config, folder: Path) -> bool:
 
 
 def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint | None:
-    """Return the checkpoint to go on from, or None for a run that begins: a new one, or one stopped before its first.
-
-    Raises:
-        DyngsError: resuming where no run was begun, or a new run where something is that it would replace.
-    """
+    """Return the checkpoint to go on from; None for a run that begins, or that was stopped before its first."""
     if not resuming:
         require_startable(folder, config)
         return None
@@ -430,11 +411,7 @@ def _start_of_run(config: Config, folder: Path, *, resuming: bool) -> Checkpoint
 
 
 def _with_new_length(config: Config, folder: Path, resumed: Checkpoint | None) -> Config:
-    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another number of steps.
-
-    Raises:
-        DyngsError: that number is not possible.
-    """
+    """Return ``config`` of a resumed run, changed in its folder, too, where it asks for another number of steps."""
     stored, steps = load_resolved(folder), config.train.steps
     was = stored.train.steps
     if steps == was:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError, counted
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer, restored_scene
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.ops.device import CPU
@@ -89,7 +89,7 @@ def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> S
     before = quality_of(trainer, scene, images)
     plan = storage_plan(config, full, scene, None)
 
-    def stored(kept: Scene, coarseness: Tensor | None) -> _File | None:
+    def stored(kept: GaussianScene, coarseness: Tensor | None) -> _File | None:
         found = _fitted(full.info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
         if found is None:
             return None
@@ -115,7 +115,7 @@ def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> S
 
 
 def _fitted(
-    info: CheckpointInfo, scene: Scene, coarseness: Tensor | None, steps: Mapping[str, float], most: int
+    info: CheckpointInfo, scene: GaussianScene, coarseness: Tensor | None, steps: Mapping[str, float], most: int
 ) -> tuple[bytes, float] | None:
     """Return the bytes of a file of at most ``most``, and the factor on ``steps`` that this took; None: none fits."""
     num_values = sum(x.numel() for x in drawable(scene).values())

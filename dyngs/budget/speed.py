@@ -21,7 +21,7 @@ from dyngs.config import Config
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted
 from dyngs.evaluate.view_scores import Drawing
-from dyngs.gaussians.scene import Scene, render_options
+from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import flip, ssim
 from dyngs.models.schedule import scaled
@@ -238,7 +238,7 @@ def allowed(found: Measured, fps: float, count: int, config: Config) -> int:
 
 
 @torch.no_grad()
-def drawing_seconds(trainer: GaussianTrainer, scene: Scene, views: int = VIEWS) -> float:
+def drawing_seconds(trainer: GaussianTrainer, scene: GaussianScene, views: int = VIEWS) -> float:
     """Return the median over training views of the least time to draw one at full size, deformation included.
 
     In between each image is judged, as evaluation does: drawing is faster where caches still hold all it needs.
@@ -261,7 +261,7 @@ def drawing_seconds(trainer: GaussianTrainer, scene: Scene, views: int = VIEWS) 
     return median(least)
 
 
-def least_seconds(trainer: GaussianTrainer, scene: Scene, limit: float) -> float:
+def least_seconds(trainer: GaussianTrainer, scene: GaussianScene, limit: float) -> float:
     """Return ``drawing_seconds``, or the least of several measurements if more than ``limit``."""
     least = math.inf
     for _ in range(ATTEMPTS):
@@ -271,7 +271,7 @@ def least_seconds(trainer: GaussianTrainer, scene: Scene, limit: float) -> float
     return least
 
 
-def _few(trainer: GaussianTrainer) -> Scene:
+def _few(trainer: GaussianTrainer) -> GaussianScene:
     """Return ``FEW`` of the Gaussians of ``trainer``, all of them moving if any will move."""
     kept = torch.tensor(evenly_spaced(trainer.num_gaussians, FEW), device="cpu")
     return trainer.model.training.all_moving(trainer.model.scene.select(kept), trainer.extent)

@@ -53,13 +53,11 @@ def run(arguments: argparse.Namespace) -> int:
         made = predict_person(
             arguments.network, arguments.capture, out, arguments.views, steps=arguments.steps, report=report
         )
-    seconds = made.seconds_steps + made.seconds_maps + made.seconds_network
-    trained = f"{made.seconds_steps:.2f} s steps, " if arguments.steps else ""
-    parts = f"{trained}{made.seconds_maps:.2f} s images, {made.seconds_network:.2f} s network"
+    trained = f", after {made.seconds_steps:.2f} s of training on these images" if arguments.steps else ""
     word = as_word(out)
     print(
         f"predicted: {counted(made.num_gaussians, 'Gaussian')} from {', '.join(made.views)}\n"
-        f"time:      {seconds:.2f} s ({parts})\n"
+        f"time:      {made.seconds:.2f} s{trained}\n"
         f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it"
     )
     return 0

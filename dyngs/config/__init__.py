@@ -1,27 +1,22 @@
 """The configuration of a run: typed keys (``keys``), YAML files and overrides (``io``), keys in words (``schema``)."""
 
-from dyngs.config.keys.budget import BudgetConfig
-from dyngs.config.keys.camera import CameraConfig
 from dyngs.config.keys.colour import AutoColour, ColourSection, NetworkColour, ShColour
-from dyngs.config.keys.config import Config
+from dyngs.config.keys.config import BudgetConfig, CameraConfig, Config, PruneConfig, RunConfig
 from dyngs.config.keys.data import DataConfig
-from dyngs.config.keys.dynamic import (
+from dyngs.config.keys.start import PointsInit, RandomInit
+from dyngs.config.keys.strategy import DefaultStrategy, FixedStrategy, McmcStrategy, OptimConfig, Strategy
+from dyngs.config.keys.train import TrainConfig
+from dyngs.deform.keys import (
     ControlNodesField,
     DeformField,
     DynamicModel,
     FieldSection,
     HexplaneField,
     MlpField,
-    TrajectoryField,
 )
-from dyngs.config.keys.human import HumanModel, HumanPredictorModel
-from dyngs.config.keys.model import ModelSection, SceneModel, StaticModel
-from dyngs.config.keys.prune import PruneConfig
-from dyngs.config.keys.run import RunConfig
-from dyngs.config.keys.section import CutOff, Fraction, Positive, Section
-from dyngs.config.keys.start import PointsInit, RandomInit
-from dyngs.config.keys.strategy import DefaultStrategy, FixedStrategy, McmcStrategy, OptimConfig, Strategy
-from dyngs.config.keys.train import TrainConfig
+from dyngs.human.keys import HumanModel, HumanPredictorModel
+from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
+from dyngs.static.keys import StaticModel
 
 __all__ = [
     "AutoColour",
@@ -57,5 +52,4 @@ __all__ = [
     "StaticModel",
     "Strategy",
     "TrainConfig",
-    "TrajectoryField",
 ]

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes
-from dyngs.deform.field import MAX_KEY_TIMES, FieldSetup, NetworkField, Offsets
+from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
 from dyngs.deform.spline_fit import SPAN, cubic_fractions, refitted
 from dyngs.gaussians import TopologyEdit
@@ -29,19 +29,16 @@ from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
 NOTHING = torch.zeros(0, 3, device="cpu")
-COMPARED_TIMES = 16
-"""Times at which the paths of nodes are compared where some of them are to go."""
+COMPARED_TIMES = 16  # Times at which the paths of nodes are compared where some of them are to go
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
 """Learning rates of the nodes' attributes other than positions."""
-LR_DECAY = 0.2
-"""Ratio of the last to the first learning rate."""
+LR_DECAY = 0.2  # Ratio of the last to the first learning rate
 PIECES_PER_TIME = 0.3
 """Pieces of the splines per training time. With more, poses follow single images; with fewer, they lag behind."""
-SMOOTHNESS = 0.01
-"""Weight of the nodes' squared acceleration, in node spacings."""
+SMOOTHNESS = 0.01  # Weight of the nodes' squared acceleration, in node spacings
 
 
-class ControlNodes(NetworkField):
+class ControlNodes(DeformationField):
     """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that follow them.
 
     Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that nothing follows are
@@ -79,11 +76,6 @@ class ControlNodes(NetworkField):
 
         Nodes are still placed where Gaussians are far from any, and begin with the motion of those around them: where
         nothing should move at first, nodes that stand still must be among the given ones.
-
-        Args:
-            positions: (S, 3) canonical, no two alike.
-            splines: by head, the control points (S, P, size); heads that are not given stay 0. P is the number of
-                pieces, from now on that of all splines, plus 3.
         """
         field, count = copy.copy(self), len(positions)
         field.num_pieces = splines["means"].shape[1] - SPAN + 1
@@ -103,12 +95,11 @@ class ControlNodes(NetworkField):
         return self.parameters.num_values + sum(x.numel() for x in self.buffers.values())
 
     def edited(self, edit: TopologyEdit) -> ControlNodes:
-        field = self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+        field = copy.copy(self)
         field.buffers = {n: edit.apply(x) if n == "followed" else x for n, x in self.buffers.items()}
         return field
 
     def regroup(self) -> None:
-        """Place the nodes again, and assign Gaussians to them, when they are next needed."""
         self.buffers.pop("followed", None)
 
     def to(self, device: torch.device | str) -> ControlNodes:
@@ -142,16 +133,13 @@ class ControlNodes(NetworkField):
 
     @property
     def num_nodes(self) -> int:
-        """Number of nodes that are placed."""
         return len(self.buffers["positions"])
 
     @property
     def num_points(self) -> int:
-        """Number of control points of each spline."""
         return self.num_pieces + SPAN - 1
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """See ``DeformationField.offsets``; differentiable in ``means``, which nodes turn about themselves."""
         if not len(means):  # whatever nodes there are
             return self.at(time).select(slice(0))
         nodes, now = self.nodes_for(means), self.at(time)
@@ -188,7 +176,6 @@ class ControlNodes(NetworkField):
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
     def at(self, time: float) -> Offsets:
-        """Return the nodes' offsets at ``time``."""
         place = min(max(time, 0.0), 1.0) * self.num_pieces
         piece = min(int(place), self.num_pieces - 1)
         fractions = sent(cubic_fractions(place - piece)[:, None], self.setup.center.device)
@@ -198,14 +185,12 @@ class ControlNodes(NetworkField):
         return Offsets(**parts)
 
     def _untrained(self, count: int) -> Parameters:
-        """Return the parameters of ``count`` nodes that stand still."""
         sizes, device = head_sizes(self.options), self.setup.center.device
         tensors = {name: torch.zeros(count, self.num_points, size, device=device) for name, size in sizes.items()}
         rates = {"means": self.options.lr_means * self.setup.extent} | LR
         return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
     def _splines(self) -> dict[str, Tensor]:
-        """Return the control points (S, P, size) by head."""
         return {name: self.parameters[name] for name in head_sizes(self.options)}
 
     def nodes_for(self, means: Tensor) -> Nodes:
@@ -230,7 +215,6 @@ class ControlNodes(NetworkField):
         self._assign(torch.cat([old[kept], means[added]]), means)
 
     def _assign(self, positions: Tensor, means: Tensor) -> None:
-        """Let ``means`` (M, 3) follow the nodes at ``positions`` (S, 3)."""
         nodes, around = nodes_at(positions, means), nodes_at(positions, positions).followed[:, 1:]
         found = {"radii": nodes.radii, "followed": nodes.followed, "neighbours": around}
         self.buffers = {"positions": positions} | found

@@ -18,11 +18,9 @@ from dyngs.deform.field import DeformationField, Offsets
 from dyngs.deform.nodes import FOLLOWED
 from dyngs.deform.spline_fit import SPAN, spline_basis
 
-SAMPLES_PER_PIECE = 3
-"""Times per piece at which a motion is looked at."""
+SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
 FEWEST_PIECES, MOST_PIECES = 8, 256
-CHECKED = 0.95
-"""Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance."""
+CHECKED = 0.95  # Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance
 
 
 @dataclass(frozen=True)
@@ -46,14 +44,7 @@ class Curves:
 
 @torch.no_grad()
 def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> Curves:
-    """Return the motion of ``means`` (M, 3) as splines.
-
-    Args:
-        field: that moves them.
-        means: (M, 3) canonical, of all moving Gaussians in order.
-        num_times: distinct training times.
-        tolerance: world units that the fit of a place may be off, where it is not exact.
-    """
+    """Return the motion of ``means`` (M, 3) as splines."""
     match field:
         case ControlNodes():
             return _curves_of_nodes(field, means)
@@ -80,7 +71,6 @@ def fitted_curves(
 
 
 def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tensor]:
-    """Return the least-squares fit with so many pieces."""
     count = SAMPLES_PER_PIECE * pieces + 1
     times = torch.linspace(0, 1, count, dtype=torch.float64, device="cpu")
     solver = torch.linalg.pinv(spline_basis(times, pieces)).float()  # (P, count)
@@ -106,7 +96,6 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
 
 
 def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
-    """Return the splines of control nodes, which are exact."""
     nodes = field.nodes_for(means)
     followed, fractions = _padded(nodes.followed, nodes.weights(means))
     return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)

@@ -18,9 +18,6 @@ class Decoder:
     """A multilayer perceptron whose last layer starts at zero.
 
     Args:
-        num_inputs: features per row.
-        hidden: units of the hidden layers.
-        options: which heads there are.
         skip: layer whose input is the features once more, beside the hidden units.
     """
 
@@ -43,7 +40,6 @@ class Decoder:
         return values
 
     def __call__(self, features: Tensor, parameters: Parameters) -> Tensor:
-        """Return (M, K) outputs of ``features`` (M, num_inputs) with the weights in ``parameters``."""
         layers = [Layer(parameters[f"weight{i}"], parameters[f"bias{i}"]) for i in range(len(self.widths) - 1)]
         return perceptron(features, layers, skip=self.skip)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -20,59 +20,44 @@ from dyngs.ops.registration import has_kernel
 from dyngs.ops.skinning import add_offsets_
 from dyngs.state import State, moved_to, part_of, prefixed
 
-F = TypeVar("F", bound="NetworkField")
+F = TypeVar("F", bound="DeformationField")
 
-MAX_KEY_TIMES = 256
-"""Limit on the default number of key times; longer clips may set more, which takes memory."""
+MAX_KEY_TIMES = 256  # Limit on the default number of key times; longer clips may set more, which takes memory
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """Changes of M Gaussians from their canonical form at one time; zeros mean no change.
+    """Changes of M Gaussians from their canonical form at one time; zeros mean no change."""
 
-    Attributes:
-        means: (M, 3) world units.
-        quats: (M, 4) added to the identity (1, 0, 0, 0); the sum turns the Gaussian after its own rotation.
-        log_scales: (M, 3).
-        logit_opacities: (M,).
-        colors: (M, 3) of the base colour, in units of the constant SH coefficient.
-    """
-
-    means: Tensor
+    means: Tensor  # (M, 3) world units
+    # (M, 4) added to the identity (1, 0, 0, 0); the sum turns the Gaussian after its own rotation
     quats: Tensor | None = None
-    log_scales: Tensor | None = None
-    logit_opacities: Tensor | None = None
-    colors: Tensor | None = None
+    log_scales: Tensor | None = None  # (M, 3)
+    logit_opacities: Tensor | None = None  # (M,)
+    colors: Tensor | None = None  # (M, 3) of the base colour, in units of the constant SH coefficient
 
     def select(self, index: Tensor | slice) -> Offsets:
-        """Return the offsets of the Gaussians at ``index``."""
         others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
         return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
 
 
 @dataclass(frozen=True)
 class FieldSetup:
-    """Properties of the scene that a field needs.
+    """Properties of the scene that a field needs."""
 
-    Attributes:
-        center, half_size: (3,) of the box in which things move, world units; no side is zero.
-        num_times: distinct training times.
-        num_moving: M.
-        extent: of the scene, world units; learning rates are relative to it.
-    """
-
+    # center, half_size: (3,) of the box in which things move, world units; no side is zero
     center: Tensor
     half_size: Tensor
     num_times: int
     num_moving: int
-    extent: float
+    extent: float  # of the scene, world units; learning rates are relative to it
 
     def normalized(self, means: Tensor) -> Tensor:
         """Return (M, 3) ``means`` in the box's own coordinates: [-1, 1] inside."""
         return (means - self.center) / self.half_size
 
 
-class DeformationField(Protocol):
+class DeformationField:
     """Offsets of canonical Gaussians over time, the identity before training."""
 
     setup: FieldSetup
@@ -82,78 +67,39 @@ class DeformationField(Protocol):
     @property
     def num_values(self) -> int:
         """Number of values that the field stores."""
-        ...
+        return self.parameters.num_values
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """Return the offsets at ``time``.
+        """Return the offsets at ``time`` in [0, 1] of the moving Gaussians with canonical ``means`` (M, 3), in order.
 
         Args:
-            means: (M, 3) canonical, of all moving Gaussians in order.
-            time: in [0, 1].
-            rows: (A,) only these of them are asked for, in this order, and cost anything; None: all.
+            rows: (A,) only these of them are requested, in this order, and cost anything; None: all.
         """
-        ...
+        raise NotImplementedError
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         """Return differentiable regularizers of the field itself, weighted, by name; some look at ``time`` only."""
-        ...
-
-    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
-        ...
-
-    def edited(self, edit: TopologyEdit) -> DeformationField:
-        """Return the field after an edit of the moving Gaussians."""
-        ...
-
-    def regroup(self) -> None:
-        """Drop what was derived from the set of Gaussians; it is computed again when next needed."""
-        ...
-
-    def state(self) -> State:
-        """Return the state that ``restored`` needs, without the setup."""
-        ...
-
-    def restored(self, tensors: Mapping[str, Tensor]) -> DeformationField:
-        """Return the field of a state that ``state`` returned, with the options and the setup of this one.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as a field of these options has it.
-        """
-        ...
-
-    def to(self, device: torch.device | str) -> DeformationField:
-        """Return the field on ``device``."""
-        ...
-
-
-class NetworkField:
-    """Base of the fields whose tensors belong to no single Gaussian."""
-
-    setup: FieldSetup
-    parameters: Parameters
-
-    @property
-    def num_values(self) -> int:
-        return self.parameters.num_values
-
-    def penalties(self, time: float) -> dict[str, Tensor]:
         return {}
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Do nothing: the field continues by itself."""
+        """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
 
     def edited(self: F, edit: TopologyEdit) -> F:
+        """Return the field after an edit of the moving Gaussians."""
         return self
 
     def regroup(self) -> None:
-        """Do nothing: nothing is derived from the set of Gaussians."""
+        """Drop what was derived from the set of Gaussians; it is computed again when next needed."""
 
     def state(self) -> State:
+        """Return the state that ``restored`` needs, without the setup."""
         return prefixed("learned", self.parameters.state())
 
     def restored(self: F, tensors: Mapping[str, Tensor]) -> F:
+        """Return the field of a state that ``state`` returned, with the options and the setup of this one.
+
+        Raises KeyError or ValueError: a tensor is missing, or is not as a field of these options has it.
+        """
         return self.with_parameters(self.parameters.restored(part_of(tensors, "learned")))
 
     def to(self: F, device: torch.device | str) -> F:
@@ -162,7 +108,6 @@ class NetworkField:
         return field
 
     def with_parameters(self: F, parameters: Parameters) -> F:
-        """Return a copy with other ``parameters``."""
         field = copy.copy(self)
         field.parameters = parameters
         return field

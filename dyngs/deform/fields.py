@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.config import ControlNodesField, DeformField, HexplaneField, MlpField, TrajectoryField
+from dyngs.config import ControlNodesField, DeformField, HexplaneField, MlpField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup
 from dyngs.deform.fixed_cameras.start import FirstMotion
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
-from dyngs.deform.trajectory import Trajectory
 from dyngs.state import Role, State, with_role
 from dyngs.tensor_checks import require_positive, require_tensor
 
@@ -28,43 +27,16 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
             return Mlp(options, setup, generator)
         case ControlNodesField():
             return ControlNodes(options, setup, generator)
-        case TrajectoryField():
-            return Trajectory(options, setup, generator)
         case _:
             assert_never(options)
 
 
-def can_begin_on_its_way(options: DeformField) -> bool:
-    """Return whether a field of that kind can begin with given paths."""
-    match options:
-        case ControlNodesField():
-            return True
-        case HexplaneField() | MlpField() | TrajectoryField():
-            return False
-        case _:
-            assert_never(options)
-
-
-def field_on_its_way(options: DeformField, setup: FieldSetup, first: FirstMotion, others: Tensor) -> DeformationField:
-    """Return an untrained field in which things already follow the paths found for them.
-
-    Args:
-        options: of a field that can; see ``can_begin_on_its_way``.
-        setup: of the field.
-        first: what travels.
-        others: (M, 3) moving Gaussians that belong to none of it, which stand still.
-
-    Raises:
-        ValueError: a field of another kind.
-    """
-    match options:
-        case ControlNodesField():
-            field = ControlNodes(options, setup, torch.Generator())
-            most = options.pieces or max(field.num_pieces, min(setup.num_times - 1, MAX_KEY_TIMES))
-            positions, paths = first.nodes(others, options.nodes, range(field.num_pieces, most + 1))
-            return field.started(positions, {"means": paths})
-        case _:
-            raise ValueError(f"a field of kind {options.kind} cannot begin on its way")
+def field_on_its_way(options: ControlNodesField, setup: FieldSetup, first: FirstMotion, others: Tensor) -> ControlNodes:
+    """Return an untrained field in which things already follow the paths found for them."""
+    field = ControlNodes(options, setup, torch.Generator())
+    most = options.pieces or max(field.num_pieces, min(setup.num_times - 1, MAX_KEY_TIMES))
+    positions, paths = first.nodes(others, options.nodes, range(field.num_pieces, most + 1))
+    return field.started(positions, {"means": paths})
 
 
 def field_state(field: DeformationField) -> State:
@@ -75,12 +47,7 @@ def field_state(field: DeformationField) -> State:
 
 
 def restored_field(options: DeformField, tensors: Mapping[str, Tensor], num_moving: int) -> DeformationField:
-    """Return the field of a checkpoint for M moving Gaussians.
-
-    Raises:
-        KeyError: a tensor is missing.
-        ValueError: one is not as a field of these options has it.
-    """
+    """Return the field of a checkpoint for M moving Gaussians."""
     num_times, extent = require_positive("numbers", require_tensor("numbers", tensors["numbers"], (2,), None)).tolist()
     center, half_size = require_tensor("box", tensors["box"], (2, 3))
     setup = FieldSetup(center, require_positive("box", half_size), int(num_times), num_moving, extent)

@@ -9,19 +9,18 @@ from torch import Tensor
 
 from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
-from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen, key_times
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen, key_times
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
 WEIGHTS = (1e-4, 0.01, 1e-4)
 """Of the smoothness of space planes, of that along time, and of the sparsity of planes with time (Wu et al.)."""
-LR_DECAY = 0.01
-"""Ratio of the last to the first learning rate."""
+LR_DECAY = 0.01  # Ratio of the last to the first learning rate
 SPACE_RANGE = (0.1, 0.5)
 """Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not depend on time."""
 
 
-class Hexplane(NetworkField):
+class Hexplane(DeformationField):
     """Features from six planes per level, decoded into offsets.
 
     Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the field starts as the
@@ -54,7 +53,6 @@ class Hexplane(NetworkField):
         return [PlaneLevel(self.parameters[f"space{i}"], self.parameters[f"time{i}"]) for i in indices]
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """See ``DeformationField.offsets``; no gradient flows to ``means``."""
         coords = self.setup.normalized(chosen(means.detach(), rows))
         features = hexplane_features(coords, time, self.levels)
         return split_heads(self.decoder(features, self.parameters), self.options)

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from dyngs.config import DynamicModel
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
-from dyngs.deform.given_masks import moving_fraction_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
-from dyngs.deform.still_error import StillErrors, cameras_in_place, still_errors, views_to_compare
+from dyngs.deform.still_error import StillErrors, cameras_in_place, moving_fractions, still_errors, views_to_compare
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.training import ColourTraining
@@ -20,26 +19,25 @@ from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Kind, Setting
+from dyngs.models.kind import RunStart
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 from dyngs.static.training import start as start_static
 
-MAX_STANDING = 12
-"""Fixed cameras from which tracks are found, at most."""
+MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 
 
-def start(setting: Setting) -> GaussianModel:
+def start(run: RunStart) -> GaussianModel:
     """Return the model of a moving scene before its first step: a static one where there are no times to move in."""
-    model = setting.config.model
-    if not isinstance(model, DynamicModel) or len(set(training_times(setting.capture))) < 2:
-        return start_static(setting)
-    gaussians = first_gaussians(setting)
-    colours = colours_of(setting, gaussians, sees_time=True)
-    schedule = deform_schedule(model, rates_of(setting.config))
-    views = _training_views(setting, model, colours)
-    training = DynamicTraining(model, schedule, views, filter_update(setting), setting.generator)
-    return GaussianModel(setting, training.first_scene(gaussians), training, densifier_of(setting), colours)
+    model = run.config.model
+    if not isinstance(model, DynamicModel) or len(set(training_times(run.capture))) < 2:
+        return start_static(run)
+    gaussians = first_gaussians(run)
+    colours = colours_of(run, gaussians, sees_time=True)
+    schedule = deform_schedule(model, rates_of(run.config))
+    views = _training_views(run, model, colours)
+    training = DynamicTraining(model, schedule, views, filter_update(run), run.generator)
+    return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
 
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
@@ -48,12 +46,8 @@ def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     return drawn_as_trained(scene, model, checkpoint)
 
 
-KIND = Kind(DynamicModel, start, restore)
-
-
-def _training_views(setting: Setting, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
-    """Return the properties of the capture that training a dynamic scene needs."""
-    config, capture, images = setting.config, setting.capture, setting.images
+def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+    config, capture, images = run.config, run.capture, run.images
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
@@ -65,7 +59,7 @@ def _training_views(setting: Setting, model: DynamicModel, colours: ColourTraini
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
         shown = [images.shrunk(i, divisor) for i in looked_at]
         if any(image.moves is not None for image in shown):
-            return moving_fraction_of(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
+            return moving_fractions(gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold)
         return still_errors(gaussians_at, shown, options, background, shader)
 
     in_place = cameras_in_place(views)
@@ -77,7 +71,7 @@ def _training_views(setting: Setting, model: DynamicModel, colours: ColourTraini
     return TrainingViews(
         training_times(capture),
         training_cameras(views, config.data),
-        setting.extent,
+        run.extent,
         errors_of,
         cameras_stay=bool(in_place),
         standing=standing,

@@ -7,18 +7,15 @@ from torch import Tensor
 
 from dyngs.config import MlpField
 from dyngs.deform.decoder import Decoder, split_heads
-from dyngs.deform.field import FieldSetup, NetworkField, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.gaussians.parameters import Parameters
 
-SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6
-"""Octaves of the positional encodings."""
-LR_DECAY = 0.002
-"""Ratio of the last to the first learning rate."""
-SKIP_LAYER = 5
-"""The input is fed once more into this layer (counted from 0), where there are that many hidden ones."""
+SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # Octaves of the positional encodings
+LR_DECAY = 0.002  # Ratio of the last to the first learning rate
+SKIP_LAYER = 5  # The input is fed once more into this layer (counted from 0), where there are that many hidden ones
 
 
-class Mlp(NetworkField):
+class Mlp(DeformationField):
     """Offsets by a deep network; starts as the identity, because its last layer starts at zero.
 
     Differs from Deformable-3DGS in two small ways: time is encoded like position instead of by a network of its own,
@@ -34,7 +31,6 @@ class Mlp(NetworkField):
         self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), LR_DECAY)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """See ``DeformationField.offsets``; no gradient flows to ``means``, as in the paper."""
         space = encoded(self.setup.normalized(chosen(means.detach(), rows)), SPACE_FREQUENCIES)
         moment = encoded(space.new_full((1, 1), time), TIME_FREQUENCIES)
         features = torch.cat([space, moment.expand(len(space), -1)], dim=1)

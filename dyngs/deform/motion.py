@@ -13,32 +13,27 @@ from dyngs.gaussians import Gaussians
 
 PX_PER_OPACITY = 6.0
 """A change of opacity, or of a colour in units of SH, by x counts as much as a motion by 6 x pixels."""
-MAX_SAMPLES = 24
-"""Largest number of times at which motion is measured."""
+MAX_SAMPLES = 24  # Largest number of times at which motion is measured
 
 
 @dataclass(frozen=True)
-class Motion:
-    """Motion of M Gaussians over time.
+class MeasuredMotion:
+    """Motion of M Gaussians over time."""
 
-    Attributes:
-        pixels: (M,) farthest stray from the mean position, turning and growing of the outline included, in pixels.
-        mean: the offsets' means over time.
-    """
-
-    pixels: Tensor
-    mean: Offsets
+    pixels: Tensor  # (M,) farthest stray from the mean position, turning and growing of the outline included, in pixels
+    mean: Offsets  # the offsets' means over time
 
 
 @torch.no_grad()
-def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor) -> Motion:
+def measure_motion(
+    field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor
+) -> MeasuredMotion:
     """Return the motion of M Gaussians over ``times``.
 
     The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size of a pixel, s being
     the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour.
 
     Args:
-        gaussians: the M canonical Gaussians that the field moves.
         times: in [0, 1]; at most ``MAX_SAMPLES`` evenly chosen ones are looked at.
         px_size: (M,) world units that one pixel covers, in the nearest training view.
     """
@@ -61,7 +56,7 @@ def measure_motion(field: DeformationField, gaussians: Gaussians, times: Sequenc
         if sample.colors is not None and mean.colors is not None:
             pixels = pixels + PX_PER_OPACITY * (sample.colors - mean.colors).abs().amax(1)
         score = torch.maximum(score, pixels)
-    return Motion(score, mean)
+    return MeasuredMotion(score, mean)
 
 
 @torch.no_grad()
@@ -79,7 +74,6 @@ def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
 
 
 def _mean(samples: Sequence[Offsets]) -> Offsets:
-    """Return the mean of offsets that have the same heads."""
     return Offsets(
         torch.stack([s.means for s in samples]).mean(0),
         _mean_head([s.quats for s in samples]),

@@ -18,26 +18,18 @@ from dyngs.ops.skinning import blend_skinning
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-FOLLOWED = 4
-"""Nodes that a Gaussian follows."""
+FOLLOWED = 4  # Nodes that a Gaussian follows
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Control nodes, and the ones that each of M points follows.
+    """Control nodes, and the ones that each of M points follows."""
 
-    Attributes:
-        positions: (S, 3) canonical.
-        radii: (S,) of influence, world units: the mean distance to the nearest other nodes.
-        followed: (M, B) indices of the nodes that each point follows, nearest first.
-    """
-
-    positions: Tensor
-    radii: Tensor
-    followed: Tensor
+    positions: Tensor  # (S, 3) canonical
+    radii: Tensor  # (S,) of influence, world units: the mean distance to the nearest other nodes
+    followed: Tensor  # (M, B) indices of the nodes that each point follows, nearest first
 
     def followed_by(self, rows: Tensor) -> Nodes:
-        """Return the nodes with only the points ``rows`` following them."""
         return replace(self, followed=self.followed.index_select(0, rows))
 
     def weights(self, means: Tensor) -> Tensor:

@@ -11,12 +11,9 @@ from torch import Tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 
 BOX_MARGIN = 1.1
-SCALE = 0.3
-"""Standard deviation of each, as a fraction of the distance between them."""
-LOGIT = -2.2
-"""Opacity 0.1, as all Gaussians begin."""
-SOLID = 0.05
-"""Opacity from which a Gaussian counts for the bounding box."""
+SCALE = 0.3  # Standard deviation of each, as a fraction of the distance between them
+LOGIT = -2.2  # Opacity 0.1, as all Gaussians begin
+SOLID = 0.05  # Opacity from which a Gaussian counts for the bounding box
 
 
 def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:

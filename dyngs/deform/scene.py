@@ -13,7 +13,7 @@ from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.fields import field_state, restored_field
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
-from dyngs.gaussians.scene import GaussianTimeStep, Scene, stored_times, times_state
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, matched
 from dyngs.models.renderable import clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed
@@ -23,29 +23,16 @@ _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DynamicScene(Scene):
-    """N canonical Gaussians of which a field moves M.
+class DynamicScene(GaussianScene):
+    """N canonical Gaussians of which a field moves M."""
 
-    Attributes:
-        seen_at: distinct training times in [0, 1], ascending.
-        field: None before motion begins, and for good where nothing moves.
-        moving: (M,) ascending indices of the Gaussians that it moves.
-        filter_std: (N,) standard deviations of Mip-Splatting's 3D filter, world units; None without one.
-    """
-
-    seen_at: tuple[float, ...]
+    seen_at: tuple[float, ...]  # distinct training times in [0, 1], ascending
     field: DeformationField | None = None
-    moving: Tensor = _NONE
+    moving: Tensor = _NONE  # (M,) ascending indices of the Gaussians that it moves
     filter_std: Tensor | None = None
 
     @staticmethod
     def restored(options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
-        """Return the scene of a state that ``state`` returned.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as the others and the options have it.
-        """
         count = len(gaussians)
         own = part_of(tensors, "field")
         std, times = stored_filter(tensors, count), stored_times(tensors)
@@ -91,7 +78,6 @@ class DynamicScene(Scene):
         """Return the Gaussians drawn at ``time``, and the offsets of those of them that move.
 
         Args:
-            time: in [0, 1].
             detach: gradients reach the field alone, not the canonical Gaussians.
         """
         if self.field is None:
@@ -145,25 +131,17 @@ class DynamicScene(Scene):
         return _Part(gaussians.picked(active), std, means, asked, rows)
 
 
-def field_scene_of(scene: Scene) -> DynamicScene | None:
+def field_scene_of(scene: GaussianScene) -> DynamicScene | None:
     """Return ``scene`` if a deformation field moves it, None for any other scene."""
     return scene if isinstance(scene, DynamicScene) and not scene.is_static else None
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Gaussians drawn around a time.
+    """Gaussians drawn around a time."""
 
-    Attributes:
-        gaussians: A canonical ones.
-        filter_std: (A,) of theirs, or None.
-        moving_means: (M, 3) canonical means of all that move.
-        asked: which of the M are drawn; None: all.
-        rows: their places among the A; None: all of them, in order.
-    """
-
-    gaussians: Gaussians
-    filter_std: Tensor | None
-    moving_means: Tensor
-    asked: Tensor | None
-    rows: Tensor | None
+    gaussians: Gaussians  # A canonical ones
+    filter_std: Tensor | None  # (A,) of theirs, or None
+    moving_means: Tensor  # (M, 3) canonical means of all that move
+    asked: Tensor | None  # which of the M are drawn; None: all
+    rows: Tensor | None  # their places among the A; None: all of them, in order

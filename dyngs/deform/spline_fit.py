@@ -10,10 +10,8 @@ import math
 import torch
 from torch import Tensor
 
-SPAN = 4
-"""Control points that a value depends on."""
-_SAMPLES_PER_PIECE = 8
-"""Places per piece at which two splines are compared; a cubic is determined by four."""
+SPAN = 4  # Control points that a value depends on
+_SAMPLES_PER_PIECE = 8  # Places per piece at which two splines are compared; a cubic is determined by four
 
 
 def spline_basis(places: Tensor, pieces: int) -> Tensor:

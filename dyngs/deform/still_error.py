@@ -1,4 +1,4 @@
-"""Errors of a static model in the images: the first measure of what may move."""
+"""What may move: errors of a static model in the images, or motion masks that the capture has in place of these."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced, static_cameras
@@ -16,29 +18,20 @@ from dyngs.deform.fixed_cameras.changes import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
-DIFFERS = 0.06
-"""Difference from the median image, mean over channels, from which a pixel shows something else."""
-MIN_SAME = 3
-"""Fewest images of one camera whose median shows what is still."""
-USUAL = 0.7
-"""What moves differs from the median in three of ten images or more; what is hidden at times, in fewer."""
-MOMENTS = 8
-"""Images of one camera that are compared."""
-SHOWS = 1e-3
-"""Sum of weights, in pixels, from which a Gaussian counts as visible in an image."""
+DIFFERS = 0.06  # Difference from the median image, mean over channels, from which a pixel shows something else
+MIN_SAME = 3  # Fewest images of one camera whose median shows what is still
+USUAL = 0.7  # What moves differs from the median in three of ten images or more; what is hidden at times, in fewer
+MOMENTS = 8  # Images of one camera that are compared
+SHOWS = 1e-3  # Sum of weights, in pixels, from which a Gaussian counts as visible in an image
+SURE_FRACTION = 0.5  # Fraction of a Gaussian in motion masks, where it is seen, from which it surely moves
 
 
 @dataclass(frozen=True)
 class StillErrors:
-    """Errors of a static scene in the images, per Gaussian.
+    """Errors of a static scene in the images, per Gaussian."""
 
-    Attributes:
-        most: (N,) large where anything moves, be it this Gaussian or what hides it at times.
-        usual: (N,) large where this moves.
-    """
-
-    most: Tensor
-    usual: Tensor
+    most: Tensor  # (N,) large where anything moves, be it this Gaussian or what hides it at times
+    usual: Tensor  # (N,) large where this moves
 
 
 def still_errors(
@@ -59,12 +52,6 @@ def still_errors(
     whatever is still exactly as it is; ``most`` is the largest, ``usual`` the ``USUAL`` quantile of e_vi over images
     in which a Gaussian shows. Else the rendering is expected, and both are the mean, weighted by sum_p w_vip: a still
     model that is not yet right errs too.
-
-    Args:
-        gaussians_at: N Gaussians at a time.
-        images: one or more, as many as are to be looked at.
-        background: (3,) colour.
-        shader_at: what colours the Gaussians at a time; None: their harmonics.
     """
     expected = _median_images(images, background)
     looked_at = [p for p in images if _camera_key(p) in expected] if expected else images
@@ -75,40 +62,62 @@ def still_errors(
             with torch.no_grad():
                 shader = shader_at(image.time or 0.0)
                 shown = render(gaussians, image.cameras, options, background=background, shader=shader).rgb[0]
-        signed, weight = signed_errors(gaussians, image, options, background, shown)
-        found.append((signed.abs().mean(1), weight))
+        counts = torch.ones(shown.shape[:2], device=shown.device) if image.mask is None else image.mask
+        error = (shown - image.composite(background)) * counts[..., None]
+        weights = counts[..., None].expand_as(error).contiguous()
+        signed, weight = weighted_sums(gaussians, image.cameras, options, [error, weights])
+        found.append((signed.abs().mean(1), weight[:, 0]))
     errors, weights = torch.stack([x for x, _ in found]), torch.stack([x for _, x in found])
     if not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
         return StillErrors(mean, mean)
     shows = weights > SHOWS
-    ordered = torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0).sort(dim=0, descending=True).values
-    usual = ((1 - USUAL) * shows.sum(0)).long()
-    return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
+    return _ranked(torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0), shows)
 
 
-def signed_errors(
-    gaussians: Gaussians, image: Image, options: RenderOptions, background: Tensor, expected: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return, per Gaussian, sums over pixels of its blending weight times the signed error, and of the weight alone.
+def moving_fractions(
+    gaussians_at: Callable[[float], Gaussians], images: Sequence[Image], options: RenderOptions, sure: float
+) -> StillErrors:
+    """Return the fraction of each Gaussian that lies in motion masks where it is seen, scaled as ``still_errors``.
 
-    Args:
-        gaussians: N, as they are drawn.
-        image: the truth; masked pixels do not count.
-        options: how to draw.
-        background: (3,) colour.
-        expected: (H, W, 3) image that is compared with it.
-
-    Returns:
-        (N, 3) and (N,); both come from passes back through the blending of a constant colour.
+    s_vi = sum_p w_vip m_vp / sum_p w_vip with w = alpha T and m the mask of image v. What stands behind is covered in
+    fewer images. Those without a mask do not count; ``sure`` is the error that ``SURE_FRACTION`` stands for.
     """
-    counts = torch.ones(expected.shape[:2], device=expected.device) if image.mask is None else image.mask
-    error = (expected - image.composite(background)) * counts[..., None]
+    sums, weights = [], []
+    for image in images:
+        if image.moves is None:
+            continue
+        counts = torch.ones_like(image.moves) if image.mask is None else image.mask
+        # One pass sums both weights, each in a channel of its own.
+        both = torch.stack([image.moves * counts, counts, 0 * counts], dim=-1)
+        gaussians = gaussians_at(image.time or 0.0).detach()
+        (found,) = weighted_sums(gaussians, image.cameras, options, [both])
+        sums.append(found[:, 0])
+        weights.append(found[:, 1])
+    weight = torch.stack(weights)
+    seen = SH_C0 * SHOWS  # weights come out times the constant harmonic
+    shows = weight > seen
+    fraction = torch.where(shows, torch.stack(sums) / weight.clamp_min(seen), 0.0)
+    return _ranked(fraction * (sure / SURE_FRACTION), shows)
+
+
+def weighted_sums(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions, images: Sequence[Tensor]
+) -> list[Tensor]:
+    """Return, for each image (H, W, 3), the (N, 3) sums over its pixels, times the blending weight of each Gaussian.
+
+    By passes back through the blending of a constant colour.
+    """
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
-    blended = render(gaussians.replace(sh=flat), image.cameras, options).rgb[0]
-    (signed,) = torch.autograd.grad(blended, flat, error, retain_graph=True)
-    (weight,) = torch.autograd.grad(blended, flat, counts[..., None].expand_as(error).contiguous())
-    return signed[:, 0], weight[:, 0, 0]
+    blended = render(gaussians.replace(sh=flat), cameras, options).rgb[0]
+    return [torch.autograd.grad(blended, flat, image, retain_graph=True)[0][:, 0] for image in images]
+
+
+def _ranked(errors: Tensor, shows: Tensor) -> StillErrors:
+    """Return the largest and the ``USUAL`` quantile of ``errors`` (V, N) over the images in which a Gaussian shows."""
+    ordered = errors.sort(dim=0, descending=True).values
+    usual = ((1 - USUAL) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
+    return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
 
 
 def cameras_in_place(views: Sequence[View]) -> list[list[int]]:
@@ -154,9 +163,6 @@ def differing_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
 
     Each image is first brought to the brightness of the median (changing exposure is no motion) and averaged over
     2x2 pixels, against noise.
-
-    Args:
-        cameras: images (H, W, 3) in [0, 1] of each camera that stays in place.
     """
     differing = total = 0
     for images in cameras:

@@ -18,14 +18,7 @@ FRONTIER_VIEWS = 6
 
 @dataclass(frozen=True)
 class TimeWindow:
-    """The times that are trained on at each step.
-
-    Attributes:
-        strays: |time - 0.5| of all training views, ascending.
-        first: views in the window at the start, as a fraction of all.
-        begins: step up to which all views are trained on, because nothing moves yet.
-        opens, full: steps between which the window grows evenly, in views, to all of them.
-    """
+    """The times that are trained on at each step."""
 
     strays: tuple[float, ...]
     first: float
@@ -35,11 +28,9 @@ class TimeWindow:
 
     @staticmethod
     def around_middle(times: Sequence[float], first: float, begins: int, opens: int, full: int) -> TimeWindow:
-        """Return the window over the times of all training views."""
         return TimeWindow(tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full)
 
     def num_views(self, step: int) -> int:
-        """Return the number of views in the window at ``step``."""
         start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
         progress = (step - self.opens) / max(self.full - self.opens, 1)
         return start + int(min(max(progress, 0.0), 1.0) * (len(self.strays) - start))

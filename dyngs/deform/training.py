@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel
+from dyngs.config import ControlNodesField, DynamicModel
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup, Offsets, deformed
-from dyngs.deform.fields import can_begin_on_its_way, field_on_its_way, new_field
+from dyngs.deform.fields import field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.motion import bake_, measure_motion
@@ -34,61 +34,40 @@ from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, fields_moved_to, with_role
 
-SURELY_MOVING = 1.5
-"""Multiple of ``motion_threshold`` above which an error always counts as motion."""
+SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
-MIN_MOVING_FRACTION = 0.02
-"""Fraction of surely moving Gaussians up to which the scene counts as still."""
+MIN_MOVING_FRACTION = 0.02  # Fraction of surely moving Gaussians up to which the scene counts as still
 
 
 @dataclass(frozen=True)
 class DeformSchedule:
-    """The steps at which the phases of training begin.
+    """The steps at which the phases of training begin."""
 
-    Attributes:
-        fine: last step without motion.
-        opens, full: steps between which the window of times grows, to all of them.
-        decays: step from which the field's rates fall.
-        splits: steps after which Gaussians that do not move are frozen.
-        rates: how the field's rates fall.
-    """
-
-    fine: int
+    fine: int  # last step without motion
+    # opens, full: steps between which the window of times grows, to all of them
     opens: int
     full: int
-    decays: int
-    splits: tuple[int, ...]
+    decays: int  # step from which the field's rates fall
+    splits: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
     rates: Rates
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Properties of the capture that training a dynamic scene needs.
+    """Properties of the capture that training a dynamic scene needs."""
 
-    Attributes:
-        times: of the training views, in [0, 1], ascending; at least two differ.
-        cameras: the training cameras.
-        extent: of the scene, world units.
-        still_errors: how far its images disagree with what is still, where N Gaussians are seen.
-        cameras_stay: in place, so that images show what is still exactly alike.
-        standing: returns what those cameras show.
-    """
-
-    times: tuple[float, ...]
+    times: tuple[float, ...]  # of the training views, in [0, 1], ascending; at least two differ
     cameras: Sequence[Cameras]
     extent: float
+    # how far its images disagree with what is still, where N Gaussians are seen
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
-    cameras_stay: bool = False
-    standing: Callable[[], Sequence[Footage]] = tuple
+    cameras_stay: bool = False  # in place, so that images show what is still exactly alike
+    standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):
-    """See ``SceneTraining``.
-
-    Attributes:
-        times: distinct times of the training views, ascending.
-    """
+    """See ``SceneTraining``."""
 
     moves_by = ("field", "model.deform")
 
@@ -106,11 +85,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
-        """Return the scene of the first Gaussians: nothing moves yet."""
         return DynamicScene(gaussians=gaussians, seen_at=self.times, filter_std=self._update.of(gaussians))
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return whether ``time`` lies in the window of ``step``."""
         return self._window.holds(time or 0.0, step)
 
     def window(self, step: int) -> tuple[float, float]:
@@ -121,7 +98,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene.field.extend(seen, self._window.bounds(step))
 
     def time_step(self, scene: DynamicScene, image: Image, step: int) -> GaussianTimeStep:
-        """Return the moment drawn for ``image`` at its time, and the regularizers of motion."""
         if scene.field is None:
             return scene.time_step(image.time)
         time = image.time or 0.0
@@ -132,18 +108,15 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return GaussianTimeStep(gaussians, image.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
-        """Update the field."""
         if scene.field is None:
             return 0
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
         return scene.field.parameters.step(step - self.schedule.fine, progress)
 
     def learned(self, scene: DynamicScene) -> Parameters | None:
-        """Return what the field learns."""
         return None if scene.field is None else scene.field.parameters
 
     def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
-        """Return the scene with its filter up to date, the field extended to new times, static Gaussians frozen."""
         if self._update.is_due(step, edited):
             scene = replace(scene, filter_std=self._update.of(scene.gaussians))
         if scene.field is None:
@@ -175,7 +148,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
-        if first.seeds:
+        if first.seeds and isinstance(self.options.deform, ControlNodesField):
             others = now.means.detach()[rows].cpu()  # tracks and seeds are found on the CPU
             field = field_on_its_way(self.options.deform, fields_moved_to(setup, "cpu"), first, others)
             self._on_its_way(True)
@@ -198,7 +171,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return DynamicScene.restored(self.options, gaussians, tensors)
 
     def state(self) -> State:
-        """Return whether tracks are known, so that all times are trained on."""
         return with_role({"tracked": torch.ones(1, device="cpu")}, Role.TRAINING) if self._tracked else {}
 
     def _on_its_way(self, tracked: bool) -> None:
@@ -209,7 +181,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def _first_motion(self, still: Gaussians, rows: Tensor) -> FirstMotion:
         """Return what travels before fixed cameras, for a field that can begin on its way."""
-        if not can_begin_on_its_way(self.options.deform):
+        if not isinstance(self.options.deform, ControlNodesField):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still, rows, self.capture.extent, limit)

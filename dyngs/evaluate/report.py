@@ -22,7 +22,7 @@ from dyngs.evaluate.temporal import TimeScore, flicker_error, flicker_of_split, 
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import Drawing, PoseScores, ViewScore, means_of, score_views
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.metrics import Lpips, LpipsNet, load_lpips, psnr
@@ -226,7 +226,7 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
         "step": run.step,
         "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size if has_only_scene_file(run_dir) else None,
     }
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, GaussianScene):
         values = sum(x.tensor.numel() for x in scene.drawing_state().values())
         none = {"num_gaussians": 0, "num_moving": 0, "moving_fraction": 0.0, "field_mb": 0.0, "colour_floats": 0.0}
         return facts | none | {"model_mb": 4e-6 * values}
@@ -274,12 +274,12 @@ def report_path(run_dir: Path, split: str) -> Path:
 def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:
     tracks = read_true_tracks(capture.root, capture.world_offset)
     cameras = training_cameras(views, run.config.data)
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, GaussianScene):
         return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")
     return track_scores(scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits))
 
 
-def parameter_megabytes(scene: Scene) -> float:
+def parameter_megabytes(scene: GaussianScene) -> float:
     """Return the size in 1e6 bytes as float32: 236 bytes per Gaussian at SH degree 3, the field, and masks as bits.
 
     Harmonics of a Gaussian that are all zero beyond the base colour do not count.

@@ -16,7 +16,7 @@ from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.times import SAME_TIME
 from dyngs.data.tracks import TRACKS_FILE, TrueTracks
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 
 CARRIERS = 4  # K, nearest Gaussians that carry a point, weighted by opacity
 MIN_OPACITY = 0.3  # fainter Gaussians carry nothing
@@ -39,7 +39,7 @@ class TrackScores:
 
 
 def track_scores(
-    scene: Scene, tracks: TrueTracks | None, split: Sequence[tuple[View, Cameras]], views: Sequence[View]
+    scene: GaussianScene, tracks: TrueTracks | None, split: Sequence[tuple[View, Cameras]], views: Sequence[View]
 ) -> TrackScores:
     """Return the errors of a scene's motion in the images of a split, of which each view has its camera.
 
@@ -86,7 +86,7 @@ class _Bound:
     weights: np.ndarray  # (P, K), each row sums to 1
     positions: np.ndarray  # (P, K, 3) of the carriers when they were bound
 
-    def carried(self, scene: Scene, time: float) -> np.ndarray:
+    def carried(self, scene: GaussianScene, time: float) -> np.ndarray:
         """Return the (P, 3) points at ``time``."""
         means = scene.at(time).means.detach().cpu().double().numpy()
         return self.points + (self.weights[..., None] * (means[self.carriers] - self.positions)).sum(axis=1)
@@ -101,7 +101,7 @@ def _times_of(tracks: TrueTracks, views: Sequence[View]) -> np.ndarray:
     return times
 
 
-def _bind(scene: Scene, tracks: TrueTracks, times: np.ndarray) -> _Bound:
+def _bind(scene: GaussianScene, tracks: TrueTracks, times: np.ndarray) -> _Bound:
     """Return the points bound to the nearest Gaussians, each at its own one of the (T,) times."""
     from scipy.spatial import KDTree
 
@@ -144,7 +144,7 @@ def _binding_rows(tracks: TrueTracks, times: np.ndarray) -> dict[int, list[int]]
     return rows
 
 
-def _opacities(scene: Scene, time: float | None) -> np.ndarray:
+def _opacities(scene: GaussianScene, time: float | None) -> np.ndarray:
     """Return the (N,) opacities at ``time``; None: canonical ones."""
     gaussians = scene.gaussians if time is None else scene.at(time)
     return torch.sigmoid(gaussians.logit_opacities.detach()).cpu().double().numpy()

@@ -15,7 +15,7 @@ from dyngs.camera_paths.path import CameraPath, path_file, read_path, resize_cam
 from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.export.images import file_stems
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
@@ -104,7 +104,7 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
 
 def points_at(scene: Renderable, time: float | None = None) -> Tensor:
     """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box of all else."""
-    return scene.at(time).means if isinstance(scene, Scene) else scene.bounds
+    return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
 def front_of(opened: Opened, ring: Cameras) -> int:

@@ -13,7 +13,7 @@ from dyngs.camera_paths.orbit import frame_orbit_for_points
 from dyngs.camera_paths.path import resize_cameras
 from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.rendering import render
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr
 from dyngs.runs.opened import Opened
 from dyngs.splats.formats import Written, read_splats
@@ -45,7 +45,7 @@ class Redrawn:
         return self.psnr < FAINT
 
 
-def compare_run(opened: Opened, scene: Scene, time: float, meant: SplatFile, read: SplatFile) -> Redrawn:
+def compare_run(opened: Opened, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile) -> Redrawn:
     """Return how a file differs from a scene at one time, seen by cameras of its capture, else from an orbit.
 
     ``time``: in [0, 1]. ``meant``: what the file is meant to hold, turned from the axes of the scene. Raises

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import restored_scene
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
@@ -78,6 +78,6 @@ def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], afte
     return replace(precision, change=change)
 
 
-def num_bytes_exact(scene: Scene) -> int:
+def num_bytes_exact(scene: GaussianScene) -> int:
     """Return the bytes of what drawing needs, as it is in memory."""
     return sum(x.numel() * x.itemsize for x in drawable(scene).values())

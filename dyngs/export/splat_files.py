@@ -19,7 +19,7 @@ from dyngs.errors import DyngsError, counted
 from dyngs.files.temporary import temporary_folder_beside
 from dyngs.files.write import atomic_file
 from dyngs.gaussians.colour.bake import with_harmonics
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.formats import Written, turned_file, write_splats
@@ -129,7 +129,7 @@ def frame_names(count: int, suffix: str = ".ply") -> list[str]:
     return [f"frame_{i:0{digits}d}{suffix}" for i in range(count)]
 
 
-def scene_part(scene: Scene, part: Part) -> Scene:
+def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
     """Return a part of a scene. Raises DyngsError if it is empty."""
     if part == "all":
         return scene
@@ -140,7 +140,7 @@ def scene_part(scene: Scene, part: Part) -> Scene:
     return found
 
 
-def splats_at(opened: Opened, scene: Scene, time: float, how: Writing = AS_THEY_ARE) -> SplatFile:
+def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = AS_THEY_ARE) -> SplatFile:
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked for."""
     model = opened.config.model
     with torch.no_grad():
@@ -156,7 +156,7 @@ def splats_at(opened: Opened, scene: Scene, time: float, how: Writing = AS_THEY_
     return turned_file(splat, how.turn, how.up)
 
 
-def _write(opened: Opened, scene: Scene, path: Path, time: float, how: Writing) -> Written:
+def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: Writing) -> Written:
     return write_splats(path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree)
 
 
@@ -191,7 +191,7 @@ class Tracks:
 
 
 def tracks_of(
-    scene: Scene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
+    scene: GaussianScene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
 ) -> Tracks:
     """Return the tracks of a scene, or with ``part`` "moving" of what moves, in coordinates of the capture.
 

@@ -11,8 +11,7 @@ from torch import Tensor
 from dyngs.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.tensor_checks import require_tensor
 
-LARGEST_LOG_SCALE = 88
-"""Natural logarithm of the largest size that float32 can hold, rounded down."""
+LARGEST_LOG_SCALE = 88  # Natural logarithm of the largest size that float32 can hold, rounded down
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Return the degree of the harmonics."""
+        """Degree of the harmonics."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def tensors(self) -> dict[str, Tensor]:
@@ -131,14 +130,10 @@ class TopologyEdit:
 
     Row ``i`` of the new set descends from row ``source[i]`` of the old one: clone, split, prune and relocate are all
     ``x[source]``. Where ``is_new`` is set, optimizer moments start at zero.
-
-    Attributes:
-        source: (N_new,) long indices into the old set.
-        is_new: (N_new,) bool.
     """
 
-    source: Tensor
-    is_new: Tensor
+    source: Tensor  # (N_new,) long indices into the old set
+    is_new: Tensor  # (N_new,) bool
 
     def apply(self, x: Tensor) -> Tensor:
         """Return the rows of ``x`` (N_old, ...) rearranged to (N_new, ...)."""
@@ -159,16 +154,10 @@ class TopologyEdit:
 
 @dataclass(frozen=True)
 class EditResult:
-    """A change of the set of Gaussians and of their values.
+    """A change of the set of Gaussians and of their values."""
 
-    Attributes:
-        edit: how rows move; None where all stay in place.
-        changes: field name to its new values (N_new, ...), for the fields that are not just rows moved.
-        zero_moments: fields whose optimizer moments start anew in every row.
-        finding: a line for people about why, or None.
-    """
-
-    edit: TopologyEdit | None
+    edit: TopologyEdit | None  # how rows move; None where all stay in place
+    # field name to its new values (N_new, ...), for the fields that are not just rows moved
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
-    zero_moments: frozenset[str] = frozenset()
-    finding: str | None = None
+    zero_moments: frozenset[str] = frozenset()  # fields whose optimizer moments start anew in every row
+    finding: str | None = None  # a line for people about why, or None

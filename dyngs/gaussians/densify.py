@@ -16,32 +16,23 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import rotate
 from dyngs.tensor_checks import require_tensor
 
-DENSE_FRACTION = 0.01
-"""Scale, in scene extents, up to which Gaussians are cloned; larger ones are split."""
-PRUNE_SCALE = 0.1
-"""Scale, in scene extents, from which Gaussians are removed after the first opacity reset."""
+DENSE_FRACTION = 0.01  # Scale, in scene extents, up to which Gaussians are cloned; larger ones are split
+PRUNE_SCALE = 0.1  # Scale, in scene extents, from which Gaussians are removed after the first opacity reset
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
-MAX_LOG_VARIANCE = 60.0
-"""Random offsets stay finite whatever the scales."""
+MAX_LOG_VARIANCE = 60.0  # Random offsets stay finite whatever the scales
 
 
 @dataclass(frozen=True)
 class DensifySchedule:
-    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with its length).
+    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with its length)."""
 
-    Attributes:
-        start, stop: changes happen strictly between the two.
-        every: steps between changes.
-        resets: steps at which opacities are lowered.
-        prune_scale_after: from this step on, Gaussians that are too large are removed.
-    """
-
+    # start, stop: changes happen strictly between the two
     start: int
     stop: int
     every: int
     resets: tuple[int, ...] = ()
-    prune_scale_after: int = 0
+    prune_scale_after: int = 0  # from this step on, Gaussians that are too large are removed
 
     def densifies_at(self, step: int) -> bool:
         return self.start < step < self.stop and step % self.every == 0
@@ -82,7 +73,6 @@ class Densifier:
         """Limit the number of Gaussians from now on; none are removed. Not part of the state."""
 
     def state(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint must hold, by name."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -199,8 +189,6 @@ def plan_edit(
     """Return the plan of one densification.
 
     Args:
-        score: (N,) mean gradient norm of the 2D means in NDC units.
-        extent: of the scene, world units.
         max_scale: larger Gaussians are removed, world units.
     """
     scale = parameters.log_scales.amax(1).exp()

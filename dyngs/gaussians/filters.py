@@ -13,11 +13,9 @@ from dyngs.gaussians import Gaussians
 from dyngs.state import Role, State, StateTensor
 from dyngs.tensor_checks import require_tensor
 
-FILTER_VARIANCE = 0.2
-"""Variance of the filter in squared sampling intervals."""
+FILTER_VARIANCE = 0.2  # Variance of the filter in squared sampling intervals
 NEAR = 0.2
-MARGIN = 0.15
-"""Cameras count as seeing what lies within the image enlarged by this fraction on each side."""
+MARGIN = 0.15  # Cameras count as seeing what lies within the image enlarged by this fraction on each side
 
 
 def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
@@ -25,10 +23,6 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
 
     The nearest depth is over the cameras that see a Gaussian at depth > 0.2; a Gaussian that none sees gets the largest
     nearest depth of the others (1 where there are no others). Constant with respect to gradients.
-
-    Args:
-        means: (N, 3) in the world.
-        cameras: the training cameras, with the intrinsics of the images that are trained on.
     """
     means = means.detach()
     nearest = torch.full((len(means),), torch.inf, device=means.device)
@@ -61,9 +55,6 @@ def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
 
     All in logarithms, one axis at a time, because products of scales underflow: log o' / (1 - o') is taken from
     log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive terms.
-
-    Args:
-        std: (N,) from ``filter_std``.
     """
     log_scales = torch.logaddexp(2 * gaussians.log_scales, 2 * std.log()[:, None]) / 2
     log_ratio = (gaussians.log_scales - log_scales).sum(1).clamp_max(0)
@@ -104,7 +95,6 @@ class FilterUpdate:
         self.cameras, self.steps = cameras, steps
 
     def of(self, gaussians: Gaussians) -> Tensor | None:
-        """Return the filter (N,) of the Gaussians; None where there is none."""
         return filter_std(gaussians.means, self.cameras) if self.cameras else None
 
     def is_due(self, step: int, edited: bool) -> bool:

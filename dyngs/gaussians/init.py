@@ -18,27 +18,19 @@ from dyngs.data.scene_space import MIN_VIEWS, outside_of_cube, points_in_frusta
 from dyngs.gaussians import Gaussians
 
 START_OPACITY = 0.1
-MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1
-"""Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with."""
+MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with
 MIN_SQUARED_DISTANCE = 1e-7
 EXTENT_MARGIN = 1.1
-CANDIDATES = 4
-"""Random points that are drawn per one that is taken, where what the cameras see decides."""
+CANDIDATES = 4  # Random points that are drawn per one that is taken, where what the cameras see decides
 
 
 @dataclass(frozen=True)
 class StartValues:
-    """Scales and opacities of the first Gaussians, by strategy.
+    """Scales and opacities of the first Gaussians, by strategy."""
 
-    Attributes:
-        opacity: in (0, 1).
-        scale_factor: multiplies the distance to the nearest neighbours.
-        max_gaussians: more points than this are thinned at random.
-    """
-
-    opacity: float = START_OPACITY
-    scale_factor: float = 1.0
-    max_gaussians: int = 3_000_000
+    opacity: float = START_OPACITY  # in (0, 1)
+    scale_factor: float = 1.0  # multiplies the distance to the nearest neighbours
+    max_gaussians: int = 3_000_000  # more points than this are thinned at random
 
     @staticmethod
     def for_strategy(strategy: Strategy) -> StartValues:
@@ -54,23 +46,16 @@ class StartValues:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Cameras and extent of a scene before training, in world units.
-
-    Attributes:
-        views: the training cameras, one or more.
-        points: (P, 3) sparse points, or None.
-        points_rgb: (P, 3) their colours, uint8; None without points.
-        around_origin: by convention the scene lies around the origin (Blender scenes), where the cameras look there.
-    """
+    """Cameras and extent of a scene before training, in world units."""
 
     views: Sequence[View]
-    points: np.ndarray | None = None
+    points: np.ndarray | None = None  # (P, 3) sparse points, or None
     points_rgb: np.ndarray | None = None
+    # by convention the scene lies around the origin (Blender scenes), where the cameras look there
     around_origin: bool = False
 
     @property
     def camera_centers(self) -> np.ndarray:
-        """(V, 3) centres of the training cameras."""
         poses = np.stack([view.cam_from_world for view in self.views])
         return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
 
@@ -108,9 +93,6 @@ def initial_gaussians(
 
     ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the scene's points; where
     there are none it draws that cube if the scene may lie in it by convention, else what the cameras see together.
-
-    Args:
-        generator: a CPU generator; the only source of randomness.
     """
     if options.kind != "random" and scene.points is not None and scene.points_rgb is not None:
         finite = np.isfinite(scene.points).all(axis=1)

@@ -28,7 +28,6 @@ class McmcDensifier(Densifier):
     touches_all = True
 
     def __init__(self, options: McmcStrategy, schedule: DensifySchedule, growth: float) -> None:
-        """Take the options; ``growth`` is the fraction of Gaussians added per change at the run's length."""
         self.options, self.schedule, self.growth = options, schedule, growth
         self.max_gaussians = options.max_gaussians
 
@@ -112,8 +111,6 @@ def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> 
     up.
 
     Args:
-        opacities: (n,) float64 in (0, 1].
-        copies: (n,) long, how many there will be (treated as at most 50).
         min_opacity: lower bound of o'; where it acts, the integral is not kept.
 
     Returns:
@@ -131,6 +128,5 @@ def relocated(opacities: Tensor, copies: Tensor, min_opacity: float = 0.005) -> 
 
 
 def _binomials() -> Tensor:
-    """Return (51, 51) table of C(N, j), float64."""
     rows = [[float(math.comb(n, j)) for j in range(MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)]
     return torch.tensor(rows, dtype=torch.float64, device="cpu")

@@ -12,7 +12,6 @@ from torch import Tensor
 from dyngs.config import AutoColour, Config, DefaultStrategy, SceneModel
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, TrainingLooks
@@ -21,17 +20,17 @@ from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import GaussianTimeStep, Scene, render_options
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import active_sh_degree, means_rate, rates_of
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Setting
+from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, prefixed, with_role
 
-S = TypeVar("S", bound=Scene)
+S = TypeVar("S", bound=GaussianScene)
 
 
 class SceneTraining(Generic[S]):
@@ -44,11 +43,9 @@ class SceneTraining(Generic[S]):
     moves_by: tuple[str, str] = ("", "")
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        """Return whether an image of ``time`` may be trained on in ``step``; at each step some may."""
         return True
 
     def window(self, step: int) -> tuple[float, float]:
-        """Return the first and last time that are trained on at ``step``."""
         return 0.0, 1.0
 
     def extend(self, scene: S, seen: tuple[float, float], step: int) -> None:
@@ -63,17 +60,10 @@ class SceneTraining(Generic[S]):
         return 0
 
     def learned(self, scene: S) -> Parameters | None:
-        """Return what the scene learns; None: nothing."""
         return None
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
-        """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen.
-
-        Args:
-            scene: after the optimizers and the strategy.
-            step: that was done.
-            edited: the set of Gaussians has just changed.
-        """
+        """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen."""
         return scene
 
     def revised(self, scene: S, step: int) -> tuple[S, EditResult] | None:
@@ -81,36 +71,24 @@ class SceneTraining(Generic[S]):
         return None
 
     def all_moving(self, scene: S, extent: float) -> S:
-        """Return ``scene`` as expensive to draw as it may become: all Gaussians move, by an untrained field if need be.
-
-        Args:
-            scene: N Gaussians.
-            extent: of the scene, world units.
-        """
+        """Return ``scene`` as expensive to draw as it may become: all Gaussians move."""
         return scene
 
     def follow(self, edit: TopologyEdit) -> None:
         """Let what the training itself keeps per Gaussian follow a change of the set."""
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> S:
-        """Return the scene of a checkpoint, and take over the training's state.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: the tensors do not fit together.
-        """
+        """Return the scene of a checkpoint, and take over the training's state."""
         raise NotImplementedError
 
     def state(self) -> State:
-        """Return the tensors that a checkpoint must hold beside the scene."""
         return {}
 
 
-class GaussianModel(Model[Scene]):
+class GaussianModel(Model[GaussianScene]):
     """A scene of Gaussians in training.
 
     Args:
-        setting: of the run.
         scene: before the first step, or predicted; its Gaussians become leaf tensors.
         training: how its kind is trained.
         densifier: the strategy, which adds and removes Gaussians.
@@ -122,23 +100,23 @@ class GaussianModel(Model[Scene]):
 
     def __init__(
         self,
-        setting: Setting,
-        scene: Scene,
+        run: RunStart,
+        scene: GaussianScene,
         training: SceneTraining[Any],
         densifier: Densifier,
         colours: ColourTraining,
     ) -> None:
-        config = setting.config
+        config = run.config
         self._config, self.densifier, self.colours = config, densifier, colours
-        self._setting, self._generator = setting, setting.generator
+        self._run, self._generator = run, run.generator
         self.options = training_options(config)
         self.begin_with(scene, training)
 
-    def begin_with(self, scene: Scene, training: SceneTraining[Any]) -> None:
+    def begin_with(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
         """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned yet."""
         config = self._config
         self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, config.optim)
-        behind = evaluation_background(config.data.background, self._setting.capture.has_alpha)[1]
+        behind = evaluation_background(config.data.background, self._run.capture.has_alpha)[1]
         self._scene = replace(
             scene.with_gaussians(self._optimizer.parameters),
             colour=self.colours.network,
@@ -147,13 +125,8 @@ class GaussianModel(Model[Scene]):
         )
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> GaussianScene:
         return self._scene
-
-    @property
-    def optimizer_state(self) -> State:
-        """The moments of Adam, by name."""
-        return self._optimizer.state()
 
     @property
     def moves_by(self) -> tuple[str, str]:  # type: ignore[override]
@@ -218,7 +191,7 @@ class GaussianModel(Model[Scene]):
 
     def update(self, step: int) -> Updated:
         before, generator = self._optimizer.parameters, self._generator
-        lr_means = means_rate(self._config.optim, rates_of(self._config).progress(step), self._setting.extent)
+        lr_means = means_rate(self._config.optim, rates_of(self._config).progress(step), self._run.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
         bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
@@ -236,7 +209,7 @@ class GaussianModel(Model[Scene]):
         text = "; ".join(text for text in findings if text) or None
         return Updated(bad, text, self._optimizer.parameters is not before)
 
-    def exchange(self, scene: Scene) -> None:
+    def exchange(self, scene: GaussianScene) -> None:
         """Go on with ``scene``: the same Gaussians, moved, masked or drawn in another way."""
         self._scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene.changed()
@@ -259,7 +232,7 @@ class GaussianModel(Model[Scene]):
 
     def keep_plain(self, plain: Tensor, colour: AutoColour) -> None:
         """Leave the harmonics of the Gaussians ``plain`` (N,) zero from now on."""
-        colours = AutoTraining(colour, self._config.train.steps, len(self._setting.images))
+        colours = AutoTraining(colour, self._config.train.steps, len(self._run.images))
         colours.freeze(plain)
         self.colours = colours
 
@@ -293,16 +266,15 @@ class GaussianModel(Model[Scene]):
         self._optimizer = self._optimizer.to(device)
         self.colours.place(device)
         self.densifier.place(device)
-        scene: Scene = self._scene.to(device)
+        scene: GaussianScene = self._scene.to(device)
         scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene = replace(scene, colour=self.colours.network)
 
     def _options(self, step: int) -> RenderOptions:
-        """Return how images are drawn in ``step``."""
         degree = active_sh_degree(self._config.train, step, self._scene.gaussians.sh_degree)
         return replace(self.options, sh_degree=degree)
 
-    def _apply(self, result: EditResult, edited: Scene | None = None) -> None:
+    def _apply(self, result: EditResult, edited: GaussianScene | None = None) -> None:
         """Change the set of Gaussians, and everything that is stored per Gaussian with it; ``edited``: is already."""
         self._optimizer.apply(result)
         if edited is None:
@@ -322,8 +294,7 @@ class GaussianModel(Model[Scene]):
         return None if found is None else found.text
 
     def _looks(self, step: int) -> TrainingLooks:
-        """Return the training views as they are drawn after ``step``."""
-        images, colour = self._setting.images, background_colour(self._setting.background).to(self._scene.device)
+        images, colour = self._run.images, background_colour(self._run.background).to(self._scene.device)
 
         def views(indices: Sequence[int]) -> Iterator[MeasuredView]:
             for image in (images[i] for i in indices):
@@ -338,18 +309,3 @@ def training_options(config: Config) -> RenderOptions:
     """Return how the training images of a run are drawn."""
     absgrad = isinstance(config.strategy, DefaultStrategy) and config.strategy.absgrad
     return replace(render_options(config.model), absgrad=absgrad, nonfinite="trust")
-
-
-def gaussian_model(model: Model[Any] | None, what: str) -> GaussianModel:
-    """Return ``model`` if it is made of Gaussians.
-
-    Args:
-        model: of any kind.
-        what: is not made of them, for the message.
-
-    Raises:
-        DyngsError: it is made of something else.
-    """
-    if not isinstance(model, GaussianModel):
-        raise DyngsError(f"{what}: is not made of Gaussians, which this needs")
-    return model

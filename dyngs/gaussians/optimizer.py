@@ -14,7 +14,6 @@ from dyngs.ops.adam import Count, seen_rows
 from dyngs.state import State
 
 ADAM_EPS = 1e-15
-"""Epsilon of Adam (3DGS)."""
 
 
 class GaussianOptimizer:
@@ -33,8 +32,6 @@ class GaussianOptimizer:
         """Update the parameters, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
-            step: number of this step, from 1, for Adam's bias correction.
-            lr_means: learning rate of the means, world units.
             frozen_rest: (N,) bool, Gaussians of whose harmonics only the base colour is updated; None: none.
             dense: update all Gaussians; otherwise, if ``optim.sparse``, only those that received a gradient: the others
                 keep parameters and moments.
@@ -71,12 +68,7 @@ class GaussianOptimizer:
         self.parameters = _as_leaves(moved)
 
     def drop_rest(self, base: Tensor, frozen_rest: Tensor) -> None:
-        """Replace harmonics by a base colour, for good: rest and moments become zero; if they do for all, they go.
-
-        Args:
-            base: (N, 3) new constant coefficients.
-            frozen_rest: (N,) bool, the Gaussians that have only that; the others stay as they are.
-        """
+        """Replace harmonics by a base colour, for good: rest and moments become zero; if they do for all, they go."""
         chosen = frozen_rest[:, None, None]
         sh = self.parameters.sh.detach()
         plain = torch.cat([base[:, None], torch.zeros_like(sh[:, 1:])], dim=1)
@@ -87,22 +79,15 @@ class GaussianOptimizer:
         )
 
     def to(self, device: torch.device | str) -> GaussianOptimizer:
-        """Return an optimizer of the same parameters and moments on ``device``."""
         moved = GaussianOptimizer(self.parameters.detach().to(device=device), self.options)
         moved._adam = self._adam.to(device)
         return moved
 
     def state(self) -> State:
-        """Return the moments by name: ``exp_avg.*``, ``exp_avg_sq.*``."""
         return self._adam.state()
 
     def restored(self, parameters: Gaussians, tensors: Mapping[str, Tensor]) -> GaussianOptimizer:
-        """Return an optimizer of copies of ``parameters`` with the moments that ``state`` returned.
-
-        Raises:
-            KeyError: a moment is missing.
-            ValueError: one is not finite float32, or does not fit the parameters.
-        """
+        """Return an optimizer of copies of ``parameters`` with the moments that ``state`` returned."""
         # steps change them in place, and a checkpoint may share its memory with another trainer
         copies = Gaussians(**{name: x.detach().clone() for name, x in parameters.tensors().items()})
         optimizer = GaussianOptimizer(copies, self.options)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-MORTON_BITS = 20
-"""Bits per coordinate; 60 in all."""
+MORTON_BITS = 20  # Bits per coordinate; 60 in all
 INNER, OUTLYING = 0.01, 64.0
 """Quantile and multiple of the box: points farther out than so many of its sides count as its edge."""
 

@@ -20,18 +20,12 @@ class Parameters:
     """Leaf tensors that receive gradients, optimised in place by Adam.
 
     Args:
-        tensors: name to start value.
-        rates: name to learning rate at the first step.
         decay: last over first rate; log-linear between. 0: rates fall linearly to 0.
         roles: of the tensors, one for all or by name.
     """
 
     def __init__(
-        self,
-        tensors: Mapping[str, Tensor],
-        rates: Mapping[str, float],
-        decay: float = 1.0,
-        roles: Roles = Role.SHARED,
+        self, tensors: Mapping[str, Tensor], rates: Mapping[str, float], decay: float = 1.0, roles: Roles = Role.SHARED
     ) -> None:
         self.decay, self.rates = decay, dict(rates)
         self._roles = dict.fromkeys(tensors, roles) if isinstance(roles, Role) else dict(roles)
@@ -42,7 +36,6 @@ class Parameters:
         return self._tensors[name]
 
     def get(self, name: str) -> Tensor | None:
-        """Return the tensor of that name, None without one."""
         return self._tensors.get(name)
 
     def __contains__(self, name: str) -> bool:
@@ -50,19 +43,16 @@ class Parameters:
 
     @property
     def leaves(self) -> list[Tensor]:
-        """The tensors, in a fixed order."""
         return list(self._tensors.values())
 
     @property
     def num_values(self) -> int:
-        """Number of values in all tensors."""
         return sum(x.numel() for x in self._tensors.values())
 
     def step(self, step: int, progress: float) -> Count:
         """Update all tensors, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
-            step: number of this update, from 1.
             progress: 0 at the first update, 1 at the last; decides the rates.
         """
         progress = min(progress, 1.0)
@@ -82,18 +72,13 @@ class Parameters:
         return self._with(moved, edit.apply_moments) if names else self
 
     def rearranged(self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor) -> Parameters:
-        """Return the parameters with other values for some tensors; row i has the moments of the old row ``source[i]``.
-
-        Rows that are new have zero moments, whatever their source.
-        """
+        """Return the parameters with other values for some tensors, and the moments of the old rows ``source``."""
         return self._with(values, lambda x: _moments_of(x, source, is_new))
 
     def values(self) -> dict[str, Tensor]:
-        """Return name to value, detached."""
         return {name: x.detach() for name, x in self._tensors.items()}
 
     def state(self) -> State:
-        """Return values and moments by name."""
         return {name: StateTensor(x, self._roles[name]) for name, x in self.values().items()} | self._adam.state()
 
     def restored(self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None) -> Parameters:
@@ -102,12 +87,7 @@ class Parameters:
         Where no moments are stored, as in files for drawing, they are 0.
 
         Args:
-            tensors: names to values and moments.
             rows: names of the tensors that have another number of rows than now, and what it must be.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one has another type or shape, or is not finite.
         """
         values = {
             name: require_tensor(name, tensors[name], ((rows or {}).get(name, len(x)), *x.shape[1:]), x.dtype)
@@ -121,7 +101,6 @@ class Parameters:
         return found
 
     def to(self, device: torch.device | str) -> Parameters:
-        """Return the parameters on ``device``."""
         found = Parameters(moved_to(self.values(), device), self.rates, self.decay, self._roles)
         found._adam = self._adam.to(device)
         return found

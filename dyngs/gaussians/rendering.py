@@ -19,8 +19,7 @@ from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 
-FOCAL_LENGTHS = (1e-6, 1e12)
-"""Smallest and largest allowed, px; beyond them gradients leave the range of float32."""
+FOCAL_LENGTHS = (1e-6, 1e12)  # Smallest and largest allowed, px; beyond them gradients leave the range of float32
 ROTATION_TOLERANCE = 0.01
 """Largest entry of ``R^T R - I`` of a pose that is drawn; half precision rounds by a tenth of that."""
 
@@ -73,25 +72,19 @@ class RenderOptions(DrawOptions):
 
     @property
     def projection(self) -> ProjectionOptions:
-        """The part that concerns the projection."""
         antialiased = self.mode == RasterizeMode.ANTIALIASED
         return ProjectionOptions(self.eps2d, self.near, self.far, self.alpha_min, antialiased=antialiased)
 
     @property
     def blending(self) -> BlendOptions:
-        """The part that concerns the blending."""
         return BlendOptions(self.alpha_min, self.alpha_max, self.transmittance_min, self.absgrad)
 
 
 @dataclass(frozen=True)
 class GaussianRendering(Rendering):
-    """V rendered images of N Gaussians.
+    """V rendered images of N Gaussians."""
 
-    Attributes:
-        radii: (V, N, 2) int32 half extents in px, 0 = not drawn.
-    """
-
-    radii: Tensor
+    radii: Tensor  # (V, N, 2) int32 half extents in px, 0 = not drawn
 
 
 def render(
@@ -124,7 +117,6 @@ def render(
     Args:
         gaussians: N Gaussians, float32 (production), float64 (checks) or half (computed in float32).
         cameras: V cameras, on the device of the Gaussians.
-        options: settings.
         background: (3,) or (V, 3) colour; None = black.
         probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
         shader: gives the colours; None: the Gaussians' harmonics do.
@@ -191,9 +183,6 @@ def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions
             torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]), 64, 48
         )
         seen = dyngs.contributions(scene.gaussians, cameras).sum(0) > 0
-
-    Raises:
-        DyngsError: as ``render``.
     """
     gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
     projection, opacities = _project(gaussians, cameras, options)
@@ -211,9 +200,6 @@ def sensitivities(
     """Return the (V, N) sums over pixels of (dI/dG)^2 (Tu et al. 2026).
 
     I is the sum of a pixel's channels, G the value of the 2D Gaussian there.
-
-    Raises:
-        DyngsError: as ``render``.
     """
     gaussians, cameras = _checked(gaussians.detach(), cameras, background, options)
     projection, opacities = _project(gaussians, cameras, options)
@@ -227,7 +213,6 @@ def sensitivities(
 def _colors(
     gaussians: Gaussians, cameras: Cameras, radii: Tensor, options: RenderOptions, shader: Shader | None
 ) -> Tensor:
-    """Return the colours (V, N, 3)."""
     if shader is not None:
         return shader(gaussians, cameras, radii)
     degree = gaussians.sh_degree if options.sh_degree is None else min(options.sh_degree, gaussians.sh_degree)
@@ -285,11 +270,7 @@ def _check_views(cameras: Cameras, background: Tensor | None) -> None:
 
 
 def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
-    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``.
-
-    Raises:
-        DyngsError: naming the first camera whose focal lengths do not.
-    """
+    """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``."""
     focal, (shortest, longest) = intrinsics.detach().diagonal(dim1=1, dim2=2)[:, :2], FOCAL_LENGTHS
     bad = torch.nonzero(~((focal >= shortest) & (focal <= longest)).all(1))[:, 0]
     if len(bad):
@@ -299,11 +280,7 @@ def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
 
 
 def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
-    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``.
-
-    Raises:
-        DyngsError: naming the first camera whose rotation is mirrored, scaled, sheared or zero.
-    """
+    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``."""
     poses = cam_from_world.detach().double()
     rotations = poses[:, :3, :3]
     unit = torch.eye(3, device=poses.device, dtype=poses.dtype)

@@ -28,28 +28,22 @@ from dyngs.models.views import background_colour
 from dyngs.state import Role, State, prefixed, with_role
 from dyngs.tensor_checks import require_moments
 
-S = TypeVar("S", bound="Scene")
+S = TypeVar("S", bound="GaussianScene")
 
 
 @dataclass(frozen=True)
 class GaussianTimeStep(TimeStep):
-    """Gaussians at one time.
-
-    Attributes:
-        gaussians: as they are drawn; differentiable where gradients are enabled.
-        time: in [0, 1], for colours that depend on it.
-        frame: where the Gaussians are at rest, if colours follow a body.
-        penalties: differentiable regularizers, weighted, by name; empty outside training.
-    """
+    """Gaussians at one time."""
 
     gaussians: Gaussians
     time: float | None = None
-    frame: Frame | None = None
+    frame: Frame | None = None  # where the Gaussians are at rest, if colours follow a body
+    # differentiable regularizers, weighted, by name; empty outside training
     penalties: dict[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene(Renderable):
+class GaussianScene(Renderable):
     """N Gaussians at any time.
 
     Example::
@@ -62,8 +56,6 @@ class Scene(Renderable):
     Attributes:
         gaussians: as stored: canonical, or at rest. In training they are the optimizer's leaf tensors.
         colour: network that colours them; None: their harmonics do.
-        options: how they are drawn unless ``render`` is told otherwise.
-        background: (3,) colour behind them unless ``render`` is told otherwise; None is black.
         masks: which Gaussians are seen around a time; None: all may be, at all times. Only where a field moves some.
     """
 
@@ -95,12 +87,10 @@ class Scene(Renderable):
 
     @property
     def num_moving(self) -> int:
-        """M."""
         return len(self.rows)
 
     @property
     def moving_fraction(self) -> float:
-        """M / N, 0 where nothing moves."""
         return 0.0 if self.is_static else self.num_moving / max(len(self), 1)
 
     @property
@@ -123,7 +113,6 @@ class Scene(Renderable):
 
     @property
     def num_mask_bytes(self) -> int:
-        """Number of bytes of the masks; 0 without any."""
         return 0 if self.masks is None else self.masks.bits.numel()
 
     @abstractmethod
@@ -175,7 +164,7 @@ class Scene(Renderable):
         """Return the scene with only the Gaussians at ``index`` (long or bool)."""
         return self.edited(TopologyEdit.select(index))
 
-    def part(self, which: Literal["moving", "still"]) -> Scene:
+    def part(self, which: Literal["moving", "still"]) -> GaussianScene:
         """Return only the Gaussians that move, or only those that do not."""
         moves = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         if not self.is_static:
@@ -198,7 +187,6 @@ class Scene(Renderable):
         self._derived.clear()
 
     def state(self) -> State:
-        """Return everything that is stored, by name, with its role."""
         return prefixed("gaussians", with_role(self.gaussians.detach().tensors(), Role.PER_GAUSSIAN)) | prefixed(
             "model", self._model_state() | ({} if self.colour is None else prefixed("colour", self.colour.state()))
         )
@@ -208,17 +196,9 @@ class Scene(Renderable):
         """Return the state of this kind of scene beside its Gaussians and colours."""
 
 
-def require_gaussians(scene: Renderable, what: str) -> Scene:
-    """Return ``scene`` if it is made of Gaussians.
-
-    Args:
-        scene: of any kind.
-        what: is not made of them, for the message.
-
-    Raises:
-        DyngsError: it is made of something else.
-    """
-    if not isinstance(scene, Scene):
+def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
+    """Return ``scene`` if it is made of Gaussians."""
+    if not isinstance(scene, GaussianScene):
         raise DyngsError(f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed")
     return scene
 
@@ -228,11 +208,7 @@ def _number(time: float | TimeStep | None) -> float | None:
 
 
 def drawn_as_trained(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
-    """Return a restored scene with the colours of the checkpoint, drawn as the model is.
-
-    Raises:
-        ValueError: the tensors of its colours do not fit together.
-    """
+    """Return a restored scene with the colours of the checkpoint, drawn as the model is."""
     colour, background = network_of(checkpoint.part("model.colour")), background_colour(checkpoint.info.background)
     return replace(scene, colour=colour, options=render_options(model), background=background)
 

@@ -7,23 +7,13 @@ from dataclasses import dataclass
 
 from typing_extensions import assert_never
 
-from dyngs.config import (
-    Config,
-    DefaultStrategy,
-    McmcStrategy,
-    OptimConfig,
-    Strategy,
-    TrainConfig,
-)
+from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
 from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 
-MIN_START = 100
-"""Densification never starts earlier: the first gradients say little."""
-MIN_RESET_GAP = 400
-"""Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)."""
-RESET_FRACTION = 0.2
-"""Fraction of a short run between opacity resets."""
+MIN_START = 100  # Densification never starts earlier: the first gradients say little
+MIN_RESET_GAP = 400  # Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)
+RESET_FRACTION = 0.2  # Fraction of a short run between opacity resets
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
@@ -33,15 +23,10 @@ REWIND = 0.3
 
 @dataclass(frozen=True)
 class Rates:
-    """The course of all learning rates that fall over a run.
-
-    Attributes:
-        steps: of training, at the end of which rates are at their lowest.
-        tuning: steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``.
-    """
+    """The course of all learning rates that fall over a run."""
 
     steps: int
-    tuning: int = 0
+    tuning: int = 0  # steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``
 
     def progress(self, step: int, since: int = 0) -> float:
         """Return 0 up to step ``since``, rising to 1 at the end: the progress of rates that fall from ``since`` on."""

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing_extensions import assert_never
 
-from dyngs.config import (
-    AutoColour,
-    DefaultStrategy,
-    FixedStrategy,
-    McmcStrategy,
-    NetworkColour,
-    ShColour,
-)
+from dyngs.config import AutoColour, DefaultStrategy, FixedStrategy, McmcStrategy, NetworkColour, ShColour
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import box_around
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, NetworkTraining
@@ -20,57 +13,50 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
 from dyngs.gaussians.mcmc import McmcDensifier
 from dyngs.gaussians.schedule import densify_schedule, filter_steps, grad_threshold, growth_per_change
-from dyngs.models.kind import Setting
+from dyngs.models.kind import RunStart
 from dyngs.models.views import training_cameras
 
 
-def first_gaussians(setting: Setting) -> Gaussians:
+def first_gaussians(run: RunStart) -> Gaussians:
     """Return the Gaussians at the points of the capture, or at random."""
-    config, start = setting.config, StartValues.for_strategy(setting.asked.strategy)
-    where = surroundings(setting.capture)
-    return initial_gaussians(where, config.init, start, config.stored_sh_degree, setting.generator)
+    config, start = run.config, StartValues.for_strategy(run.asked.strategy)
+    where = surroundings(run.capture)
+    return initial_gaussians(where, config.init, start, config.stored_sh_degree, run.generator)
 
 
-def colours_of(setting: Setting, gaussians: Gaussians, *, sees_time: bool) -> ColourTraining:
-    """Return how colours are trained.
-
-    Args:
-        setting: of the run.
-        gaussians: the first ones.
-        sees_time: colours of a network may depend on time; not those of a person, which would mean nothing in another
-            motion.
-    """
-    colour, steps = setting.config.colour, setting.config.train.steps
+def colours_of(run: RunStart, gaussians: Gaussians, *, sees_time: bool) -> ColourTraining:
+    """Return how colours are trained."""
+    colour, steps = run.config.colour, run.config.train.steps
     match colour:
         case ShColour():
             return ColourTraining(colour)
         case AutoColour():
-            return AutoTraining(colour, steps, len(setting.capture.splits["train"]))
+            return AutoTraining(colour, steps, len(run.capture.splits["train"]))
         case NetworkColour():
             box = box_around(gaussians.means)
-            return NetworkTraining(colour, steps, box, setting.generator, sees_time=sees_time)
+            return NetworkTraining(colour, steps, box, run.generator, sees_time=sees_time)
         case _:
             assert_never(colour)
 
 
-def densifier_of(setting: Setting) -> Densifier:
+def densifier_of(run: RunStart) -> Densifier:
     """Return the strategy of the run."""
-    strategy, steps, on_white = setting.config.strategy, setting.config.train.steps, setting.background == "white"
+    strategy, steps, on_white = run.config.strategy, run.config.train.steps, run.background == "white"
     match strategy:
         case McmcStrategy():
             schedule = densify_schedule(strategy, steps, on_white)
             return McmcDensifier(strategy, schedule, growth_per_change(steps))
         case DefaultStrategy():
             options = strategy.model_copy(update={"grad_threshold": grad_threshold(strategy, steps)})
-            return DefaultDensifier(options, densify_schedule(strategy, steps, on_white), setting.extent)
+            return DefaultDensifier(options, densify_schedule(strategy, steps, on_white), run.extent)
         case FixedStrategy():
             return Densifier()
         case _:
             assert_never(strategy)
 
 
-def filter_update(setting: Setting) -> FilterUpdate:
+def filter_update(run: RunStart) -> FilterUpdate:
     """Return when the 3D filter of the model is computed anew."""
-    config = setting.config
-    cameras = training_cameras(setting.capture.splits["train"], config.data) if config.model.filter_3d else []
+    config = run.config
+    cameras = training_cameras(run.capture.splits["train"], config.data) if config.model.filter_3d else []
     return FilterUpdate(cameras, filter_steps(config.strategy, config.train.steps))

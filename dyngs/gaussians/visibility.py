@@ -19,27 +19,19 @@ BITS = 8
 
 @dataclass(frozen=True)
 class VisibilityMasks:
-    """Visibility of N Gaussians at K >= 2 key times.
+    """Visibility of N Gaussians at K >= 2 key times."""
 
-    Attributes:
-        times: distinct, ascending, in [0, 1].
-        bits: (K, ceil(N / 8)) uint8; Gaussian i is bit i % 8 of byte i // 8.
-        count: N.
-    """
-
-    times: tuple[float, ...]
-    bits: Tensor
-    count: int
+    times: tuple[float, ...]  # distinct, ascending, in [0, 1]
+    bits: Tensor  # (K, ceil(N / 8)) uint8; Gaussian i is bit i % 8 of byte i // 8
+    count: int  # N
 
     @staticmethod
     def pack(times: tuple[float, ...], seen: Tensor) -> VisibilityMasks:
-        """Return the masks of ``seen`` (K, N) bool."""
         padded = torch.nn.functional.pad(seen, (0, -seen.shape[1] % BITS)).unflatten(1, (-1, BITS))
         return VisibilityMasks(times, (padded * _places()).sum(2).to(torch.uint8), seen.shape[1])
 
     @property
     def seen(self) -> Tensor:
-        """Return (K, N) bool, whether each Gaussian is seen at each key time."""
         return _unpacked(self.bits, self.count)
 
     def interval(self, time: float) -> int:
@@ -52,27 +44,16 @@ class VisibilityMasks:
         return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
 
     def select(self, index: Tensor) -> VisibilityMasks:
-        """Return the masks of the Gaussians at ``index`` (long)."""
         return VisibilityMasks.pack(self.times, self.seen[:, index])
 
     def state(self) -> State:
-        """Return times, packed bits and the number of Gaussians."""
         times = torch.tensor(self.times, dtype=torch.float64, device="cpu")
         count = torch.tensor([self.count], device="cpu")
         return with_role({"times": times, "bits": self.bits, "count": count}, Role.SHARED)
 
     @staticmethod
     def restored(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
-        """Return the masks of a state that ``state()`` returned; None of an empty one.
-
-        Args:
-            state: by name.
-            count: N; None: as the state says.
-
-        Raises:
-            KeyError: something is missing.
-            ValueError: they are not masks of so many Gaussians.
-        """
+        """Return the masks of a state that ``state()`` returned; None of an empty one."""
         if not state:
             return None
         times, bits = state["times"], state["bits"]
@@ -98,6 +79,5 @@ def _places() -> Tensor:
 
 
 def _unpacked(bits: Tensor, count: int) -> Tensor:
-    """Return (K, N) bool of packed bits (K, ceil(N / 8))."""
     places = torch.arange(BITS, dtype=torch.uint8, device=bits.device)
     return ((bits[..., None] >> places) & 1).bool().flatten(1)[:, :count]

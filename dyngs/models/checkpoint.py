@@ -15,38 +15,25 @@ OTHER_CONFIG = "was its config changed? Otherwise train anew"
 
 @dataclass(frozen=True)
 class CheckpointInfo:
-    """Metadata of a checkpoint.
-
-    Attributes:
-        step: steps done.
-        extent: of the scene, world units.
-        world_offset: add it to the means to get the capture's own coordinates.
-        background: resolved choice: "white", "black" or "random".
-        rasterize_mode: how the Gaussians want to be drawn.
-    """
+    """Metadata of a checkpoint."""
 
     step: int
-    extent: float
-    world_offset: tuple[float, float, float]
-    background: str
-    rasterize_mode: str
+    extent: float  # of the scene, world units
+    world_offset: tuple[float, float, float]  # add it to the means to get the capture's own coordinates
+    background: str  # resolved choice: "white", "black" or "random"
+    rasterize_mode: str  # how the Gaussians want to be drawn
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that a run needs to go on: named tensors and a few values.
-
-    Attributes:
-        path: of the file that it was read from; None: of none.
-    """
+    """Everything that a run needs to go on: named tensors and a few values."""
 
     info: CheckpointInfo
     tensors: dict[str, Tensor]
-    path: Path | None = field(default=None, compare=False)
+    path: Path | None = field(default=None, compare=False)  # of the file that it was read from; None: of none
 
     @property
     def name(self) -> str:
-        """For messages."""
         return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
 
     def part(self, prefix: str) -> dict[str, Tensor]:

@@ -1,40 +1,34 @@
-"""A kind of model: its section of the configuration, and what begins and restores it."""
+"""The kinds of model: one line each in ``KINDS``, of which the configuration makes the choices of ``model.kind``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-import torch
+from dyngs.deform.keys import DynamicModel
+from dyngs.human.keys import HumanModel, HumanPredictorModel
+from dyngs.section import ModelSection
+from dyngs.static.keys import StaticModel
 
-from dyngs.config import Config
-from dyngs.data.capture import Capture
-from dyngs.data.loader import ImageLoader
-from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.model import Model
-from dyngs.models.renderable import Renderable
+if TYPE_CHECKING:
+    import torch
 
-M = TypeVar("M")
+    from dyngs.config import Config
+    from dyngs.data.capture import Capture
+    from dyngs.data.loader import ImageLoader
+    from dyngs.models.checkpoint import Checkpoint
+    from dyngs.models.model import Model
+    from dyngs.models.renderable import Renderable
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What a model begins with.
-
-    Attributes:
-        config: of the run, with its limits applied.
-        asked: the same without limits: a run may begin with more Gaussians than it may end with.
-        capture: that is trained on, with its first points.
-        images: the training images.
-        background: "white", "black" or "random".
-        extent: of the scene, world units.
-        generator: the run's only source of randomness.
-    """
+class RunStart:
+    """What a model begins with."""
 
     config: Config
-    asked: Config
-    capture: Capture
+    asked: Config  # the same without limits: a run may begin with more Gaussians than it may end with
+    capture: Capture  # that is trained on, with its first points
     images: ImageLoader
     background: str
     extent: float
@@ -42,17 +36,35 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Kind(Generic[M]):
-    """A kind of model.
+class Kind:
+    """A kind of model."""
 
-    Attributes:
-        section: class of its configuration.
-        start: returns its model before the first step.
-        restore: returns the scene of a checkpoint; raises KeyError or ValueError where its tensors do not fit.
-        trainer: of a kind that is not trained on one capture: returns what the loop steps; ``start`` is not called.
-    """
+    section: type[ModelSection]  # class of its configuration
+    # module with its ``start`` and ``restore``, and ``trainer`` of a network; imported when first needed, so that
+    # reading a configuration imports no model
+    home: str
 
-    section: type[M]
-    start: Callable[[Setting], Model[Any]]
-    restore: Callable[[M, Checkpoint], Renderable]
-    trainer: Callable[[Config], Any] | None = None
+    def start(self, start: RunStart) -> Model[Any]:
+        """Return the model before the first step."""
+        return import_module(self.home).start(start)
+
+    def restore(self, model: ModelSection, checkpoint: Checkpoint) -> Renderable:
+        """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
+        return import_module(self.home).restore(model, checkpoint)
+
+    def trainer(self, config: Config) -> Any:
+        """Return what the loop steps, of a network, which is not trained on one capture."""
+        return import_module(self.home).trainer(config)
+
+
+KINDS: tuple[Kind, ...] = (
+    Kind(StaticModel, "dyngs.static.training"),
+    Kind(DynamicModel, "dyngs.deform.kind"),
+    Kind(HumanModel, "dyngs.human.avatar.kind"),
+    Kind(HumanPredictorModel, "dyngs.training.prediction"),
+)
+
+
+def kind_of(model: ModelSection) -> Kind:
+    """Return the kind of a section of the configuration."""
+    return next(kind for kind in KINDS if type(model) is kind.section)

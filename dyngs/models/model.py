@@ -26,35 +26,24 @@ def nothing() -> None:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A training image as a model draws it.
+    """A training image as a model draws it."""
 
-    Attributes:
-        rendering: of the image's camera.
-        penalties: differentiable regularizers of what was drawn, weighted, by name.
-        moved: tensors that something learned has moved, by name: one that is not finite would not be drawn, so that a
-            diverging field could go unseen; empty: nothing was.
-        after_backward: takes in gradients once they are there.
-    """
-
-    rendering: Rendering
+    rendering: Rendering  # of the image's camera
+    # differentiable regularizers of what was drawn, weighted, by name
     penalties: Mapping[str, Tensor] = field(default_factory=dict)
+    # tensors that something learned has moved, by name: one that is not finite would not be drawn, so that a diverging
+    # field could go unseen; empty: nothing was
     moved: Mapping[str, Tensor] = field(default_factory=dict)
-    after_backward: Callable[[], None] = nothing
+    after_backward: Callable[[], None] = nothing  # takes in gradients once they are there
 
 
 @dataclass(frozen=True)
 class Updated:
-    """What an update has done.
+    """What an update has done."""
 
-    Attributes:
-        bad: number of rows left out because their gradient was not finite.
-        finding: lines about what was found out, or None.
-        is_rearranged: there are other rows now: several processes must have come to the same.
-    """
-
-    bad: Count = 0
-    finding: str | None = None
-    is_rearranged: bool = False
+    bad: Count = 0  # number of rows left out because their gradient was not finite
+    finding: str | None = None  # lines about what was found out, or None
+    is_rearranged: bool = False  # there are other rows now: several processes must have come to the same
 
 
 class Model(ABC, Generic[S_co]):
@@ -73,14 +62,7 @@ class Model(ABC, Generic[S_co]):
 
     @abstractmethod
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
-        """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable.
-
-        Args:
-            image: of training, perhaps shrunk.
-            step: that is being done, from 1.
-            background: behind it.
-            depth: the expected depth is needed, too.
-        """
+        """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable."""
 
     @abstractmethod
     def update(self, step: int) -> Updated:
@@ -97,19 +79,13 @@ class Model(ABC, Generic[S_co]):
 
     @abstractmethod
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as it must be.
-        """
+        """Go back to where ``checkpoint`` was taken."""
 
     @abstractmethod
     def place(self, device: torch.device) -> None:
         """Go on on ``device``."""
 
     def regularizers(self) -> Mapping[str, Tensor]:
-        """Return differentiable penalties on what is learned, weighted, by name."""
         return {}
 
     def tallies(self, step: int) -> Sequence[Tensor]:
@@ -140,28 +116,18 @@ class Model(ABC, Generic[S_co]):
 
     @property
     def num_moving(self) -> int:
-        """Number of Gaussians that depend on time or pose."""
         return 0
 
 
 @dataclass(frozen=True)
 class Look:
-    """A training image next to its rendering, for terms of the loss.
+    """A training image next to its rendering, for terms of the loss."""
 
-    Attributes:
-        index: of the view.
-        step: that is being done.
-        image: what was trained on, with a mask of the pixels that count.
-        drawn: by the model.
-        rendered, truth: (H, W, 3) that are compared, on the same background.
-        model: that is trained.
-        generator: the run's only source of randomness.
-    """
-
-    index: int
+    index: int  # of the view
     step: int
-    image: Image
+    image: Image  # what was trained on, with a mask of the pixels that count
     drawn: Drawn
+    # rendered, truth: (H, W, 3) that are compared, on the same background
     rendered: Tensor
     truth: Tensor
     model: Model[Any]

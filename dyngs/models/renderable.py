@@ -21,14 +21,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """How any scene is drawn.
+    """How any scene is drawn."""
 
-    Attributes:
-        near: what is nearer to the camera is not drawn, world units (3DGS: 0.2).
-        depth: none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha).
-    """
-
-    near: float = 0.2
+    near: float = 0.2  # what is nearer to the camera is not drawn, world units (3DGS: 0.2)
+    # none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha)
     depth: Literal["none", "accumulated", "expected"] = "none"
 
 
@@ -71,11 +67,7 @@ class Rendering:
 
 
 class TimeStep:
-    """A scene at one time, computed once for several images.
-
-    Attributes:
-        time: in [0, 1], for what depends on it.
-    """
+    """A scene at one time, computed once for several images."""
 
     def __init__(self, time: float | None = None) -> None:
         self.time = time
@@ -126,16 +118,10 @@ class Renderable(ABC):
         Args:
             cameras: V cameras, on any device.
             time: in [0, 1], or what ``time_step`` returned; None is the first.
-            options: how to draw; None: as the scene is to be drawn.
-            background: (3,) or (V, 3) colour; None: that of the scene.
         """
 
     def time_step(self, time: float | None) -> TimeStep:
-        """Return what drawing at ``time`` needs, clamped to [0, 1]; None is the first.
-
-        Raises:
-            DyngsError: the time is NaN.
-        """
+        """Return what drawing at ``time`` needs, clamped to [0, 1]; None is the first."""
         return TimeStep(clamped_time(time))
 
     @abstractmethod

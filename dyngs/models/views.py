@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,42 +15,25 @@ from dyngs.data.images.images import target_size
 from dyngs.data.loader import Image
 
 _BACKGROUNDS = {"white": 1.0, "black": 0.0}
-OPAQUE = 0.99
-"""Alpha from which a pixel shows no background."""
-ALIKE = 0.1
-"""Largest difference of a channel up to which a colour counts as that of the background."""
+OPAQUE = 0.99  # Alpha from which a pixel shows no background
+ALIKE = 0.1  # Largest difference of a channel up to which a colour counts as that of the background
 MANY_ALIKE = 0.05
 """Fraction of the opaque pixels of the background's colour from which silhouettes are trained on: with 0.12 (orbits)
 the whole image gains 0.8 dB, with 0 (flag) nothing; in between nothing was measured."""
-WEIGHT = 0.1
-"""Weight of the mean error of alpha there."""
-IMAGES = 12
-"""Number of images in which colours are compared with the background."""
+WEIGHT = 0.1  # Weight of the mean error of alpha there
+IMAGES = 12  # Number of images in which colours are compared with the background
 
 
-@dataclass(frozen=True)
-class AlphaWeight:
-    """Weight of the mean error of alpha in the loss.
-
-    Attributes:
-        weight: 0 or more.
-        finding: a line about why, if that was measured.
-    """
-
-    weight: float = 0.0
-    finding: str | None = None
-
-
-def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> AlphaWeight:
-    """Return the weight of the mean error of alpha that suits ``images`` on the colour ``background`` (3,)."""
+def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> tuple[float, list[str]]:
+    """Return the weight of the mean error of alpha that suits images on ``background`` (3,), and lines about why."""
     fraction = share_alike(images, background)
     if fraction is None:
-        return AlphaWeight()
+        return 0.0, []
     uses = fraction >= MANY_ALIKE
     text = f"{fraction:.1%} of the opaque pixels have nearly the background's colour: " + (
         f"silhouettes count, too (train.alpha_weight={WEIGHT:g})" if uses else "silhouettes are not needed"
     )
-    return AlphaWeight(WEIGHT if uses else 0.0, text)
+    return WEIGHT if uses else 0.0, [text]
 
 
 def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
@@ -74,12 +56,7 @@ def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
 
 
 def evaluation_background(choice: str, has_alpha: bool) -> tuple[str, Tensor]:
-    """Return the name and (3,) colour of the background to evaluate on: that of training, black where that was random.
-
-    Args:
-        choice: ``data.background`` of the config.
-        has_alpha: of the capture; decides what "auto" means.
-    """
+    """Return the name and (3,) colour of the background to evaluate on: black where that of training was random."""
     resolved = {"auto": "white" if has_alpha else "black", "random": "black"}.get(choice, choice)
     return resolved, torch.full((3,), _BACKGROUNDS[resolved], device="cpu")
 

@@ -13,7 +13,7 @@ from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY
 from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
@@ -30,18 +30,12 @@ class FieldSize:
 
 @dataclass(frozen=True)
 class Cut:
-    """A choice of parts to take away; the defaults take nothing.
+    """A choice of parts to take away; the defaults take nothing."""
 
-    Attributes:
-        fraction: of the Gaussians that is removed.
-        alpha_min: pixels skip Gaussians with a lower alpha; None: as the run has it.
-        field: size of the field of control nodes; None: as it is.
-        harmonics: PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay.
-    """
-
-    fraction: float = 0.0
-    alpha_min: float | None = None
-    field: FieldSize | None = None
+    fraction: float = 0.0  # of the Gaussians that is removed
+    alpha_min: float | None = None  # pixels skip Gaussians with a lower alpha; None: as the run has it
+    field: FieldSize | None = None  # size of the field of control nodes; None: as it is
+    # PSNR that view dependence may cost on training views before fine-tuning, dB; 0: all harmonics stay
     harmonics: float = 0.0
 
     def __str__(self) -> str:
@@ -52,7 +46,7 @@ class Cut:
         return ", ".join(words) or "nothing"
 
 
-def field_size(scene: Scene) -> FieldSize | None:
+def field_size(scene: GaussianScene) -> FieldSize | None:
     """Return the size of the field of ``scene``; None where no control nodes move anything."""
     match scene:
         case DynamicScene(field=ControlNodes() as field, is_static=False) if field.num_nodes:
@@ -61,7 +55,7 @@ def field_size(scene: Scene) -> FieldSize | None:
             return None
 
 
-def with_field(scene: Scene, size: FieldSize) -> Scene:
+def with_field(scene: GaussianScene, size: FieldSize) -> GaussianScene:
     """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move anything."""
     match scene:
         case DynamicScene(field=ControlNodes() as field, is_static=False):
@@ -90,13 +84,7 @@ def cut_config(config: Config, cut: Cut) -> Config:
 
 
 def apply_cut(trainer: GaussianTrainer, cut: Cut, scores: Tensor) -> None:
-    """Take away what ``cut`` says from the scene of ``trainer``, which is at the end of its run.
-
-    Args:
-        trainer: its configuration becomes that of ``cut_config``; nothing is added to its scene from here on.
-        cut: what goes.
-        scores: (N,) importance of its Gaussians.
-    """
+    """Take away what ``cut`` says from the scene of ``trainer``, which is at the end of its run."""
     trainer.config = cut_config(trainer.config, cut)
     trainer.model.draw_as(trainer.config.model)
     remove_(trainer, scores if cut.fraction else None)
@@ -107,7 +95,6 @@ def apply_cut(trainer: GaussianTrainer, cut: Cut, scores: Tensor) -> None:
 
 
 def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
-    """Drop the harmonics of the Gaussians that need none, and keep them zero."""
     usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
@@ -119,7 +106,6 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
 
 
 def _looks(trainer: GaussianTrainer, indices: Sequence[int], background: Tensor) -> Iterator[MeasuredView]:
-    """Yield training views as they are drawn now."""
     for image in (trainer.images[i] for i in indices):
         with torch.no_grad():
             now = trainer.model.training.time_step(trainer.model.scene, image, trainer.done).gaussians.detach()

@@ -21,16 +21,11 @@ from dyngs.models.views import background_colour
 from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 
-MAIN_FRACTION = 0.5
-"""Fraction of the weight of a Gaussian that must lie in one view."""
-NEAR = 0.6
-"""Depth of a Gaussian in that view, over the median depth of the view, below which it is near."""
-SEEN = 0.3
-"""Sum of weights over all views, px, from which a Gaussian shows at all."""
-LONGEST_SIDE = 200
-"""Of the views that are drawn, px: what hangs in the way shows in small ones, too."""
-SOLID = 0.5
-"""Alpha from which a pixel has a depth."""
+MAIN_FRACTION = 0.5  # Fraction of the weight of a Gaussian that must lie in one view
+NEAR = 0.6  # Depth of a Gaussian in that view, over the median depth of the view, below which it is near
+SEEN = 0.3  # Sum of weights over all views, px, from which a Gaussian shows at all
+LONGEST_SIDE = 200  # Of the views that are drawn, px: what hangs in the way shows in small ones, too
+SOLID = 0.5  # Alpha from which a pixel has a depth
 FEWEST_VIEWS, MOST = 20, 0.01
 """With fewer views, or with a larger fraction of such Gaussians, much of the scene is seen by one view only."""
 
@@ -42,7 +37,6 @@ class FloaterRemoval:
         self._loop, self._trainer = loop, trainer
 
     def __call__(self, event: Event) -> None:
-        """Remove them after the last step of training, before it is saved."""
         match event:
             case StepDone() if event.step == self._trainer().config.train.steps:
                 self._remove(event.step)

@@ -14,24 +14,17 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 
-STEEPNESS = 4.0
-"""Slope of the hyperbolic tangent: second differences of a profile are small numbers."""
+STEEPNESS = 4.0  # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 VOLUME_POWER = 0.1
 
 
 @dataclass(frozen=True)
 class ScoringViews:
-    """A scene, and the views that its Gaussians are scored on: every camera at every time.
+    """A scene, and the views that its Gaussians are scored on: every camera at every time."""
 
-    Attributes:
-        scene: N Gaussians; none is masked.
-        cameras: V groups of one camera.
-        times: K moments in [0, 1], ascending; one None for a static scene.
-    """
-
-    scene: Scene
+    scene: GaussianScene
     cameras: Sequence[Cameras]
     times: Sequence[float | None]
     options: RenderOptions
@@ -40,14 +33,7 @@ class ScoringViews:
 
 @dataclass(frozen=True)
 class Importance:
-    """Contributions of N Gaussians at K moments.
-
-    Attributes:
-        fractions: (K, N) C, sums over pixels and views of alpha T.
-        slopes: (N,) sums over pixels, views and moments of (dI/dG)^2, or None where that was not asked for.
-        opacities: (K, N).
-        log_volumes: (K, N) sums of the logarithms of the scales.
-    """
+    """Contributions of N Gaussians at K moments."""
 
     fractions: Tensor
     slopes: Tensor | None
@@ -56,12 +42,10 @@ class Importance:
 
     @property
     def contribution(self) -> Tensor:
-        """(N,) sum of C over moments."""
         return self.fractions.sum(0)
 
     @property
     def temporal(self) -> Tensor:
-        """(N,) sum over moments of gamma g, see ``variation``."""
         return (self._volumes() * self._variation()).sum(0)
 
     @property

@@ -23,7 +23,7 @@ from dyngs.config import Config
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
@@ -37,56 +37,40 @@ LEFT_GAUSSIANS = tuple(2 ** (-step / 2) for step in range(1, 13))
 CUT_OFFS = (0.01, 0.02, 0.03)
 FIELD_LOSSES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Losses of training images, dB, before fine-tuning, by fewer pieces and by fewer nodes each."""
-HARMONIC_LOSSES = (0.01, 0.03, 0.1)
-"""Losses of training images, dB, before fine-tuning, by dropping harmonics."""
+HARMONIC_LOSSES = (0.01, 0.03, 0.1)  # Losses of training images, dB, before fine-tuning, by dropping harmonics
 ALLOWED = {"cut-off": 0.1, "Gaussians": 0.65, "field": 0.8, "harmonics": 0.85}
 """Fraction of the allowed loss up to which each kind is taken, those before it included; the rest is for rounding."""
 FEWEST_NODES = 8
 
-SMALLEST_FILE_LOSS = 0.01
-"""Least loss of rounding that is allowed, dB: with 0 no file would be good enough."""
+SMALLEST_FILE_LOSS = 0.01  # Least loss of rounding that is allowed, dB: with 0 no file would be good enough
 
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A run after a cut and fine-tuning.
-
-    Attributes:
-        checkpoint: at its end.
-        psnr: mean on the views held out, dB.
-        loss: that of what it is compared with, minus ``psnr``.
-        trained_loss: of views that the run and fine-tuning see, against the run as it is, dB.
-    """
+    """A run after a cut and fine-tuning."""
 
     cut: Cut
     config: Config
-    checkpoint: Checkpoint
+    checkpoint: Checkpoint  # at its end
     num_gaussians: int
-    psnr: float
-    loss: float
-    trained_loss: float = 0.0
+    psnr: float  # mean on the views held out, dB
+    loss: float  # that of what it is compared with, minus ``psnr``
+    trained_loss: float = 0.0  # of views that the run and fine-tuning see, against the run as it is, dB
 
     @property
     def worst(self) -> float:
-        """The larger of the two losses, dB."""
         return max(self.loss, self.trained_loss)
 
 
 @dataclass(frozen=True)
 class Limit:
-    """Why no more of one kind of thing was taken.
+    """Why no more of one kind of thing was taken."""
 
-    Attributes:
-        kind: of thing, a key of ``ALLOWED``.
-        taken: what goes, of this kind.
-        refused: the next step, and its loss in dB; None where there is no next step.
-    """
-
-    kind: str
-    taken: str
-    refused: tuple[str, float] | None = None
+    kind: str  # of thing, a key of ``ALLOWED``
+    taken: str  # what goes, of this kind
+    refused: tuple[str, float] | None = None  # the next step, and its loss in dB; None where there is no next step
 
     def __str__(self) -> str:
         if self.refused is None:
@@ -97,19 +81,13 @@ class Limit:
 
 @dataclass(frozen=True)
 class Found:
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes:
-        accepted: candidates that keep the promise, each smaller than the one before; the first is the run as it is.
-        limits: why no more was taken, by kind of thing.
-        views: that losses were measured on, for people.
-        trials: number of fine-tuned candidates, the run as it is included.
-    """
-
+    # candidates that keep the promise, each smaller than the one before; the first is the run as it is
     accepted: tuple[Candidate, ...]
-    limits: tuple[Limit, ...]
-    views: str
-    trials: int
+    limits: tuple[Limit, ...]  # why no more was taken, by kind of thing
+    views: str  # that losses were measured on, for people
+    trials: int  # number of fine-tuned candidates, the run as it is included
 
 
 @dataclass(frozen=True)
@@ -179,7 +157,6 @@ class Search:
         return psnr + max(cost, 0.0)
 
     def _others(self) -> list[Image]:
-        """Return some training images that are not held out."""
         others = [i for i in range(len(self.trainer.images)) if i not in self.held_out]
         return [self.trainer.images[others[i]] for i in evenly_spaced(len(others), PROBED_VIEWS)]
 
@@ -199,8 +176,7 @@ class Search:
             return Stored(candidate, file, Limit("precision", f"steps {file.factor:.2g} times the usual", refused))
         raise DyngsError(f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more")
 
-    def _quality(self, scene: Scene) -> float:
-        """Return the mean PSNR of the views that count, drawn of ``scene`` as it wants to be drawn, dB."""
+    def _quality(self, scene: GaussianScene) -> float:
         return quality_of(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
 
     def _knobs(self) -> dict[str, Callable[[Cut], Sequence[tuple[str, Cut]]]]:
@@ -232,7 +208,6 @@ class Search:
         return found, Limit(kind, levels[low - 1][0] if low else "nothing", refused)
 
     def _tried(self, cut: Cut) -> Candidate:
-        """Return the run after a cut and fine-tuning."""
         self.trials += 1
         trainer = self.trainer
         self._restart()

@@ -20,7 +20,7 @@ from dyngs.config import PruneConfig
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import counted
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
@@ -30,29 +30,21 @@ from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 
-MOVING_VIEWS, MOVING_TIMES = 8, 24
-"""Numbers of training cameras and times whose pairs are scored in dynamic scenes."""
+MOVING_VIEWS, MOVING_TIMES = 8, 24  # Numbers of training cameras and times whose pairs are scored in dynamic scenes
 STILL_VIEWS = 100
-PROBED_VIEWS = 16
-"""Number of training images on which the loss is measured."""
+PROBED_VIEWS = 16  # Number of training images on which the loss is measured
 MASKED_BELOW = 0.5
 """At a key time, Gaussians that contribute no more px to all views together are masked (docs/prune.md)."""
 
 
 @dataclass(frozen=True)
 class Pruned:
-    """Result of the pruning stage of a run.
-
-    Attributes:
-        before, after: numbers of Gaussians.
-        loss: dB on training images, before anything is trained again.
-        active: mean fraction of the kept that masks let through; 1 without masks.
-    """
+    """Result of the pruning stage of a run."""
 
     before: int
     after: int
     loss: float
-    active: float
+    active: float  # mean fraction of the kept that masks let through; 1 without masks
 
     def __str__(self) -> str:
         masks = "" if self.active == 1 else f"; masks let {self.active:.0%} of them through"
@@ -70,7 +62,6 @@ class PruneStage:
         self._loop, self._trainer = loop, trainer
 
     def __call__(self, event: Event) -> None:
-        """Prune before the first step after training."""
         match event:
             case Started() | StepDone() if event.step == self._trainer().config.train.steps < event.total:
                 done = prune_(self._trainer())
@@ -142,7 +133,9 @@ def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
     return [different[i] for i in evenly_spaced(len(different), count)]
 
 
-def scoring_views(trainer: GaussianTrainer, scene: Scene, times: Sequence[float | None] | None = None) -> ScoringViews:
+def scoring_views(
+    trainer: GaussianTrainer, scene: GaussianScene, times: Sequence[float | None] | None = None
+) -> ScoringViews:
     """Return all pairs of some training cameras and some times; with no times all that matters are cameras."""
     background = background_colour(trainer.background)
     if times is None:
@@ -153,7 +146,7 @@ def scoring_views(trainer: GaussianTrainer, scene: Scene, times: Sequence[float 
 
 
 @torch.no_grad()
-def training_quality(trainer: GaussianTrainer, scene: Scene) -> float:
+def training_quality(trainer: GaussianTrainer, scene: GaussianScene) -> float:
     """Return the mean PSNR of at most 16 training images drawn of ``scene``, dB."""
     return quality_of(trainer, scene, probe_images(trainer))
 
@@ -165,7 +158,7 @@ def probe_images(trainer: GaussianTrainer) -> list[Image]:
 
 @torch.no_grad()
 def quality_of(
-    trainer: GaussianTrainer, scene: Scene, images: Sequence[Image], alpha_min: float | None = None
+    trainer: GaussianTrainer, scene: GaussianScene, images: Sequence[Image], alpha_min: float | None = None
 ) -> float:
     """Return the mean PSNR of ``images`` drawn of ``scene``, dB; ``alpha_min`` instead of that of training."""
     background, options = sent(background_colour(trainer.background), trainer.device), trainer.model.options
@@ -177,7 +170,7 @@ def quality_of(
     return fmean(values)
 
 
-def _masks(trainer: GaussianTrainer, scene: Scene, kept: Tensor) -> VisibilityMasks:
+def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> VisibilityMasks:
     """Return at which of evenly spaced key times each Gaussian kept is seen from any of the survey's cameras."""
     options, last = trainer.config.prune, len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))

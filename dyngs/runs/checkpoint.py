@@ -24,7 +24,7 @@ from dyngs.data.capture import View
 from dyngs.errors import DyngsError, as_word, reading, require_regular
 from dyngs.files.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.files.write import write_text
-from dyngs.gaussians.scene import Scene, require_gaussians
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.kinds import restored_model
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.models.renderable import Renderable
@@ -51,7 +51,7 @@ class LoadedRun:
     info: CheckpointInfo
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> GaussianScene:
         """Its scene of Gaussians. Raises DyngsError: it is made of something else."""
         return require_gaussians(self.renderable, f"a run of model.kind={self.config.model.kind}")
 

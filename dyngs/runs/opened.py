@@ -18,7 +18,7 @@ from dyngs.data.capture import Capture, Split, View
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion import placement
 from dyngs.human.motion.motion import captured_motion, motion_clip, same_bodies
@@ -262,7 +262,7 @@ def open_run(folder: Path, capture: Capture | None = None, data_root: Path | Non
     return Opened(**vars(run), name=folder.absolute().name, captured=Captured(run.config.data, capture))
 
 
-def opened_scene(scene: Scene, file: Path = Path("scene")) -> Opened:
+def opened_scene(scene: GaussianScene, file: Path = Path("scene")) -> Opened:
     """Return a scene of which nothing else is known, as if it had been read from ``file``."""
     config = Config(data=DataConfig(root=file), model=StaticModel())
     info = CheckpointInfo(0, 0.0, (0.0, 0.0, 0.0), "black", scene.options.mode.value)

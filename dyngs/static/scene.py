@@ -10,30 +10,21 @@ from torch import Tensor
 
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
-from dyngs.gaussians.scene import GaussianTimeStep, Scene, stored_times, times_state
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
 from dyngs.models.renderable import clamped_time
 from dyngs.state import State
 
 
 @dataclass(frozen=True, kw_only=True)
-class StaticScene(Scene):
-    """The same N Gaussians at every time.
-
-    Attributes:
-        filter_std: (N,) standard deviations of Mip-Splatting's 3D filter, world units; None without one.
-        seen_at: distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing moves.
-    """
+class StaticScene(GaussianScene):
+    """The same N Gaussians at every time."""
 
     filter_std: Tensor | None = None
+    # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing moves
     seen_at: tuple[float, ...] = ()
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
-        """Return the scene of a state that ``state`` returned.
-
-        Raises:
-            ValueError: a tensor does not fit the Gaussians.
-        """
         return StaticScene(
             gaussians=gaussians, filter_std=stored_filter(tensors, len(gaussians)), seen_at=stored_times(tensors)
         )

@@ -14,7 +14,7 @@ from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Kind, Setting
+from dyngs.models.kind import RunStart
 from dyngs.static.scene import StaticScene
 
 
@@ -25,7 +25,6 @@ class StaticTraining(SceneTraining[StaticScene]):
         self._update = update
 
     def first_scene(self, gaussians: Gaussians) -> StaticScene:
-        """Return the scene of the first Gaussians."""
         return StaticScene(gaussians=gaussians, filter_std=self._update.of(gaussians))
 
     def after_step(self, scene: StaticScene, step: int, edited: bool) -> StaticScene:
@@ -37,17 +36,14 @@ class StaticTraining(SceneTraining[StaticScene]):
         return StaticScene.restored(gaussians, tensors)
 
 
-def start(setting: Setting) -> GaussianModel:
+def start(run: RunStart) -> GaussianModel:
     """Return the model of a static scene before its first step."""
-    gaussians = first_gaussians(setting)
-    colours, training = colours_of(setting, gaussians, sees_time=False), StaticTraining(filter_update(setting))
-    return GaussianModel(setting, training.first_scene(gaussians), training, densifier_of(setting), colours)
+    gaussians = first_gaussians(run)
+    colours, training = colours_of(run, gaussians, sees_time=False), StaticTraining(filter_update(run))
+    return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
 
 
 def restore(model: StaticModel, checkpoint: Checkpoint) -> StaticScene:
     """Return the scene of a checkpoint."""
     scene = StaticScene.restored(Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
     return drawn_as_trained(scene, model, checkpoint)
-
-
-KIND = Kind(StaticModel, start, restore)

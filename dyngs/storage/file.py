@@ -27,7 +27,7 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.storage.tensors import (
     COARSENESS,
@@ -206,7 +206,9 @@ def read_scene(path: Path) -> Checkpoint:
         raise DyngsError(f"{path}: {error}") from None
 
 
-def encoded(info: CheckpointInfo, scene: Scene, steps: Mapping[str, float], coarseness: Tensor | None = None) -> bytes:
+def encoded(
+    info: CheckpointInfo, scene: GaussianScene, steps: Mapping[str, float], coarseness: Tensor | None = None
+) -> bytes:
     """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is not finite.
 
     ``steps`` are of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.

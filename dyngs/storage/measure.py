@@ -17,7 +17,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import contributions
-from dyngs.gaussians.scene import Scene, render_options
+from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.kinds import restored_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.views import evaluation_background, training_cameras
@@ -40,7 +40,7 @@ LOOKED_AT = 50  # number of training views in which the visibility of each Gauss
 
 FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))  # factors on the usual steps that are tried, by bisection
 
-Images = Callable[[Scene], list[Tensor]]
+Images = Callable[[GaussianScene], list[Tensor]]
 """Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
 
 
@@ -61,7 +61,7 @@ class _Shot:
     time: float | None
 
 
-def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_change: float | None) -> StoragePlan:
+def storage_plan(config: Config, checkpoint: Checkpoint, scene: GaussianScene, max_change: float | None) -> StoragePlan:
     """Return how exactly ``scene`` must be stored: measured where the run's capture can be read.
 
     ``checkpoint``: of ``scene``. ``max_change``: root mean square over all values of some training images, grey levels
@@ -76,7 +76,7 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Scene, max_chang
     shots, options = _shots(config, capture, scene, COMPARED), render_options(config.model)
 
     @torch.no_grad()
-    def images(drawn: Scene) -> list[Tensor]:
+    def images(drawn: GaussianScene) -> list[Tensor]:
         return [drawn.render(shot.cameras, shot.time, options=options, background=background).rgb[0] for shot in shots]
 
     def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
@@ -103,7 +103,7 @@ class CoarseFile:
 
 
 def coarsest_file(
-    config: Config, checkpoint: Checkpoint, quality: Callable[[Scene], float], least: float
+    config: Config, checkpoint: Checkpoint, quality: Callable[[GaussianScene], float], least: float
 ) -> CoarseFile | None:
     """Return the file with the coarsest steps tried at which ``quality`` is at least ``least``; None: it never is.
 
@@ -114,7 +114,7 @@ def coarsest_file(
     plan = storage_plan(config, checkpoint, scene, None)
     exact = drawable(scene) | ({} if plan.coarseness is None else {COARSENESS: plan.coarseness})
 
-    def drawn(tensors: dict) -> Scene:
+    def drawn(tensors: dict) -> GaussianScene:
         return restored_scene(Checkpoint(checkpoint.info, tensors), config.model)
 
     def steps(factor: float) -> dict[str, float]:
@@ -137,7 +137,7 @@ def coarsest_file(
     return None
 
 
-def _shots(config: Config, capture: Capture, scene: Scene, count: int) -> list[_Shot]:
+def _shots(config: Config, capture: Capture, scene: GaussianScene, count: int) -> list[_Shot]:
     """Return at most ``count`` training views, evenly chosen; where they have no times, those of the scene."""
     chosen = _chosen(capture, count)
     times: Sequence[float | None] = [view.time for view in chosen]
@@ -153,7 +153,7 @@ def _chosen(capture: Capture, count: int) -> list[View]:
     return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
-def _visibility(scene: Scene, shots: Sequence[_Shot]) -> Tensor:
+def _visibility(scene: GaussianScene, shots: Sequence[_Shot]) -> Tensor:
     scene = scene.unmasked()
     total = torch.zeros(len(scene), device=scene.gaussians.means.device)
     for shot in shots:

@@ -18,7 +18,7 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.order import storage_order
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.ops.quaternions import quat_product
 from dyngs.state import tensors_of
 
@@ -209,7 +209,7 @@ class Whole:
     far: np.ndarray
 
 
-def drawable(scene: Scene) -> dict[str, Tensor]:
+def drawable(scene: GaussianScene) -> dict[str, Tensor]:
     """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by length.
 
     Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not finite.
@@ -241,7 +241,7 @@ def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return full
 
 
-def stored_edit(scene: Scene, means: np.ndarray) -> TopologyEdit:
+def stored_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
     """Return the edit that puts Gaussians beside their neighbours in space, first those that a field moves.
 
     ``means``: (N, 3) as they will be read again, which decide the order.

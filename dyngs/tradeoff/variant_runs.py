@@ -33,7 +33,7 @@ from dyngs.storage.file import write_scene
 from dyngs.tradeoff.measure import with_render_settings
 from dyngs.tradeoff.variants import RunSettings, Variant
 
-FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width", "trajectory": "fourier"}
+FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width"}
 """The key that sets the size of a field, by its kind."""
 
 NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)

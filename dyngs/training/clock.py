@@ -20,12 +20,10 @@ from dyngs.models.schedule import image_divisor, scaled
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 18.0, 300.0, 9e-4
 """Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two cores."""
-MOTION = 2.0
-"""Factor by which steps cost more once things may move."""
+MOTION = 2.0  # Factor by which steps cost more once things may move
 DETAIL = 0.5
 """Power of the images' side with which the number of Gaussians grows: 2 to 4.7 times were seen from 1/4 to full."""
 SAMPLES = 64
-"""Steps whose costs stand for those of many."""
 
 
 class Stopwatch:
@@ -86,13 +84,7 @@ class _Mark:
 
 
 class Forecast:
-    """Prediction of the seconds that a run still takes, by its pace so far.
-
-    Args:
-        done: steps done.
-        seconds: on the clock now.
-        num_gaussians: there are now; 0: not known.
-    """
+    """Prediction of the seconds that a run still takes, by its pace so far."""
 
     def __init__(self, done: int, seconds: float, num_gaussians: int = 0) -> None:
         self._pixels = 0.0
@@ -103,32 +95,16 @@ class Forecast:
         self._marks = [_Mark(step, seconds, 0.0, num_gaussians)]
 
     def pause(self, seconds: float) -> None:
-        """Leave ``seconds`` out of the pace."""
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 
     def observe(self, config: Config | None, step: int, seconds: float, num_gaussians: int, drawn: int = 0) -> None:
-        """Take in how far the run is.
-
-        Args:
-            config: as it is now, whose schedule decides the cost of steps; None: all are alike.
-            step: steps done.
-            seconds: on the clock now.
-            num_gaussians: there are now.
-            drawn: pixels of the image drawn last.
-        """
         last = self._marks[-1]
         self._pixels = full_pixels(config, step, drawn)
         cost = last.cost + (step - last.step) * step_cost(config, step, self._pixels, num_gaussians)
         self._marks.append(_Mark(step, seconds, cost, num_gaussians))
 
     def seconds(self, config: Config | None, total: int, done: int | None = None) -> float:
-        """Return the seconds until step ``total`` of a run of ``config``, by the pace of the second half so far.
-
-        Args:
-            config: as for ``observe``; its schedules may be others than those so far.
-            total: the last step.
-            done: steps done; None: those observed.
-        """
+        """Return the seconds until step ``total`` of a run of ``config``, by the pace of the second half so far."""
         first, now = self._marks[0], self._marks[-1]
         done = now.step if done is None else done
         if done >= total or now.cost == 0:

@@ -22,26 +22,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StepReport:
-    """One step of training.
+    """One step of training."""
 
-    Attributes:
-        step: its number, from 1.
-        loss: regularizers included.
-        image: what was trained on.
-        rendered, truth: (H, W, 3) on the same background.
-        finding: lines about what was found out after the step, or None.
-    """
-
-    step: int
+    step: int  # its number, from 1
     loss: float
     image: Image
+    # rendered, truth: (H, W, 3) on the same background
     rendered: Tensor
     truth: Tensor
-    finding: str | None = None
+    finding: str | None = None  # lines about what was found out after the step, or None
 
     @cached_property
     def psnr(self) -> float:
-        """PSNR of the image, dB, at most 100; NaN where its mask leaves nothing, or it is not finite."""
         return psnr(self.rendered, self.truth, self.image.mask)
 
 
@@ -55,15 +47,10 @@ class Started:
 
 @dataclass(frozen=True)
 class StepDone:
-    """A step is done. Values outside the report are current when read: an earlier listener may have changed them.
+    """A step is done. Values outside the report are current when read: an earlier listener may have changed them."""
 
-    Attributes:
-        report: of the step.
-        loop: that did it; a viewer finds what is trained in ``loop.trainer``.
-    """
-
-    report: StepReport
-    loop: Loop
+    report: StepReport  # of the step
+    loop: Loop  # that did it; a viewer finds what is trained in ``loop.trainer``
 
     @property
     def step(self) -> int:
@@ -71,7 +58,6 @@ class StepDone:
 
     @property
     def total(self) -> int:
-        """Steps there will be."""
         return self.loop.total
 
     @property
@@ -93,13 +79,12 @@ class StepDone:
 
     @property
     def seconds(self) -> float:
-        """Seconds of training so far, over all resumes."""
         return self.loop.watch.seconds
 
 
 @dataclass(frozen=True)
 class TopologyChanged:
-    """The set of Gaussians has changed outside the strategy: pruned, or limited."""
+    """The set of Gaussians has changed outside the strategy."""
 
     step: int
     before: int

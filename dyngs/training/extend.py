@@ -19,13 +19,7 @@ from dyngs.training.corrections.exposure import WARM_UP
 
 @dataclass(frozen=True)
 class Length:
-    """A change of the length of a run.
-
-    Attributes:
-        done: steps done.
-        was: steps that the run had.
-        steps: that it shall have.
-    """
+    """A change of the length of a run."""
 
     done: int
     was: int
@@ -36,10 +30,7 @@ class Length:
         return min(step / self.steps, 1.0)
 
     def share(self, fraction: float) -> float:
-        """Return the fraction of the new length for what began, or shall begin, after ``share`` of a run.
-
-        What has begun keeps its step; what should have begun by now, in a shorter run, begins with the next step.
-        """
+        """Return the fraction of the new length for what began, or shall begin, after ``fraction`` of a run."""
         if self.done >= round(fraction * self.was):
             return self.kept(fraction * self.was)
         return max(fraction, self.kept(self.done + 1)) if self.done >= round(fraction * self.steps) else fraction
@@ -47,9 +38,6 @@ class Length:
 
 def with_length(config: Config, done: int, steps: int) -> Config:
     """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no limit of time holds.
-
-    Args:
-        config: of the run so far.
 
     Raises:
         DyngsError: so many steps are done already, the run was pruned, or its motion began too early for that length.
@@ -76,7 +64,6 @@ def with_length(config: Config, done: int, steps: int) -> Config:
 
 
 def _require_exposures_stay(config: Config, length: Length) -> None:
-    """Raise DyngsError where exposures were learned before a run of the new length begins with that."""
     begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
     if config.train.exposure == "always" and begun < length.done <= begins:
         raise DyngsError(
@@ -100,7 +87,6 @@ def told(before: Config, after: Config, done: int) -> str:
 
 
 def _train(options: TrainConfig, length: Length) -> TrainConfig:
-    """Return the section ``train``: images and harmonics go on where they are."""
     changed: dict[str, object] = {"steps": length.steps, "minutes": None}
     full_at = max(options.resolution_grows_from, options.resolution_full_at)
     if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
@@ -113,11 +99,6 @@ def _train(options: TrainConfig, length: Length) -> TrainConfig:
 
 
 def _dynamic(config: Config, model: DynamicModel, length: Length) -> DynamicModel:
-    """Return the section ``model`` of a moving scene.
-
-    Raises:
-        DyngsError: motion began before a run of the new length lets anything move.
-    """
     old = deform_schedule(model, Rates(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
     if length.done >= old.opens:

@@ -15,14 +15,11 @@ from dyngs.deform.fields import new_field
 from dyngs.errors import DyngsError
 from dyngs.training.processes import Processes
 
-RANDOM_FRACTION = 0.1
-"""Fraction of the limit that is kept free for the random Gaussians with which motion begins."""
+RANDOM_FRACTION = 0.1  # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
 """Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in docs/storage.md."""
-CLOSE = 0.8
-"""Fraction of the limit from which the limit counts as having held growth back."""
-FEWEST = 500
-"""Fewest Gaussians that a limit on the size must have room for."""
+CLOSE = 0.8  # Fraction of the limit from which the limit counts as having held growth back
+FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 
 def require_possible(config: Config) -> None:
@@ -45,11 +42,7 @@ def require_possible(config: Config) -> None:
 
 
 def shared(config: Config, processes: Processes) -> Config:
-    """Return ``config`` for so many processes: with one view for each of them where one per step was asked for.
-
-    Raises:
-        DyngsError: what is asked for needs one process, or the views of a step cannot be shared evenly.
-    """
+    """Return ``config`` for so many processes: with one view for each of them where one per step was asked for."""
     if processes.size == 1:
         return config
     for key, value in {"train.minutes": config.train.minutes, "budget.min_fps": config.budget.min_fps}.items():
@@ -79,15 +72,7 @@ def _require_batch(config: Config) -> None:
 
 
 def within_cap(config: Config, num_times: int) -> Config:
-    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where it has none.
-
-    Args:
-        config: of a run.
-        num_times: distinct times of training; fewer than two: nothing will move.
-
-    Raises:
-        DyngsError: a size that has no room for a scene.
-    """
+    """Return ``config`` with all numbers of Gaussians lowered to its limits; the same object where it has none."""
     cap, changes = most_gaussians(config, num_times), {}
     if cap is None:
         return config
@@ -100,15 +85,7 @@ def within_cap(config: Config, num_times: int) -> Config:
 
 
 def most_gaussians(config: Config, num_times: int) -> int | None:
-    """Return the largest number of Gaussians at the end by the limits of the run; None without one.
-
-    Args:
-        config: of a run.
-        num_times: distinct times of training.
-
-    Raises:
-        DyngsError: a size that has no room for a scene.
-    """
+    """Return the largest number of Gaussians at the end by the limits of the run; None without one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     if config.budget.max_mb is not None and not config.model.is_posed:
         limits.append(room(config, num_times, config.budget.max_mb))
@@ -124,8 +101,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     fixed, moves_by = 0.0, config.model.deform if isinstance(config.model, DynamicModel) else None
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
     if moves_by is not None and num_times > 1:
-        one, two = (num_field_values(moves_by, num_times, count) for count in (1, 2))
-        fixed, each = FIELD_BYTES * (2 * one - two), each + FIELD_BYTES * (two - one)
+        fixed = FIELD_BYTES * num_field_values(moves_by, num_times)
     found = int((1e6 * megabytes - fixed) / each)
     if found < FEWEST:
         field = f", of which the field takes {1e-6 * fixed:.2g}" if fixed else ""
@@ -136,7 +112,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     return found
 
 
-def num_field_values(options: DeformField, num_times: int, num_moving: int) -> int:
+def num_field_values(options: DeformField, num_times: int) -> int:
     """Return the number of values that a field learns."""
-    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0)
+    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, 0, 1.0)
     return new_field(options, setup, torch.Generator()).parameters.num_values

@@ -35,11 +35,7 @@ class Trainable(Protocol):
     def has_test_views(self) -> bool: ...
 
     def step(self) -> StepReport:
-        """Train on one image, or one choice of them.
-
-        Raises:
-            DyngsError: the loss is not finite.
-        """
+        """Train on one image, or one choice of them."""
         ...
 
     def checkpoint(self) -> Checkpoint:
@@ -47,11 +43,7 @@ class Trainable(Protocol):
         ...
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken.
-
-        Raises:
-            DyngsError: it belongs to something else, or its tensors do not fit together.
-        """
+        """Go back to where ``checkpoint`` was taken."""
         ...
 
 
@@ -59,8 +51,6 @@ class Loop:
     """Steps of a trainer, told to listeners in their order.
 
     Args:
-        trainer: what is trained.
-        total: steps that there will be.
         watch: seconds of training.
         advice: added to the message of a step that fails.
 
@@ -78,11 +68,9 @@ class Loop:
         self._listeners: list[Listener] = []
 
     def subscribe(self, *listeners: Listener) -> None:
-        """Add listeners, after the present ones."""
         self._listeners += listeners
 
     def tell(self, event: Event) -> None:
-        """Tell all listeners."""
         for listener in self._listeners:
             listener(event)
 

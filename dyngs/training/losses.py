@@ -11,11 +11,7 @@ from dyngs.ops.loss import l1_ssim_loss
 
 
 class ImageLoss(Loss):
-    """L1 and D-SSIM of the image (3DGS).
-
-    Args:
-        ssim_weight: of D-SSIM; L1 has the rest.
-    """
+    """L1 and D-SSIM of the image (3DGS)."""
 
     def __init__(self, ssim_weight: float) -> None:
         self._ssim_weight = ssim_weight
@@ -28,20 +24,19 @@ class SilhouetteLoss(Loss):
     """Mean error of alpha, where the images have any.
 
     Args:
-        weight: 0 or more.
         masked: only pixels that count in the image do so here.
     """
 
     def __init__(self, weight: float, *, masked: bool) -> None:
-        self._weight, self._masked = weight, masked
+        self.weight, self._masked = weight, masked
 
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
-        if self._weight == 0 or look.image.alpha is None:
+        if self.weight == 0 or look.image.alpha is None:
             return {}
         error = (look.drawn.rendering.alpha[0] - look.image.alpha).abs()
         if self._masked and look.image.mask is not None:
             error = error * look.image.mask
-        return {"alpha": self._weight * error.mean()}
+        return {"alpha": self.weight * error.mean()}
 
 
 class PenaltyLoss(Loss):

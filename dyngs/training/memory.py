@@ -22,7 +22,6 @@ from dyngs.config import (
     McmcStrategy,
     MlpField,
     RandomInit,
-    TrajectoryField,
 )
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
@@ -34,35 +33,27 @@ from dyngs.training.trainer import Trainer
 COPIES = 7
 """Float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more when their set
 changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values take 0.24 kB."""
-NEEDED_COPIES = 4
-"""Of these, what is there in every step: value, gradient, two moments."""
+NEEDED_COPIES = 4  # Of these, what is there in every step: value, gradient, two moments
 POSING_BYTES = 2600
 """Bytes of a Gaussian of a person beside that, where the body fit is refined: its anchor, weights of joints, their
 gradients, and the Gaussian in a pose."""
-MOVING_BYTES = 200
-"""Bytes beside that of a Gaussian that control nodes or its own trajectory move: the Gaussian at a time."""
-LOOKUP_COPIES = 12
-"""Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice."""
+MOVING_BYTES = 200  # Bytes beside that of a Gaussian that control nodes move: the Gaussian at a time
+LOOKUP_COPIES = 12  # Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice
 ACTIVATION_COPIES = 3
 """Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a gradient."""
 FIELD_COPIES = 5
 """Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for the penalties."""
-FEW_TIMES = 100
-"""Distinct times for which the values of a field are counted where their number does not matter."""
-SHAPE_VALUES = 11
-"""Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity."""
+SHAPE_VALUES = 11  # Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity
 DRAWING_BYTES = 200
 """Bytes per pixel of the largest image that a step takes beside them: rendering, truth, windows of SSIM."""
-STEP_BYTES = 30_000_000
-"""Bytes of any step: code and buffers that the first one touches."""
+STEP_BYTES = 30_000_000  # Bytes of any step: code and buffers that the first one touches
 DECODING_BYTES = 45
 """Bytes per pixel of the file that decoding takes for a while: floats for shrinking and undistorting. Measured, as that
 above, on photos of 12 megapixels."""
 USUAL_GAUSSIANS, USUAL_CHANGES = 250_000, 34
 """Gaussians that photos led to in 7,000 steps (fox 268,000, cup 204,000, lego 173,000: docs/benchmarks.md), in which
 their set changes so often; fewer in proportion in shorter runs."""
-USUAL_SIDE = 400
-"""Longest side of the images, px, from which on that holds; below it goes with the root of the side."""
+USUAL_SIDE = 400  # Longest side of the images, px, from which on that holds; below it goes with the root of the side
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _SWAP = "/sys/fs/cgroup/memory.swap.max"
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
@@ -70,47 +61,28 @@ _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in
 
 @dataclass(frozen=True)
 class MemoryForecast:
-    """Bytes that a run is expected to take at its peak.
-
-    Attributes:
-        program: taken already.
-        images: that decoded ones will take, in the cache or on their way to it.
-        drawing: for a step.
-        field: of what all Gaussians share: grids and networks of a deformation field.
-        count: Gaussians that may be expected.
-        most: Gaussians that the strategy allows.
-        least: Gaussians that there will certainly be at some time.
-        each: bytes of a Gaussian.
-        least_each: bytes that a Gaussian certainly takes.
-        free: of this machine and this process's limits, beside what is taken already; None: not known.
-        whole: of this machine with its swap, or the limit of its container; None: not known.
-        all_kept: every image has its place in the cache.
-        processes: on this machine that take as much.
-        longest_side: of the images, px.
-        on_gpu: it is the memory of a GPU, where images take no more than their share.
-        limits: key that limits the number of Gaussians, and its value at ``count`` of them.
-    """
+    """Bytes that a run is expected to take at its peak."""
 
     program: int
-    images: int
+    images: int  # that decoded ones will take, in the cache or on their way to it
     drawing: int
-    field: int
-    count: int
-    most: int
-    least: int
+    field: int  # of what all Gaussians share: grids and networks of a deformation field
+    count: int  # Gaussians that may be expected
+    most: int  # Gaussians that the strategy allows
+    least: int  # Gaussians that there will certainly be at some time
     each: int
     least_each: int
-    free: int | None
-    whole: int | None
-    all_kept: bool
+    free: int | None  # of this machine and this process's limits, beside what is taken already; None: not known
+    whole: int | None  # of this machine with its swap, or the limit of its container; None: not known
+    all_kept: bool  # every image has its place in the cache
     processes: int = 1
     longest_side: int = 0
-    on_gpu: bool = False
+    on_gpu: bool = False  # it is the memory of a GPU, where images take no more than their share
+    # key that limits the number of Gaussians, and its value at ``count`` of them
     limits: tuple[str, int] = ("strategy.max_gaussians", 0)
 
     @property
     def total(self) -> int:
-        """Of a process."""
         return self.program + self.images + self.drawing + self.field + self.count * self.each
 
     @property
@@ -142,11 +114,7 @@ class MemoryForecast:
         return f"about {_gb(needed)} GB of {self._place} are needed, and {self._there}: give {self._advice()}"
 
     def require_possible(self) -> None:
-        """Raise where the run certainly needs more than this machine, or its container, can ever give it.
-
-        Raises:
-            DyngsError: says what to set to which value.
-        """
+        """Raise where the run certainly needs more than this machine, or its container, can ever give it."""
         needed = self.program + self.processes * (self.certain - self.program)
         if self.whole is None or needed <= self.whole:
             return
@@ -201,7 +169,6 @@ class MemoryForecast:
         return ", ".join(found) + (" and fewer processes" if self.processes > 1 else "")
 
     def _limit(self, count: int) -> str:
-        """Return the key with the value that makes it ``count`` Gaussians."""
         key, value = self.limits
         if key == "model.resolution":
             return f"{key}={max(int(value * (count / self.count) ** 0.5), 16)}"
@@ -212,10 +179,6 @@ def memory_forecasts(trainer: Trainer, processes: int = 1) -> list[MemoryForecas
     """Return the memory that the run of ``trainer``, which has not begun to step, is expected to take.
 
     On a GPU first that of the GPU, with the scene, and then that of the machine, with what stays on the CPU.
-
-    Args:
-        trainer: of the run.
-        processes: on this machine that train it together.
     """
     whole = memory_forecast(trainer, processes)
     gpu = gpu_memory(trainer.device)
@@ -262,7 +225,6 @@ def memory_forecast(trainer: Trainer, processes: int = 1) -> MemoryForecast:
 
 
 def _limit_of_gaussians(config: Config) -> tuple[str, int]:
-    """Return the key that limits the number of Gaussians, and its value."""
     if isinstance(config.model, HumanModel):
         return "model.resolution", config.model.resolution
     match config.strategy:
@@ -275,11 +237,7 @@ def _limit_of_gaussians(config: Config) -> tuple[str, int]:
 
 
 def require_room(config: Config) -> None:
-    """Raise where the random Gaussians that a run is to begin with cannot fit on this machine.
-
-    Raises:
-        DyngsError: says how many can.
-    """
+    """Raise where the random Gaussians that a run is to begin with cannot fit on this machine."""
     if not config.model.made_of_gaussians:
         return
     whole, each = whole_memory(), 4 * NEEDED_COPIES * stored_values(config)
@@ -310,9 +268,8 @@ def gaussian_bytes(config: Config) -> int:
             return each + 4 * LOOKUP_COPIES * field.channels * len(field.levels)
         case MlpField():
             return each + 4 * ACTIVATION_COPIES * field.depth * field.width
-        case ControlNodesField() | TrajectoryField():
-            one, two = (num_field_values(field, FEW_TIMES, count) for count in (1, 2))
-            return each + MOVING_BYTES + 4 * COPIES * (two - one)
+        case ControlNodesField():
+            return each + MOVING_BYTES
         case _:
             assert_never(field)
 
@@ -326,8 +283,7 @@ def field_bytes(config: Config, num_times: int) -> int:
     field = _field(config)
     if field is None or num_times < 2:
         return 0
-    one, two = (num_field_values(field, num_times, count) for count in (1, 2))
-    return 4 * FIELD_COPIES * (2 * one - two)
+    return 4 * FIELD_COPIES * num_field_values(field, num_times)
 
 
 def num_changes(config: Config, steps: int | None = None) -> int:
@@ -342,13 +298,7 @@ def num_changes(config: Config, steps: int | None = None) -> int:
 
 
 def expected_gaussians(config: Config, now: int, longest_side: int = USUAL_SIDE) -> int:
-    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before anything is seen.
-
-    Args:
-        config: of the run.
-        now: Gaussians at its beginning.
-        longest_side: of its images, px.
-    """
+    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before anything is seen."""
     match config.strategy:
         case McmcStrategy():
             return _mcmc_gaussians(config, config.strategy, now)

@@ -11,12 +11,9 @@ from torch.nn.functional import adaptive_avg_pool2d
 from dyngs.camera import Cameras
 from dyngs.data.loader import ImageLoader
 
-CELLS = 40
-"""Cells along the longest side of an image."""
-NEAREST = 24
-"""Views that are asked, at most."""
-FEWEST = 3
-"""Views that must see a place, at least."""
+CELLS = 40  # Cells along the longest side of an image
+NEAREST = 24  # Views that are asked, at most
+FEWEST = 3  # Views that must see a place, at least
 SOLID = 0.5
 """Alpha from which the drawn depth means anything; and the fraction of a cell that its image's mask must keep."""
 _TINY = 1e-6
@@ -32,8 +29,6 @@ class OtherViews:
     """Mean colours of the cells of all training images, and where cells of one are found in the others.
 
     Args:
-        images: of training.
-        cameras: V cameras of their full size.
         corrected: returns the camera of a view as it is by now, see ``ImageLoader``; None: it stays.
     """
 
@@ -62,14 +57,7 @@ class OtherViews:
         return cells[:3] + (1 - cells[3]) * background[:, None, None], cells[4] > SOLID
 
     def difference(self, index: int, which: Tensor, drawn: Tensor, background: Tensor) -> Tensor:
-        """Return (P,) the median difference of other views from the rendering; infinite where too few see a place.
-
-        Args:
-            index: of the image.
-            which: (h, w) bool, P of its cells.
-            drawn: (5, h, w) colour, expected depth and alpha of the rendering.
-            background: (3,) behind all images.
-        """
+        """Return (P,) the median difference of other views from the rendering; infinite where too few see a place."""
         shown, others = drawn[:, which], self._asked(index)
         if not len(others) or not shown.shape[1]:
             return torch.full_like(shown[0], torch.inf)

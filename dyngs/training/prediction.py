@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel, HumanPredictorModel
+from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, reading
@@ -23,8 +24,7 @@ from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atla
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
-from dyngs.models.kind import Kind, Setting
-from dyngs.models.model import Model
+from dyngs.models.model import Predictor
 from dyngs.models.renderable import Renderable, Rendering
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
@@ -34,27 +34,21 @@ from dyngs.tensor_checks import require_tensor
 from dyngs.training.events import StepReport
 from dyngs.training.sampler import ViewSampler
 
-SQUARED_WEIGHT = 1.0
-"""Weight of the mean squared error in the loss, which counts edges more."""
-WARM_UP = 0.05
-"""Fraction of the run in which the highest learning rate is reached."""
-WEIGHT_DECAY = 1e-5
-"""Weight decay of AdamW."""
-MAX_GRADIENT = 1.0
-"""Norm to which gradients are clipped."""
-MEAN_VIEWS = 8
-"""Images of each person that the mean colours are taken from."""
+SQUARED_WEIGHT = 1.0  # Weight of the mean squared error in the loss, which counts edges more
+WARM_UP = 0.05  # Fraction of the run in which the highest learning rate is reached
+WEIGHT_DECAY = 1e-5  # Weight decay of AdamW
+MAX_GRADIENT = 1.0  # Norm to which gradients are clipped
+MEAN_VIEWS = 8  # Images of each person that the mean colours are taken from
+ADAPTING_RATE = 1e-4
+"""Highest learning rate of Adam per image of one person, which falls linearly: a single one says little about the other
+sides."""
 
-_LOWEST = 1e-3
-"""Ratio of the last to the highest learning rate."""
+_LOWEST = 1e-3  # Ratio of the last to the highest learning rate
 
 
 @dataclass
 class Filmed:
-    """A person to train on: images, and the choices of those that are predicted from, with their maps once known.
-
-    All that is observed is observed on the CPU.
-    """
+    """A person to train on: images, and the choices of those that are predicted from, with their maps once known."""
 
     sitter: CapturedPerson
     images: ImageLoader
@@ -69,30 +63,54 @@ class Filmed:
         return self._maps[choice]
 
     def sitter_on(self, device: torch.device) -> CapturedPerson:
-        """Return the person on ``device``; kept."""
         if self._there is None:
             self._there = fields_moved_to(self.sitter, device)
         return self._there
 
-    def look(self, views: list[int]) -> TexelMaps:
-        """Return the maps of these images."""
+    def look(self, views: Sequence[int]) -> TexelMaps:
         return observe_texels(self.sitter, ((self.images[i], self.sitter.pose_in(self.sitter.views[i])) for i in views))
 
 
 @dataclass
-class NetworkTrainer:
-    """A run in memory, as ``dyngs.training.step.Trainer``.
+class PersonPredictor(Predictor):
+    """A network that predicts the person of a capture."""
 
-    Attributes:
-        people: to train on, at least one.
-        network: what is trained.
-        mean: (3, S, S) colours of the people.
-        background: "white", "black" or "random".
-        generator: the only source of randomness.
-        done: steps done.
-        num_gaussians: of the last person.
-        device: of the network and the scenes that it predicts.
-    """
+    config: Config
+    model: HumanPredictorModel
+    network: AtlasNetwork  # may be trained on images of the person before, see ``adapt``
+    mean: Tensor  # (3, S, S) colours of the people that it was trained on
+    person: Filmed  # with images
+
+    @torch.no_grad()
+    def predict(self, views: Sequence[int]) -> HumanScene:
+        return self._scene(self.person.look(views))
+
+    def adapt(self, views: Sequence[int], steps: int, report: ReportProgress = report_nothing) -> None:
+        """Train the network until its prediction shows the images better that it is predicted from."""
+        options = replace(render_options(self.model), nonfinite="trust")
+        background = evaluation_background(self.config.data.background, True)[1]
+        images, maps = [self.person.images[i] for i in views], self.person.look(views)
+        rate = ADAPTING_RATE * len(views)
+        optimizer = torch.optim.Adam(self.network.parameters(), lr=rate)
+        for step in range(steps):
+            scene, total = self._scene(maps), torch.zeros((), device=self.mean.device)
+            for image in images:
+                moment = scene.time_step(image.time)
+                rendering = scene.render(image.cameras, moment, options=options, background=background)
+                total = total + image_loss(rendering, image, image.composite(background), self.config) / len(images)
+            if not _updated(optimizer, self.network, total, rate * (1.0 - step / steps)):
+                break
+            report("training on the images", step + 1, steps)
+
+    def _scene(self, maps: TexelMaps) -> HumanScene:
+        fraction = self.model.min_silhouette_fraction
+        avatar = predict_gaussians(self.person.sitter, maps, self.mean, self.network, fraction)
+        return scene_of(human_options(self.model), avatar, Rates(1))[0]
+
+
+@dataclass
+class NetworkTrainer:
+    """A run in memory, as ``Trainer``."""
 
     config: Config
     model: HumanPredictorModel
@@ -104,22 +122,17 @@ class NetworkTrainer:
     background: str
     generator: torch.Generator
     done: int = 0
-    num_gaussians: int = 0
+    num_gaussians: int = 0  # of the last person
     bad_gradients: int = 0
     has_test_views: bool = False
-    device: torch.device = CPU
+    device: torch.device = CPU  # of the network and the scenes that it predicts
 
     @property
     def num_moving(self) -> int:
-        """All of them: a person moves as a whole."""
         return self.num_gaussians
 
     def step(self) -> StepReport:
-        """Train on one person: predicted from one choice of images, compared with others of one moment.
-
-        Raises:
-            DyngsError: the loss is not finite.
-        """
+        """Train on one person: predicted from one choice of images, compared with others of one moment."""
         step = self.done + 1
         person = self.people[self.sampler.next(self.generator, lambda _: True)]
         choice = self._draw(len(person.choices))
@@ -143,7 +156,6 @@ class NetworkTrainer:
         return StepReport(step, value, image, rendering.rgb[0].detach(), truth)
 
     def checkpoint(self) -> Checkpoint:
-        """Return everything that ``restore`` needs."""
         tensors = {f"model.network.{name}": x for name, x in self.network.state_dict().items()}
         tensors |= {"model.mean": self.mean, "rng": self.generator.get_state()}
         tensors |= {f"sampler.{name}": x for name, x in self.sampler.state().items()}
@@ -155,11 +167,6 @@ class NetworkTrainer:
         return Checkpoint(info, {name: x.detach().cpu() for name, x in tensors.items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken.
-
-        Raises:
-            DyngsError: it belongs to another network.
-        """
         self.mean = load_network(self.network, checkpoint, self.model.resolution).to(self.device)
         with reading(checkpoint.name, OTHER_CONFIG):
             self.sampler.load_state(checkpoint.part("sampler"))
@@ -184,18 +191,23 @@ class NetworkTrainer:
         return [person.images[shown[i]].to(self.device) for i in order[: self.model.target_views]]
 
     def _update(self, loss: Tensor, step: int) -> None:
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        length = torch.nn.utils.clip_grad_norm_(self.network.parameters(), MAX_GRADIENT)
-        if not bool(length.isfinite()):
-            self.bad_gradients += 1
-            return
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate_at(self.model, step, self.config.train.steps)
-        self.optimizer.step()
+        rate = rate_at(self.model, step, self.config.train.steps)
+        self.bad_gradients += not _updated(self.optimizer, self.network, loss, rate)
 
     def _draw(self, count: int) -> int:
         return int(torch.randint(count, (1,), generator=self.generator, device="cpu"))
+
+
+def _updated(optimizer: torch.optim.Optimizer, network: AtlasNetwork, loss: Tensor, rate: float) -> bool:
+    """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are not finite."""
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    if not bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT).isfinite()):
+        return False
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    optimizer.step()
+    return True
 
 
 def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config) -> Tensor:
@@ -211,12 +223,8 @@ def image_loss(rendering: Rendering, image: Image, truth: Tensor, config: Config
     return loss
 
 
-def assemble_network(config: Config) -> NetworkTrainer:
-    """Return the trainer of ``model.kind: human_predictor``: captures read, nothing trained.
-
-    Raises:
-        DyngsError: ``data.root`` has no captures of people, or settings that do not go together.
-    """
+def trainer(config: Config) -> NetworkTrainer:
+    """Return the trainer of ``model.kind: human_predictor``: captures read, nothing trained."""
     device, model = device_for(config.run.device), config.model
     if not isinstance(model, HumanPredictorModel):
         raise TypeError(f"not a network: {model!r}")
@@ -240,20 +248,13 @@ def assemble_network(config: Config) -> NetworkTrainer:
     )
 
 
-def _no_scene(_: HumanPredictorModel, checkpoint: Checkpoint) -> Renderable:
+def restore(_: HumanPredictorModel, checkpoint: Checkpoint) -> Renderable:
+    """Raise DyngsError: a network is no scene."""
     raise DyngsError(f"{checkpoint.name}: a network, not a scene; `dyngs predict RUN CAPTURE --out RUN` makes one")
 
 
-def _no_model(setting: Setting) -> Model[Any]:
-    raise TypeError("a network is not trained on one capture")
-
-
 def new_network(model: HumanPredictorModel, generator: torch.Generator) -> AtlasNetwork:
-    """Return the untrained network of ``model``.
-
-    Raises:
-        DyngsError: widths or a resolution that do not suit it.
-    """
+    """Return the untrained network of ``model``."""
     factor = 2 ** len(model.widths)
     if model.resolution % factor:
         raise DyngsError(
@@ -264,11 +265,7 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
-    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``.
-
-    Raises:
-        DyngsError: the checkpoint is of something else, or of another network.
-    """
+    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the ``resolution``."""
     weights, mean = checkpoint.part("model.network"), checkpoint.tensors.get("model.mean")
     own = network.state_dict()
     if mean is None or {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
@@ -289,11 +286,7 @@ def human_options(model: HumanPredictorModel) -> HumanModel:
 
 
 def captures_in(data: DataConfig) -> list[DataConfig]:
-    """Return the paths of the captures in the folders of ``data.root``, by name.
-
-    Raises:
-        DyngsError: there is no folder in it.
-    """
+    """Return the paths of the captures in the folders of ``data.root``, by name."""
     root = data.root
     folders = sorted(f for f in root.iterdir() if f.is_dir() and not f.name.startswith(".")) if root.is_dir() else []
     if not folders:
@@ -302,11 +295,7 @@ def captures_in(data: DataConfig) -> list[DataConfig]:
 
 
 def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> Filmed:
-    """Return the person of one capture, without choices of images.
-
-    Raises:
-        DyngsError: no capture there, or not one of a person.
-    """
+    """Return the person of one capture, without choices of images."""
     capture = read_capture(data)
     return Filmed(captured_person(capture, model, body), ImageLoader(capture.splits["train"], data), [])
 
@@ -352,6 +341,3 @@ def scene_of(model: HumanModel, avatar: PredictedAvatar, rates: Rates) -> tuple[
     """Return a predicted avatar as a scene, and how it is trained on."""
     training = HumanTraining(model, avatar.subject.motion.frames, rates)
     return training.first_scene(avatar.gaussians, avatar.subject), training
-
-
-KIND = Kind(HumanPredictorModel, _no_model, _no_scene, trainer=assemble_network)

@@ -20,14 +20,10 @@ from torch.distributed.rendezvous import rendezvous
 
 from dyngs.errors import DyngsError
 
-TIMEOUT = timedelta(days=30)
-"""The others wait while the first one reads, evaluates, or tries settings in small runs."""
-CHUNK = 2**22
-"""Most values that are summed at once: the memory that a sum takes for a while, twice."""
-FAILED = "dyngs/failed"
-"""Key of the store that counts the processes that have said why they end."""
-EXIT_FAILED = 2
-"""Exit code of a process that ends because another one has failed, which has said why."""
+TIMEOUT = timedelta(days=30)  # The others wait while the first one reads, evaluates, or tries settings in small runs
+CHUNK = 2**22  # Most values that are summed at once: the memory that a sum takes for a while, twice
+FAILED = "dyngs/failed"  # Key of the store that counts the processes that have said why they end
+EXIT_FAILED = 2  # Exit code of a process that ends because another one has failed, which has said why
 _NAMES = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
 
 
@@ -53,8 +49,6 @@ class Processes:
 
     Args:
         rank: number of this process, from 0.
-        size: number of processes; 1: nothing is exchanged.
-        local_size: number of those on this machine.
     """
 
     def __init__(self, rank: int = 0, size: int = 1, local_size: int = 1) -> None:
@@ -72,11 +66,6 @@ class Processes:
         return self.rank == 0
 
     def __enter__(self) -> Processes:
-        """Connect the processes.
-
-        Raises:
-            DyngsError: the others cannot be reached.
-        """
         if self.size == 1:
             return self
         backend = "gloo"
@@ -103,11 +92,7 @@ class Processes:
             distributed.destroy_process_group()
 
     def share(self, batch: int) -> range:
-        """Return which of the ``batch`` views of a step this process takes.
-
-        Raises:
-            DyngsError: they cannot be shared evenly.
-        """
+        """Return which of the ``batch`` views of a step this process takes."""
         each, rest = divmod(batch, self.size)
         if rest or not each:
             raise DyngsError(
@@ -144,14 +129,6 @@ class Processes:
             x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
         self.sum_([x.grad for x in used if x.grad is not None])
 
-    def agreed(self, choice: bool) -> bool:
-        """Return the choice of the first process."""
-        if self.size == 1:
-            return choice
-        said = torch.tensor([int(choice)], device="cpu")
-        self.send_(said)
-        return bool(said)
-
     def send_(self, values: Tensor) -> None:
         """Replace the values of a tensor by those of the first process."""
         if self.size > 1:
@@ -159,15 +136,7 @@ class Processes:
                 distributed.broadcast(values, 0)
 
     def require_same(self, tensors: Mapping[str, Tensor], when: str) -> None:
-        """Raise unless the tensors have the same bytes in all processes.
-
-        Args:
-            tensors: name to value.
-            when: begins the message.
-
-        Raises:
-            DyngsError: one has others than the first.
-        """
+        """Raise unless the tensors have the same bytes in all processes."""
         if self.size == 1:
             return
         own = torch.tensor([_checksum(tensors)], dtype=torch.int64, device="cpu")
@@ -226,7 +195,6 @@ class Processes:
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> int:
-    """Return a number that changes with any bit of the tensors."""
     total = 0
     for name, x in sorted(tensors.items()):
         values = x.detach().contiguous().reshape(-1)

@@ -46,7 +46,6 @@ class ViewSampler:
         return {"order": self._order, "position": torch.tensor([self._position], device="cpu")}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the state that ``state()`` returned. Raises KeyError, or ValueError for no order of the views."""
         order = require_indices("order", state["order"], (None,), self.num_views)
         position = require_indices("position", state["position"], (1,), len(order) + 1)
         self._order, self._position = order.clone(), int(position)

@@ -25,20 +25,15 @@ from dyngs.gaussians.colour.affine import SATURATED
 from dyngs.models.renderable import Rendering
 from dyngs.training.other_views import grid_of
 
-DRAWN_FROM, ASKED = 100, 40
-"""Views whose cells are the places, and nearest views that are looked for each of them."""
-SAME_DEPTH = 0.05
-"""Relative difference of depth up to which two views show the same place."""
+DRAWN_FROM, ASKED = 100, 40  # Views whose cells are the places, and nearest views that are looked for each of them
+SAME_DEPTH = 0.05  # Relative difference of depth up to which two views show the same place
 SOLID, DARK = 0.9, 0.02
 """Alpha from which a cell has a depth, and mean colour from which a cell has a logarithm worth using."""
-OUTLIER = 0.1
-"""Residual, in log colour, at which an observation counts half as much."""
+OUTLIER = 0.1  # Residual, in log colour, at which an observation counts half as much
 ROUNDS = 4
-PRIOR = 0.05
-"""Weight of the square of a log gain, in observations: decides what no place does."""
+PRIOR = 0.05  # Weight of the square of a log gain, in observations: decides what no place does
 
-Draw = Callable[[Cameras, float | None], Rendering]
-"""Draws cameras at a time, with expected depth."""
+Draw = Callable[[Cameras, float | None], Rendering]  # Draws cameras at a time, with expected depth
 
 
 @dataclass(frozen=True)
@@ -65,9 +60,7 @@ def log_gains(images: ImageLoader, which: Sequence[int], draw: Draw) -> Tensor:
     """Return (V, 3) log gains of the images ``which``, of mean 0; 0 of all others.
 
     Args:
-        images: V of training.
         which: indices of those that may be looked at.
-        draw: the scene, as far as it is learned.
     """
     cells = [_cells_of(images, index, draw) for index in which]
     centres = torch.cat([x.camera.centers for x in cells]).cpu()

@@ -14,13 +14,7 @@ from dyngs.ops.device import ReadBack, sent
 
 
 class StepCheck:
-    """The loss of a step, term by term, and whether what was drawn is finite.
-
-    Args:
-        terms: of the loss, () each, on any device.
-        moved: what was moved, by name; see ``Drawn``.
-        device: of the scene.
-    """
+    """The loss of a step, term by term, and whether what was drawn is finite."""
 
     def __init__(self, terms: Mapping[str, Tensor], moved: Mapping[str, Tensor], device: torch.device) -> None:
         self._terms, self._parts = tuple(terms), tuple(moved)
@@ -29,16 +23,7 @@ class StepCheck:
         self._read = ReadBack(torch.stack(numbers))
 
     def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:
-        """Return the sum of the terms; waits for them.
-
-        Args:
-            step: that is being done.
-            image: that was drawn.
-            moves_by: what moves the Gaussians, and its section of the configuration, for messages.
-
-        Raises:
-            DyngsError: something is not finite; says what, and what to do.
-        """
+        """Return the sum of the terms; waits for them."""
         numbers = self._read.numbers().tolist()
         values, finite = numbers[: len(self._terms)], numbers[len(self._terms) :]
         broken = [name for name, is_finite in zip(self._parts, finite, strict=True) if not is_finite]

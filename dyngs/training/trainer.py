@@ -20,7 +20,7 @@ from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.models.model import Look, Loss, Model
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
-from dyngs.models.views import AlphaWeight, background_colour
+from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import CPU, sent
 from dyngs.state import Role, prefixed, tensors_of, with_role
@@ -28,8 +28,6 @@ from dyngs.training.corrections.camera_refinement import CameraRefinement, watch
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.events import StepReport
-from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.priors.used import UsedPriors
 from dyngs.training.processes import Processes
 from dyngs.training.sampler import ViewSampler
 from dyngs.training.step_check import StepCheck
@@ -39,56 +37,26 @@ M = TypeVar("M", bound=Model[Any])
 
 @dataclass
 class Trainer(Generic[M]):
-    """A run in memory: everything that a step reads and changes.
-
-    Attributes:
-        model: what is trained.
-        capture: that is trained on.
-        background: "white", "black" or "random" (a new colour in each step, behind render and truth alike).
-        alpha: how much silhouettes count in the loss.
-        generator: the only source of randomness, on the CPU.
-        priors: what the user knows about the capture.
-        robust: masks of what disagrees with the other views; None: all pixels count.
-        exposures: affine colours of the training images; None: they agree.
-        refinement: of the cameras; None: they stay as the capture has them.
-        done: steps done.
-        bad_gradients: how often something was left out of a step because its gradient was not finite.
-        held_out: indices of the training views that are not trained on.
-        processes: that take a fraction of the views of each step; one: this.
-        device: where the model is trained; see ``place``.
-    """
+    """A run in memory: everything that a step reads and changes."""
 
     config: Config
     model: M
     capture: Capture
     images: ImageLoader
     sampler: ViewSampler
-    background: str
+    background: str  # "white", "black" or "random" (a new colour in each step, behind render and truth alike)
     extent: float
-    alpha: AlphaWeight
+    losses: Sequence[Loss]  # terms of the loss, in an order that decides the last bits of its gradients
     generator: torch.Generator
-    priors: UsedPriors = field(default_factory=UsedPriors)
-    robust: RobustMasks | None = None
-    exposures: ViewExposures | None = None
-    refinement: CameraRefinement | None = None
+    findings: list[str] = field(default_factory=list)  # lines that are told with the next step
+    robust: RobustMasks | None = None  # masks of what disagrees with the other views; None: all pixels count
+    exposures: ViewExposures | None = None  # affine colours of the training images; None: they agree
+    refinement: CameraRefinement | None = None  # of the cameras; None: they stay as the capture has them
     done: int = 0
-    bad_gradients: Count = 0
-    held_out: frozenset[int] = frozenset()
-    processes: Processes = field(default_factory=Processes)
-    device: torch.device = CPU
-
-    def __post_init__(self) -> None:
-        """List the terms of the loss: an order that decides the last bits of its gradients."""
-        options = self.config.train
-        exposures = [] if self.exposures is None else [self.exposures]
-        self.losses: list[Loss] = [
-            ImageLoss(options.ssim_weight),
-            SilhouetteLoss(self.alpha.weight, masked=self.robust is not None),
-            PenaltyLoss(),
-            *exposures,
-            self.priors,
-            RegularizerLoss(),
-        ]
+    bad_gradients: Count = 0  # how often something was left out of a step because its gradient was not finite
+    held_out: frozenset[int] = frozenset()  # indices of the training views that are not trained on
+    processes: Processes = field(default_factory=Processes)  # that take a fraction of the views of each step; one: this
+    device: torch.device = CPU  # where the model is trained; see ``place``
 
     @property
     def has_test_views(self) -> bool:
@@ -103,12 +71,7 @@ class Trainer(Generic[M]):
         return self.model.num_moving
 
     def step(self) -> StepReport:
-        """Train on this process's fraction of the images of a step; the report is of the first of them.
-
-        Raises:
-            DyngsError: the loss is not finite; says which term, and leaves the parameters as they were. Other processes
-                have come to other Gaussians.
-        """
+        """Train on this process's fraction of the images of a step; the report is of the first of them."""
         step = self.done + 1
         reports = []
         for index, seed in self._next_views(step):
@@ -117,10 +80,10 @@ class Trainer(Generic[M]):
         loss = self._averaged(step, [report.loss for report in reports])
         updated = self.model.update(step)
         self.bad_gradients, self.done = self.bad_gradients + updated.bad, step
-        found = (self.alpha.finding if step == 1 else None, self.priors.told(updated.finding))
         if updated.is_rearranged:
             self.processes.require_same(tensors_of(self.model.scene.state()), f"after step {step}")
-        finding = "; ".join(text for text in found if text is not None) or None
+        finding = "\n".join([*self.findings, *([] if updated.finding is None else [updated.finding])]) or None
+        self.findings.clear()
         return replace(reports[0], loss=loss, finding=finding)
 
     def _averaged(self, step: int, losses: Sequence[float]) -> float:
@@ -169,12 +132,10 @@ class Trainer(Generic[M]):
 
     @property
     def info(self) -> CheckpointInfo:
-        """Metadata of a checkpoint that is taken now."""
         x, y, z = (float(value) for value in self.capture.world_offset)
         return CheckpointInfo(self.done, self.extent, (x, y, z), self.background, self.model.rasterize_mode.value)
 
     def checkpoint(self) -> Checkpoint:
-        """Return everything that ``restore`` needs."""
         state = self.model.state()
         for name, part in self._parts().items():
             state |= prefixed(name, with_role(part.state(), Role.TRAINING))
@@ -182,11 +143,7 @@ class Trainer(Generic[M]):
         return Checkpoint(self.info, {name: x.cpu() for name, x in tensors_of(state).items()})
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken.
-
-        Raises:
-            DyngsError: it belongs to another model or strategy, or its tensors do not fit together.
-        """
+        """Go back to where ``checkpoint`` was taken."""
         with reading(checkpoint.name, OTHER_CONFIG):
             try:
                 self.model.restore(checkpoint)
@@ -217,7 +174,6 @@ class Trainer(Generic[M]):
         return {name: part for name, part in parts.items() if part is not None}
 
     def _drawn_with_depth(self, background: Tensor) -> Callable[[Cameras, float | None], Rendering]:
-        """Return what draws the scene with its expected depth."""
         scene = self.model.scene
         return partial(scene.render, options=replace(scene.options, depth="expected"), background=background)
 
@@ -246,7 +202,6 @@ class Trainer(Generic[M]):
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:
-        """Return which views may be trained on in ``step``."""
         times = self.images.times
 
         def may_train(index: int) -> bool:

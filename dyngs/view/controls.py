@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dyngs.errors import counted
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import has_timeline, views_of
 from dyngs.view.frusta import Frusta
@@ -78,13 +78,13 @@ class Controls:
     def _add_display(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
         layers = [name for name in LAYERS if len(views_of(opened)) or name != "error"]
-        layers = [name for name in layers if isinstance(opened.renderable, Scene) or name != "motion"]
+        layers = [name for name in layers if isinstance(opened.renderable, GaussianScene) or name != "motion"]
         if session.look.layer not in layers:
             session.change(layer="colour")
         hint = "error: against the truth, at a camera of the capture"
         layer = gui.add_dropdown("What", layers, initial_value=session.look.layer, hint=hint)
         layer.on_update(lambda _: self._change(layer=layer.value))
-        scene = opened.renderable if isinstance(opened.renderable, Scene) else None
+        scene = opened.renderable if isinstance(opened.renderable, GaussianScene) else None
         has_parts = scene is not None and 0 < scene.num_moving < len(scene)
         if has_parts or (scene is not None and opened.in_training and has_timeline(opened)):
             part = gui.add_dropdown("Parts", PARTS, initial_value=session.look.part)

@@ -15,7 +15,7 @@ from dyngs.camera_paths.path import resize_cameras
 from dyngs.conventions import SH_C0
 from dyngs.export.contact_sheet import color_map, depth_to_rgb
 from dyngs.files.write import to_uint8
-from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import views_of
@@ -139,7 +139,7 @@ def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> 
     return to_uint8(made.rgb[0].clamp(0, 1).cpu().numpy())
 
 
-def _motion_colours(scene: Scene) -> Tensor:
+def _motion_colours(scene: GaussianScene) -> Tensor:
     far = torch.zeros(len(scene), device=scene.gaussians.means.device)
     if not scene.is_static:
         whole = scene.unmasked()

@@ -57,7 +57,7 @@ class PeopleNetwork:
             out = Path(folder) / "run"
             made = predict_person(self.run, self.people[person].root, out, images or self.num_images)
             opened = open_to_view(out, person, up)
-        said = f"predicted from {', '.join(made.views)} in {made.seconds_maps + made.seconds_network:.1f} s"
+        said = f"predicted from {', '.join(made.views)} in {made.seconds:.1f} s"
         return opened.noted(said)
 
 

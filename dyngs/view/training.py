@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.errors import DyngsError
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.runs.opened import Captured, Opened, cameras_for_paths
@@ -45,7 +45,7 @@ class DrawnBetweenSteps:
         self._not_before = 0.0
         self._refreshed_at = -1e9
 
-    def after_step(self, scene: Scene) -> float:
+    def after_step(self, scene: GaussianScene) -> float:
         """Draw one image if one is due and time for it is left; return the seconds that it took."""
         sessions = self._drawer.sessions
         if not sessions:
@@ -123,6 +123,6 @@ def opened_training(trainer: Trainer[Any]) -> Opened:
 
 def _shell(scene: Renderable, background: Tensor) -> Renderable:
     """Return the same scene with caches of its own, to be drawn whatever its values are."""
-    if isinstance(scene, Scene):
+    if isinstance(scene, GaussianScene):
         scene = replace(scene, options=replace(scene.options, nonfinite="skip"))
     return scene.on_background(background)

@@ -11,16 +11,20 @@ from typing import Any
 
 import pytest
 import torch
+from PIL import Image
+from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, Setting, _Plan, as_static, choose, write_choices
+from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
 from dyngs.api.view_scores import explained_pixels
-from dyngs.config import Config, DynamicModel, StaticModel
+from dyngs.camera import Cameras
+from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
+from dyngs.gaussians.rendering import render
 from dyngs.kinds import with_points
 from dyngs.runs.folder import CHOICES_NAME
 
@@ -52,7 +56,7 @@ def scored(monkeypatch: pytest.MonkeyPatch, psnr_of: Any) -> list[Config]:
         monkeypatch.setattr(module, name, score)
     real = module._settings
     monkeypatch.setattr(module, "_settings", lambda config: [replace(x, score=score) for x in real(config)])
-    monkeypatch.setattr(module, "Setting", lambda text, applied, _=None: Setting(text, applied, score))
+    monkeypatch.setattr(module, "OpenSetting", lambda text, applied, _=None: OpenSetting(text, applied, score))
     return tried
 
 
@@ -179,26 +183,39 @@ def test_choices_are_a_table_in_the_run_folder(tmp_path: Path) -> None:
     assert (row["setting"], row["gain"], row["taken"]) == ("a=b", 0.5, True)
 
 
-@pytest.mark.parametrize("moves", [False])
-def test_never_worse_than_static(moves: bool, tmp_path: Path) -> None:
+def write_rolling_ball(root: Path) -> None:
+    """32 images of 24 px of a ball that goes 1.6 along x, at eight times, from everywhere."""
+    write_still_capture(root, StillOptions(size=24, num_train=32, num_test=1, samples=1, distance=4.0))
+    views = read_capture(DataConfig(root=root)).splits["train"]
+    for split, times in (("train", [i % 8 / 7 for i in range(32)]), ("test", [0.5])):
+        file = root / f"transforms_{split}.json"
+        document = json.loads(file.read_text())
+        for frame, time in zip(document["frames"], times, strict=True):
+            frame["time"] = time
+        file.write_text(json.dumps(document))
+    for i, view in enumerate(views):
+        ball = two_balls().select(torch.tensor([0])).replace(means=torch.tensor([[1.6 * (i % 8) / 7 - 0.8, 0.0, 0.0]]))
+        pose, intrinsics = (torch.from_numpy(x).float()[None] for x in (view.cam_from_world, view.intrinsics))
+        drawn = render(ball, Cameras(pose, intrinsics, 24, 24))
+        alpha = drawn.alpha[0][..., None]
+        rgba = torch.cat([drawn.rgb[0] / alpha.clamp_min(1e-3), alpha], -1).clamp(0, 1)
+        Image.fromarray((255 * rgba).round().byte().numpy()).save(view.image_path)
+
+
+@pytest.mark.parametrize(("moves", "steps"), [(True, 300), (False, 500)])
+def test_never_worse_than_static(moves: bool, steps: int, tmp_path: Path) -> None:
     """Real small runs: motion wins where something moves, the static model where nothing does."""
-    root = tmp_path / "capture"
+    root, keys = tmp_path / "capture", ["init.num_random=200", "model.num_random_moving=60"]
     if moves:
-        write_dynamic_capture("spin", root, DynamicOptions(size=32, num_times=48, num_test=1, samples=1))
+        write_rolling_ball(root)
     else:
         write_still_capture(root, StillOptions(size=32, num_train=48, num_test=1, samples=1))
-    keys = (
-        "train.steps=40_000",
-        "init.num_random=400",
-        "model.num_random_moving=200",
-        "data.times=order",
-        "train.initial_downscale=1",
-    )
-    config = preset(root, *keys)
+        keys = ["init.num_random=400", "model.num_random_moving=200", "data.times=order"]
+    config = preset(root, "train.steps=40_000", "train.initial_downscale=1", *keys)
     capture = read_capture(config.data)
-    plan = replace(_Plan.of(config, capture, 1), steps=500, runs=2)
+    plan = replace(_Plan.of(config, capture, 1), steps=steps, runs=2)
     moving = config.model_copy(update={"model": config.model.model_copy(update={"choose": False})})
-    settings, base = [Setting("model.kind=dynamic", lambda _: moving)], module._at_rest(config)
+    settings, base = [OpenSetting("model.kind=dynamic", lambda _: moving)], module._at_rest(config)
     best, (choice,) = module._decided(base, settings, plan, with_points(capture, base))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves

@@ -29,7 +29,7 @@ from dyngs.runs.checkpoint import checkpoint_paths, load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-KINDS = ("default", "mcmc", "trajectory", "human")
+KINDS = ("default", "mcmc", "control_nodes", "human")
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def captures(still: Path, moving: Path, person: Path) -> dict[str, Path]:
 
 def config_of(kind: str, captures: dict[str, Path], run_dir: Path, budget: BudgetConfig) -> Config:
     """A run that begins with more than 100 Gaussians."""
-    if kind == "trajectory":
+    if kind == "control_nodes":
         config = busy_config(captures["moving"], run_dir, kind)
         return config.model_copy(update={"init": RandomInit(num_random=150), "budget": budget})
     busy = McmcStrategy if kind == "mcmc" else DefaultStrategy

@@ -40,7 +40,7 @@ from dyngs.config import (
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.view_scores import Drawing
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import assemble, restored_scene
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.events import Event, StepDone
@@ -53,7 +53,7 @@ BASE, EACH = 1e-3, 1e-5
 """Seconds that the simulated machine takes for a drawing without Gaussians, and for each of them, moved or drawn."""
 
 
-def simulated(scene: Scene) -> float:
+def simulated(scene: GaussianScene) -> float:
     """Seconds of a drawing on the simulated machine."""
     return BASE + EACH * (len(scene) + (0 if scene.is_static else len(scene.rows)))
 
@@ -71,7 +71,7 @@ def asked(config: Config, fps: float | None) -> Config:
 def machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulated machine, on which nothing else takes time."""
 
-    def seconds(trainer: Trainer, scene: Scene, views: int = 0) -> float:
+    def seconds(trainer: Trainer, scene: GaussianScene, views: int = 0) -> float:
         return simulated(scene)
 
     monkeypatch.setattr("dyngs.budget.speed.drawing_seconds", seconds)
@@ -130,7 +130,7 @@ def test_growth_ends_where_it_would_be_too_slow(
 
 
 @pytest.mark.usefixtures("machine")
-@pytest.mark.parametrize("kind", ["still", "hexplane", "mlp", "control_nodes", "trajectory", "human"])
+@pytest.mark.parametrize("kind", ["still", "hexplane", "mlp", "control_nodes", "human"])
 def test_too_many_are_removed_and_resuming_is_exact(
     kind: str, still: Path, moving: Path, person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -161,7 +161,7 @@ def test_too_many_are_removed_and_resuming_is_exact(
 @pytest.mark.usefixtures("machine")
 def test_a_last_stage_is_fast_enough_too(moving: Path, tmp_path: Path) -> None:
     stage = PruneConfig(fraction=0.3, steps=6, mask_times=3)
-    config = busy_config(moving, tmp_path / "run", "trajectory").model_copy(update={"prune": stage})
+    config = busy_config(moving, tmp_path / "run", "control_nodes").model_copy(update={"prune": stage})
     assert len(load_run(train(config)).scene) > 40
     config = config.model_copy(update={"run": RunConfig(dir=tmp_path / "fast", threads=1)})
     run = load_run(train(asked(config, fps_of(40))))
@@ -230,14 +230,14 @@ def test_a_machine_that_becomes_too_slow_is_told_of(
         limit.reached()
 
 
-@pytest.mark.parametrize("kind", ["still", "trajectory", "human"])
+@pytest.mark.parametrize("kind", ["still", "control_nodes", "human"])
 def test_a_limit_that_is_far_away_changes_nothing(
     kind: str, still: Path, moving: Path, person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """On the machine as it is."""
     configs = {
         "still": still_config(still, tmp_path / "free"),
-        "trajectory": busy_config(moving, tmp_path / "free", "trajectory"),
+        "control_nodes": busy_config(moving, tmp_path / "free", "control_nodes"),
         "human": human_config(person, tmp_path / "free"),
     }
     config = configs[kind]

@@ -136,7 +136,7 @@ def alone(config: Config, folder: Path, resumed: Checkpoint | None = None) -> _R
 def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of steps that were asked for is kept in mind; that of a resumed run is settled."""
     _slowed(monkeypatch, 0.1)
-    config = busy_config(moving, tmp_path / "run", "trajectory")
+    config = busy_config(moving, tmp_path / "run", "control_nodes")
     assert alone(config, tmp_path / "free").limits == {}
     run = alone(timed(config, 2), tmp_path / "run")
     (found,) = run.limits.values()
@@ -150,7 +150,7 @@ def test_no_limit_no_deadline(moving: Path, tmp_path: Path, monkeypatch: pytest.
     assert not settled.fits
 
 
-@pytest.mark.parametrize("kind", ["control_nodes", "trajectory"])
+@pytest.mark.parametrize("kind", ["control_nodes", "hexplane"])
 def test_refitted_is_where_it_was_on_other_schedules(kind: str, moving: Path, tmp_path: Path) -> None:
     config = busy_config(moving, tmp_path, kind)
     trainer = assemble(config)
@@ -182,7 +182,7 @@ def _slowed(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[float]:
 def test_a_first_fit_keeps_or_lowers_the_steps_or_refuses(
     moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = busy_config(moving, tmp_path, "trajectory")
+    config = busy_config(moving, tmp_path, "control_nodes")
     wanted = config.train.steps
     _slowed(monkeypatch, 1.0)
     assert wanted < FEWEST_STEPS
@@ -201,7 +201,7 @@ def test_a_run_that_gets_slow_ends_in_time_and_stays_ended(
     moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On a clock that only steps advance: fitted at first to all steps, then they take ten times as long."""
-    config = timed(busy_config(moving, tmp_path / "run", "trajectory"), 2.0)
+    config = timed(busy_config(moving, tmp_path / "run", "control_nodes"), 2.0)
     wanted = config.train.steps
     clock, real = _slowed(monkeypatch, 0.1), Trainer.step
 

@@ -16,7 +16,7 @@ from dyngs.runs.checkpoint import SCENE_FILE
 
 @pytest.mark.usefixtures("one_thread")
 def test_a_smaller_run_its_file_and_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = train(busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "trajectory"))
+    run = train(busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "control_nodes"))
     words = ["prune", str(run), "--threads", "1", "--steps", "3", "--out"]
     rows = ("Gaussians", "PSNR, training views", "PSNR, held-out views", "rendering", "model", "file", "written")
     for out, more, told in (

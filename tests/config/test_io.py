@@ -24,7 +24,6 @@ from dyngs.config import (
     RunConfig,
     StaticModel,
     TrainConfig,
-    TrajectoryField,
 )
 from dyngs.config.io import find_preset, load_config, load_resolved, packaged_preset, save_config
 from dyngs.conventions import RasterizeMode
@@ -137,10 +136,10 @@ def test_an_inner_kind_replaces_nothing_outside_it(tmp_path: Path) -> None:
 
 
 def test_a_nested_section_can_be_given_as_a_whole() -> None:
-    expected = DynamicModel(sh_degree=2, deform=TrajectoryField(fourier=2))
-    whole = "model={sh_degree: 2, deform: {fourier: 2, kind: trajectory}, kind: dynamic}"
+    expected = DynamicModel(sh_degree=2, deform=MlpField(width=2))
+    whole = "model={sh_degree: 2, deform: {width: 2, kind: mlp}, kind: dynamic}"
     assert load_config(None, [ROOT, whole]).model == expected
-    split = ["model.sh_degree=2", "model.deform={fourier: 2, kind: trajectory}", "model={kind: dynamic}"]
+    split = ["model.sh_degree=2", "model.deform={width: 2, kind: mlp}", "model={kind: dynamic}"]
     assert load_config(None, [ROOT, *split]).model == expected
     assert load_config(None, [ROOT, "model.kind=dynamic", "model={}", "model.deform={}"]).model == DynamicModel()
 
@@ -195,16 +194,16 @@ def test_wrong_overrides_are_named_with_what_is_allowed(override: str, parts: li
 @pytest.mark.parametrize(
     ("override", "parts"),
     [
-        ("model.deform.kind=mpl", ["model.deform.kind must be one of hexplane, mlp, traj", "did you mean 'mlp'"]),
+        ("model.deform.kind=mpl", ["model.deform.kind must be one of hexplane, mlp, cont", "did you mean 'mlp'"]),
         ("model.deform.chanels=5", ["unknown key 'model.deform.chanels'", "did you mean 'model.deform.channels'"]),
         ("model.defrom.width=5", ["unknown key 'model.defrom'", "did you mean 'model.deform.width'"]),
         ("model.defrom.kind=mlp", ["unknown key 'model.defrom'", "did you mean 'model.deform.kind'"]),
-        ("model.deform.fourier=5", ["model.deform.fourier belongs to model.deform.kind=trajectory, not to hexplane"]),
+        ("model.deform.nodes=5", ["model.deform.nodes belongs to model.deform.kind=control_nodes, not to hexplane"]),
         ("model.deform.channels=0", ["model.deform.channels must be an integer >= 1, not 0"]),
         ("model.deform.levels=[1, 0]", ["model.deform.levels must be a non-empty list of integers >= 1, not [1, 0]"]),
         ("model.deform.levels=2", ["model.deform.levels must be a non-empty list of integers >= 1, not 2"]),
         ("model.deform.levels=[]", ["model.deform.levels must be a non-empty list of integers >= 1, not []"]),
-        ("model.deform=mlp", ["model.deform is a section", "kind", "polynomial"]),
+        ("model.deform=mlp", ["model.deform is a section", "kind", "rigidity"]),
         ("model.dynamic=1", ["unknown key 'model.dynamic'"]),
     ],
 )
@@ -284,7 +283,6 @@ configs = st.builds(
         motion_from=fractions,
         deform=st.builds(HexplaneField, levels=st.lists(st.integers(1, 9), min_size=1).map(tuple), lr_planes=rates)
         | st.builds(MlpField, lr=rates, move_scales=st.booleans())
-        | st.builds(TrajectoryField, lr_means=rates)
         | st.builds(ControlNodesField, rigidity=rates),
     ),
     init=st.builds(RandomInit, half_extent=rates),

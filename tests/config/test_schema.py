@@ -18,7 +18,6 @@ from dyngs.config import (
     MlpField,
     StaticModel,
     TrainConfig,
-    TrajectoryField,
 )
 from dyngs.config.schema import (
     allowed_values,
@@ -61,7 +60,7 @@ def test_nested_keys_name_the_kinds_that_have_them() -> None:
     assert ("model.deform.width", ("dynamic", "mlp")) in names
     written = [line.split("|")[1].strip() for line in keys_table().splitlines()]
     assert "`model.deform.width` (dynamic, mlp)" in written
-    for field in (HexplaneField(), MlpField(), TrajectoryField()):
+    for field in (HexplaneField(), MlpField()):
         known = {name for name, kinds in names if kinds in {("dynamic",), ("dynamic", field.kind)}}
         assert known >= {f"model.deform.{key}" for key in field.model_dump()}
 

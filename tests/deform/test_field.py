@@ -72,7 +72,7 @@ def test_gradients_reach_all_that_is_learned(kind: str) -> None:
         assert reached == (set(names) if trained else first)
 
 
-@pytest.mark.parametrize("kind", ["hexplane", "mlp", "trajectory"])
+@pytest.mark.parametrize("kind", ["hexplane", "mlp"])
 def test_gradients_reach_the_canonical_gaussians(kind: str) -> None:
     """Only through the sum: the position at which these fields are asked is a constant."""
     gaussians = cloud()

@@ -10,12 +10,11 @@ from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.fields import field_state, new_field, restored_field
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
-from dyngs.deform.trajectory import Trajectory
 from dyngs.state import tensors_of
 
 
 def test_options_decide_the_kind() -> None:
-    kinds = {"hexplane": Hexplane, "mlp": Mlp, "control_nodes": ControlNodes, "trajectory": Trajectory}
+    kinds = {"hexplane": Hexplane, "mlp": Mlp, "control_nodes": ControlNodes}
     for kind, expected in kinds.items():
         assert type(tiny_field(kind)) is expected
 
@@ -57,9 +56,7 @@ def test_the_generator_decides_everything() -> None:
         fields = [new_field(tiny_options(kind), tiny_setup(), torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
         first, second, other = (f.parameters.values() for f in fields)
         assert all(torch.equal(x, second[name]) for name, x in first.items())
-        assert kind in ("control_nodes", "trajectory") or any(
-            not torch.equal(x, other[name]) for name, x in first.items()
-        )
+        assert kind == "control_nodes" or any(not torch.equal(x, other[name]) for name, x in first.items())
 
 
 @pytest.mark.parametrize("kind", KINDS)

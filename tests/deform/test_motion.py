@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.deform.field import NetworkField, Offsets, deformed
+from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.deform.motion import MAX_SAMPLES, PX_PER_OPACITY, bake_, measure_motion
 from dyngs.gaussians.parameters import Parameters
 
 TIMES = tuple(i / 10 for i in range(11))
 
 
-class Scripted(NetworkField):
+class Scripted(DeformationField):
     """A field that follows a function of time; keeps the times at which it was asked."""
 
     def __init__(self, script: Callable[[Tensor, float], Offsets]) -> None:
@@ -117,7 +117,7 @@ def test_long_clips_are_sampled_evenly(count: int) -> None:
 def test_baking_freezes_at_the_mean(everything: bool) -> None:
     """Rows that are baked look as the field shows them on average; the others do not change."""
     gaussians = cloud()
-    field = stirred_field("trajectory", everything=everything)
+    field = stirred_field("control_nodes", everything=everything)
     mean = measure_motion(field, gaussians, TIMES, torch.ones(9)).mean
     samples = [field.offsets(gaussians.means, t).means.detach() for t in TIMES]
     torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))

@@ -137,7 +137,7 @@ def test_10000_training_times() -> None:
     assert sum(window.holds(time, 1001) for time in times) == pytest.approx(LONG / 10, abs=2)
     assert 0 < sum(window.holds(time, 1002) for time in times) <= FRONTIER_VIEWS + 1
     asked: list[float] = []
-    field = stirred_field("trajectory")
+    field = stirred_field("control_nodes")
     real = field.offsets
     field.offsets = lambda means, time: (asked.append(time), real(means, time))[1]  # type: ignore[method-assign]
     measure_motion(field, cloud(), times, torch.ones(9))
@@ -220,7 +220,7 @@ def test_boxes_without_volume(kind: str, flat: str) -> None:
     (found * weights(found)).sum().backward()
     grads = [field.parameters[name].grad for name in field.parameters.values()]
     assert all(x is None or x.isfinite().all() for x in grads)
-    if flat == "point" and kind != "trajectory":
+    if flat == "point" and kind != "control_nodes":
         torch.testing.assert_close(found, found[:1].expand_as(found))
 
 
@@ -254,7 +254,7 @@ def test_gaussians_far_outside_the_box(distance: float) -> None:
     torch.testing.assert_close(values(planes.offsets(means, 0.4)), values(planes.offsets(border, 0.4)))
     if distance > 1e6:
         return
-    for kind in ("mlp", "control_nodes", "trajectory"):
+    for kind in ("mlp", "control_nodes"):
         field = stirred_field(kind)
         field = field.edited(TopologyEdit(torch.arange(9), torch.zeros(9, dtype=torch.bool)))
         assert values(field.offsets(means, 0.4)).isfinite().all()
@@ -337,7 +337,7 @@ def test_no_random_gaussians(capture: Path) -> None:
     """Just the Gaussians that were there move."""
     sizes, moving = [], []
     for added in (12, 0):
-        trainer = assemble(busy_config(capture, capture, "trajectory", num_random_moving=added))
+        trainer = assemble(busy_config(capture, capture, "control_nodes", num_random_moving=added))
         for _ in range(8):
             trainer.step()
         sizes.append(len(trainer.model.scene.gaussians))

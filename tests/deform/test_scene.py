@@ -88,7 +88,7 @@ def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) 
 
 
 def test_parts_of_extreme_scenes() -> None:
-    field = stirred_field("trajectory", 9)
+    field = stirred_field("control_nodes", 9)
     all_move = scene_of(torch.arange(9), field)
     assert same(all_move.part("moving").at(0.3), all_move.at(0.3))
     assert len(all_move.part("still")) == 0
@@ -98,7 +98,7 @@ def test_parts_of_extreme_scenes() -> None:
 
 
 def test_what_a_scene_says_of_itself() -> None:
-    scene, field = some_scene("trajectory"), tiny_field("trajectory", 4)
+    scene, field = some_scene("hexplane"), tiny_field("hexplane", 4)
     assert len(scene) == 9
     assert scene.moving_fraction == pytest.approx(4 / 9)
     assert scene.num_motion_values == sum(x.numel() for x in field.parameters.values().values())
@@ -110,7 +110,7 @@ def test_what_a_scene_says_of_itself() -> None:
 
 def test_the_filter_acts_on_what_is_drawn() -> None:
     std = torch.full((9,), 0.3)
-    scene, plain = some_scene("trajectory", std), some_scene("trajectory")
+    scene, plain = some_scene("control_nodes", std), some_scene("control_nodes")
     assert same(scene.at(0.6), fuse_filter(plain.at(0.6), std))
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scenes import look_around
 from tiny_fields import cloud
 from torch import Tensor
+from two_balls import cameras_around, two_balls
 
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
@@ -20,6 +21,7 @@ from dyngs.deform.still_error import (
     MIN_SAME,
     cameras_in_place,
     differing_fraction,
+    moving_fractions,
     still_errors,
     two_group_threshold,
     views_to_compare,
@@ -290,3 +292,35 @@ def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
     come = room.clone()
     come[:4, :4] += 0.3
     assert differing_fraction([[room, room, come]]) == 4 / 48, "of 16 blocks of 2x2 pixels in each image"
+
+
+# --- motion masks -----------------------------------------------------------------------------------------------------
+
+
+def masked_image(moves: torch.Tensor | None, mask: torch.Tensor | None = None) -> Image:
+    return Image("a", cameras_around(1), torch.zeros(18, 24, 3), None, mask, 0.0, moves=moves)
+
+
+def left() -> torch.Tensor:
+    moves = torch.zeros(18, 24)
+    moves[:, :13] = 1
+    return moves
+
+
+def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
+    """The left ball lies in the mask, the right one does not; a fraction of one half counts as ``sure``."""
+    found = moving_fractions(lambda _: two_balls(), [masked_image(left())], RenderOptions(), 0.06)
+    torch.testing.assert_close(found.most, torch.tensor([0.12, 0.0]), rtol=0, atol=2e-3)
+    torch.testing.assert_close(found.usual, found.most)
+
+
+def test_what_is_covered_at_times_only_is_not_usual() -> None:
+    images = [masked_image(left())] + [masked_image(torch.zeros(18, 24)) for _ in range(4)] + [masked_image(None)]
+    found = moving_fractions(lambda _: two_balls(), images, RenderOptions(), 0.06)
+    assert float(found.most[0]) > 0.1
+    assert float(found.usual.max()) == 0
+
+
+def test_masked_pixels_are_in_no_motion_mask() -> None:
+    found = moving_fractions(lambda _: two_balls(), [masked_image(left(), torch.zeros(18, 24))], RenderOptions(), 0.06)
+    assert found.most.tolist() == [0, 0]

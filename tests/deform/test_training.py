@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from moving_scene import Lines
 from pretend_gpu import GPU, pretend_gpu
 from scenes import look_around
 from static_balls import Ball, filmed
@@ -17,7 +18,7 @@ from tiny_fields import KINDS, cloud, stir, tiny_options
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import ControlNodesField, DynamicModel, OptimConfig, TrajectoryField
+from dyngs.config import ControlNodesField, DynamicModel, OptimConfig
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
@@ -113,9 +114,13 @@ def new_run(
     full: int = FULL,
     **options: object,
 ) -> Run:
-    """Before the first step; the field is a straight line per Gaussian unless told otherwise."""
-    line = TrajectoryField(polynomial=1, fourier=0, move_rotations=False, move_scales=False)
-    defaults = {"deform": line, "num_random_moving": 0, "motion_sparsity": 0.0, "freeze_below_px": THRESHOLD}
+    """Before the first step."""
+    defaults = {
+        "deform": ControlNodesField(nodes=4),
+        "num_random_moving": 0,
+        "motion_sparsity": 0.0,
+        "freeze_below_px": THRESHOLD,
+    }
     capture = TrainingViews(times, [camera()], 1.0, still_errors, cameras_stay)
     schedule = DeformSchedule(FINE, FINE, full, FINE, (SPLIT,), Rates(STEPS))
     model = DynamicModel.model_validate(defaults | options)
@@ -124,10 +129,14 @@ def new_run(
 
 
 def begun(gaussians: Gaussians, **options: object) -> Run:
-    """After the coarse phase, as if the errors had said that all of the Gaussians move."""
+    """After the coarse phase, as if the errors had said that all of the Gaussians move.
+
+    Along a straight line each unless told otherwise.
+    """
     run = new_run(gaussians, **options)  # type: ignore[arg-type]
     setup = FieldSetup(*box_of(gaussians, 1.0), len(run.scene.times), len(gaussians), 1.0)
-    field = new_field(run.training.options.deform, setup, torch.Generator().manual_seed(0))
+    made = new_field(run.training.options.deform, setup, torch.Generator().manual_seed(0))
+    field = made if "deform" in options else Lines(setup)
     run.scene = replace(run.scene, field=field, moving=torch.arange(len(gaussians)))
     return run
 
@@ -369,7 +378,7 @@ def test_freezing_keeps_just_what_is_seen_to_move() -> None:
 
 def test_freezing_bakes_a_constant_offset_into_the_canonical_gaussians() -> None:
     gaussians = flat_cloud()
-    run = begun(gaussians, deform=TrajectoryField(polynomial=1, fourier=0))
+    run = begun(gaussians)
     assert run.scene.field is not None
     move(run, torch.full((9,), 0.005))
     moved_at = run.drawn_at(0.5)
@@ -572,7 +581,8 @@ def test_motion_begins_on_a_gpu_as_on_the_cpu() -> None:
 def test_where_nothing_travels_random_gaussians_are_added() -> None:
     """And for the fields that cannot begin on their way the cameras are not even asked."""
     errors = alike(torch.tensor(ERRORS))
-    for deform, footage in ((ControlNodesField(nodes=4), filmed(lambda _: [], TIMES[:4])), (TrajectoryField(), None)):
+    nothing = filmed(lambda _: [], TIMES[:4])
+    for deform, footage in ((ControlNodesField(nodes=4), nothing), (tiny_options("hexplane"), None)):
         run = new_run(flat_cloud(), still_errors=lambda _: errors, deform=deform, num_random_moving=4)
         run.training.capture = replace(run.training.capture, standing=lambda shown=footage: shown)
         result = run.grow(FINE)

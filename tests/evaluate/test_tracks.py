@@ -22,7 +22,7 @@ from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.scenes import SceneName
 from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.views import training_cameras
 
@@ -64,7 +64,7 @@ def split() -> list[tuple[View, Cameras]]:
     return [(view, camera()) for view in views()]
 
 
-def only_movers(scene: Scene) -> Scene:
+def only_movers(scene: GaussianScene) -> GaussianScene:
     """The two balls that move, so that each point is carried by them alone."""
     return scene.select(torch.tensor([1, 3]))
 

@@ -19,7 +19,7 @@ from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
@@ -44,12 +44,12 @@ def assert_alike(found: Gaussians, expected: Gaussians, atol: float = 1e-6) -> N
         )
 
 
-def image(scene: Scene, time: float | None) -> Tensor:
+def image(scene: GaussianScene, time: float | None) -> Tensor:
     with torch.no_grad():
         return scene.render(onlooker(), time).rgb
 
 
-def names_with(scene: Scene, role: Role) -> set[str]:
+def names_with(scene: GaussianScene, role: Role) -> set[str]:
     return {name for name, x in scene.state().items() if x.role is role}
 
 
@@ -96,7 +96,7 @@ def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
             if x.role is Role.PER_MOVING:
                 assert len(x.tensor) == one.num_moving, name
     assert {f"gaussians.{name}" for name in scene.gaussians.tensors()} <= names_with(scene, Role.PER_GAUSSIAN)
-    assert (kind in ("control_nodes", "trajectory")) == bool(names_with(scene, Role.PER_MOVING))
+    assert (kind == "control_nodes") == bool(names_with(scene, Role.PER_MOVING))
     assert scene.drawing_state().keys() == scene.state().keys() - names_with(scene, Role.TRAINING) - WITHIN_OTHERS
     assert all(not x.tensor.requires_grad for x in scene.state().values())
 

@@ -65,15 +65,12 @@ def test_what_is_masked_or_half_transparent_does_not_count() -> None:
 def test_without_a_background_nothing_is_measured() -> None:
     everything = image(torch.ones(4, 4, 3), torch.ones(4, 4))
     for images in ([], [image(torch.ones(4, 4, 3), None)], [everything]):
-        assert measured_alpha_weight(images, torch.ones(3)).weight == 0.0
-        assert measured_alpha_weight(images, torch.ones(3)).finding is None
+        assert measured_alpha_weight(images, torch.ones(3)) == (0.0, [])
 
 
 def test_silhouettes_count_where_much_looks_like_the_background() -> None:
     much, little = (measured_alpha_weight([half_opaque(0.95, n)], torch.ones(3)) for n in (4, 1))
-    assert (much.weight, little.weight) == (WEIGHT, 0.0)
-    assert much.finding is not None
-    assert "10.0% of the opaque pixels" in much.finding
-    assert "silhouettes count" in much.finding
-    assert little.finding is not None
-    assert "not needed" in little.finding
+    assert (much[0], little[0]) == (WEIGHT, 0.0)
+    assert "10.0% of the opaque pixels" in much[1][0]
+    assert "silhouettes count" in much[1][0]
+    assert "not needed" in little[1][0]

@@ -12,14 +12,14 @@ from moving_scene import Blinking, Sliding, camera, moving_scene, row_of_balls, 
 
 from dyngs.deform.field import Offsets
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.static.scene import StaticScene
 
 BLACK = torch.zeros(3)
 
 
-def views(scene: Scene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)) -> ScoringViews:
+def views(scene: GaussianScene, times: tuple[float | None, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)) -> ScoringViews:
     return ScoringViews(scene, [camera(), camera(40, 28)], times, RenderOptions(), BLACK)
 
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture
 def trainer(moving: Path) -> Trainer:
     """At the end of its run, untrained: what is searched does not matter here."""
-    config = busy_config(moving, moving, "trajectory")
+    config = busy_config(moving, moving, "control_nodes")
     trainer = assemble(config.model_copy(update={"prune": PruneConfig(steps=3)}))
     trainer.done = config.train.steps
     return trainer

@@ -119,7 +119,7 @@ def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("score", ["variation", "sensitivity", "contribution", "temporal"])
 def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> None:
     stage = STAGE.model_copy(update={"score": score})
-    trainer = trained(moving_config(moving, tmp_path, "trajectory", stage))
+    trainer = trained(moving_config(moving, tmp_path, "control_nodes", stage))
     before = trainer.model.scene.gaussians.detach()
     found = prune_(trainer)
     after = trainer.model.scene.gaussians
@@ -136,7 +136,7 @@ def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
 
 def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     """What no key time sees is not drawn, and receives no gradient."""
-    trainer = trained(moving_config(moving, tmp_path, "trajectory"))
+    trainer = trained(moving_config(moving, tmp_path, "control_nodes"))
     prune_(trainer)
     scene = trainer.model.scene
     assert scene.masks is not None

@@ -11,7 +11,7 @@ from moving_scene import write_moving_run
 
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import restored_scene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.storage.file import decoded
@@ -74,7 +74,7 @@ def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
     config, checkpoint = load_resolved(run), latest_checkpoint(run)
     exact = restored_scene(checkpoint, config.model).at(0.5).means
 
-    def quality(scene: Scene) -> float:
+    def quality(scene: GaussianScene) -> float:
         """Minus the sum of squares of how far the Gaussians are from where they were: their order does not matter."""
         return -float((scene.at(0.5).means.sum(0) - exact.sum(0)).square().sum())
 

@@ -19,7 +19,7 @@ from dyngs.config import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.avatar.corrections import new_corrections
@@ -244,7 +244,7 @@ def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
     return scene, DynamicModel(deform=tiny_options(kind))
 
 
-def stored(scene: Scene) -> dict[str, torch.Tensor]:
+def stored(scene: GaussianScene) -> dict[str, torch.Tensor]:
     """What a file holds of a scene, in its order."""
     return drawable(scene.edited(stored_edit(scene, scene.gaussians.means.numpy())))
 
@@ -269,12 +269,12 @@ def test_the_stored_form_looks_the_same(kind: str) -> None:
 
 
 def test_what_moves_is_in_front_and_followed() -> None:
-    scene, _ = moving("trajectory")
+    scene, _ = moving("control_nodes")
     kept = stored(scene)
     assert kept["model.rows"].tolist() == list(range(len(ROWS)))
     place = {tuple(mean): i for i, mean in enumerate(scene.gaussians.means.tolist())}
     came_from = [ROWS.index(place[tuple(mean)]) for mean in kept["gaussians.means"][: len(ROWS)].tolist()]
-    name = "model.field.learned.means"
+    name = "model.field.buffers.followed"
     assert torch.equal(kept[name], scene.state()[name].tensor[came_from])
 
 
@@ -327,7 +327,7 @@ def test_what_is_not_finite_is_refused() -> None:
 
 def masked() -> tuple[DynamicScene, DynamicModel]:
     """As ``moving``; each Gaussian is seen at one of three key times."""
-    scene, model = moving("trajectory")
+    scene, model = moving("control_nodes")
     masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])
     return replace(scene, masks=masks), model
 

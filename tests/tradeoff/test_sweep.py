@@ -33,7 +33,7 @@ PLAN = Plan(parse_variations(SETTINGS, trains=False), finetune=2, combine=2, rou
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "trajectory"))
+    return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes"))
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], r
 @pytest.mark.parametrize(
     ("variant", "kind", "size"),
     [
-        (Variant(field_size=0.5), "trajectory", {"fourier": 2}),
+        (Variant(field_size=0.5), "control_nodes", {"nodes": 256}),
         (Variant(field="control_nodes", field_size=0.25), "control_nodes", {"nodes": 128}),
         (Variant(field="hexplane"), "hexplane", {"channels": 32}),
     ],
@@ -156,7 +156,7 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], r
 def test_another_field_moves_the_same(
     variant: Variant, kind: str, size: dict[str, int], run_dir: Path, tmp_path: Path
 ) -> None:
-    before = load_resolved(run_dir, ["model.deform.fourier=4", "model.deform.move_scales=false"])
+    before = load_resolved(run_dir, ["model.deform.nodes=512", "model.deform.move_scales=false"])
     save_config(before, tmp_path / "config.yaml")
     changed = load_resolved(tmp_path, field_changes(before, variant)).model
     assert isinstance(changed, DynamicModel)

@@ -1,4 +1,4 @@
-"""Training of the network: the same bytes, exact resuming, what is refused."""
+"""Training of the network, on many people and on the images of one: the same bytes, exact resuming, what is refused."""
 
 from __future__ import annotations
 
@@ -6,13 +6,22 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_people import NET, people
+from tiny_people import NET, people, person
 
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig, HumanPredictorModel
 from dyngs.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
-from dyngs.training.prediction import NetworkTrainer, assemble_network, captures_in, mean_colours, rate_at
+from dyngs.training.prediction import (
+    Filmed,
+    NetworkTrainer,
+    PersonPredictor,
+    captures_in,
+    mean_colours,
+    new_network,
+    rate_at,
+)
+from dyngs.training.prediction import trainer as network_trainer
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +44,7 @@ def config(folder: Path, run: Path, **changes: object) -> Config:
 def assembled(config: Config) -> NetworkTrainer:
     """The trainer of its network, before the first step."""
     assert isinstance(config.model, HumanPredictorModel)
-    return assemble_network(config)
+    return network_trainer(config)
 
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) -> None:
@@ -109,3 +118,26 @@ def test_what_cannot_be_trained_on_is_refused(folder: Path, tmp_path: Path) -> N
         assembled(config(tmp_path, tmp_path / "run"))
     with pytest.raises(DyngsError, match="multiple of 4"):
         assembled(config(folder, tmp_path / "run", resolution=30))
+
+
+def test_training_on_the_images_of_one_person_shows_them_better(tmp_path: Path) -> None:
+    """The error of the images falls, by the same every time; no step changes nothing."""
+    shown = person(people(tmp_path, (1,)) / "p1")
+    first, trained, again = (error_after(shown, steps) for steps in (0, 12, 12))
+    assert trained < first
+    assert trained == again
+
+
+def error_after(shown: Filmed, steps: int) -> float:
+    """Sum over three views of the mean absolute error on white, of a network trained on these for ``steps``."""
+    values = {"data": {"root": "."}, "model": NET, "train": {"alpha_weight": 0.1}}
+    network, mean, views = new_network(NET, torch.Generator().manual_seed(0)), torch.full((3, 32, 32), 0.5), [0, 3, 6]
+    before = {name: x.clone() for name, x in network.state_dict().items()}
+    predictor = PersonPredictor(Config.model_validate(values), NET, network, mean, shown)
+    predictor.adapt(views, steps)
+    unchanged = all(torch.equal(x, before[name]) for name, x in network.state_dict().items())
+    assert unchanged == (steps == 0)
+    scene, white = predictor.predict(views), torch.ones(3)
+    images = [shown.images[view] for view in views]
+    errors = (scene.render(x.cameras, x.time, background=white).rgb[0] - x.composite(white) for x in images)
+    return sum(error.abs().mean().item() for error in errors)

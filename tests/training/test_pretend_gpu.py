@@ -15,12 +15,11 @@ from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.evaluate.report import EvalReport, evaluate_run
 from dyngs.export.images import write_split_images
-from dyngs.kinds import assemble
+from dyngs.kinds import assemble, build
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import open_run
-from dyngs.training.prediction import assemble_network
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -84,7 +83,7 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
         """After the last step but one and the last, which is done on what was stored."""
         monkeypatch.setattr("dyngs.training.prediction.device_for", lambda _: device)
         config = Config.model_validate({"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}})
-        trainer, resumed = assemble_network(config), assemble_network(config)
+        trainer, resumed = build(config), build(config)
         for _ in range(steps - 1):
             trainer.step()
         found = [trainer.checkpoint()]

@@ -29,8 +29,6 @@ def test_alone_nothing_is_exchanged() -> None:
         alone.sum_([x])
         alone.sum_gradients_([x], torch.ones(1))
         alone.require_same({"x": x}, "now")
-        assert alone.agreed(True)
-        assert not alone.agreed(False)
     assert x.tolist() == [1, 1, 1]
     assert x.grad is None
     assert alone.is_first

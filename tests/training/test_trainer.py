@@ -37,7 +37,7 @@ from dyngs.files.write import write_image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.kinds import GaussianTrainer, assemble, restored_scene
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
 from dyngs.state import Role, State, with_role
@@ -63,7 +63,7 @@ def _trainer(capture: Path, **data: object) -> GaussianTrainer:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _LiftedScene(Scene):
+class _LiftedScene(GaussianScene):
     """A scene of another kind: all Gaussians are drawn a little higher than they are stored."""
 
     @property
@@ -187,7 +187,7 @@ def test_a_kind_of_scene_may_change_the_set(capture: Path) -> None:
         trainer.step()
         counts.append(len(trainer.model.scene.gaussians))
         if trainer.done == 2:
-            moments = trainer.model.optimizer_state["exp_avg_sq.means"].tensor
+            moments = trainer.model.state()["exp_avg_sq.means"].tensor
             assert moments[:50].any()
             assert not moments[50:].any()
             other = _trained_by(_trainer(capture), _Growing())

@@ -6,7 +6,7 @@ import torch
 from moving_scene import Sliding, camera, moving_scene, still_scene
 from view_sessions import opened_at
 
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
 from dyngs.view.cameras import camera_at, pose_of
 from dyngs.view.layers import Shot, draw
@@ -22,7 +22,7 @@ class Clock:
         return self.now
 
 
-def opened(scene: Scene | None = None) -> Opened:
+def opened(scene: GaussianScene | None = None) -> Opened:
     return opened_at(scene or moving_scene(Sliding()))
 
 
@@ -34,7 +34,7 @@ def eye(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> Eye:
 class Looked:
     """A session on a clock that stands still, and what it sent."""
 
-    def __init__(self, scene: Scene | None = None) -> None:
+    def __init__(self, scene: GaussianScene | None = None) -> None:
         self.clock, self.sent = Clock(), list[Sent]()
         self.session = Session(opened(scene), self.sent.append, clock=self.clock)
 

@@ -6,10 +6,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Positive, Section
+from dyngs.section import Positive, Section
 
-MEASURED_AT = 0.6
-"""Fraction of a run after which it is measured whose harmonics pay."""
+MEASURED_AT = 0.6  # Fraction of a run after which it is measured whose harmonics pay
 
 
 class ColourSection(Section):

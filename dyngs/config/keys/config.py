@@ -1,24 +1,83 @@
-"""All sections together: ``Config``, everything that decides a run."""
+"""All sections together: ``Config``, everything that decides a run, and those of its sections that are short."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 from pydantic import Field
 
-from dyngs.config.keys.budget import BudgetConfig
-from dyngs.config.keys.camera import CameraConfig
 from dyngs.config.keys.colour import AutoColour, NetworkColour, ShColour
 from dyngs.config.keys.data import DataConfig
-from dyngs.config.keys.dynamic import DynamicModel
-from dyngs.config.keys.human import HumanModel, HumanPredictorModel
-from dyngs.config.keys.model import StaticModel
-from dyngs.config.keys.prune import PruneConfig
-from dyngs.config.keys.run import RunConfig
-from dyngs.config.keys.section import Section
 from dyngs.config.keys.start import PointsInit, RandomInit
 from dyngs.config.keys.strategy import DefaultStrategy, OptimConfig, Strategy
 from dyngs.config.keys.train import TrainConfig
+from dyngs.models.kind import KINDS
+from dyngs.section import SceneModel, Section
+from dyngs.static.keys import StaticModel
+
+if TYPE_CHECKING:
+    AnyModel = SceneModel
+else:
+    AnyModel = Union[tuple(kind.section for kind in KINDS)]  # noqa: UP007
+
+
+class CameraConfig(Section):
+    """Whether the cameras of a capture are taken as they are."""
+
+    refine: Literal["never", "auto", "always"] = Field(
+        default="never",
+        description="correct poses, focal lengths and principal points of the training views while the scene is "
+        "trained; not of people; auto: where two small runs beforehand say that it pays",
+    )
+
+
+class PruneConfig(Section):
+    """A last stage with fewer Gaussians, after ``train.steps`` (docs/prune.md). Off where nothing is asked for."""
+
+    fraction: float = Field(default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none")
+    score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
+        default="sensitivity", description="importance of a Gaussian (docs/prune.md); the lowest are removed"
+    )
+    mask_times: int = Field(
+        default=0,
+        ge=0,
+        description="key times of masks over time (4DGS-1K), which leave out what hardly shows then; 0, 1: none",
+    )
+    steps: int = Field(default=2000, ge=1, description="steps of fine-tuning after pruning")
+
+    @property
+    def is_wanted(self) -> bool:
+        return self.fraction > 0 or self.mask_times > 1
+
+
+class BudgetConfig(Section):
+    """Limits that a run keeps (docs/budget.md); null: none."""
+
+    max_gaussians: int | None = Field(default=None, ge=1, description="most Gaussians at the end of the run")
+    max_mb: float | None = Field(
+        default=None, gt=0, description="largest size of `export/scene.dyngs`, 1e6 bytes; the file is then written"
+    )
+    min_fps: float | None = Field(
+        default=None,
+        gt=0,
+        description="fewest training views drawn per second on this machine, with fewer Gaussians if need be",
+    )
+
+
+class RunConfig(Section):
+    """Where the run goes and how it is executed."""
+
+    name: str = Field(default="static", description="name of the run; names its folder")
+    dir: Path | None = Field(default=None, description="run folder; null: runs/NAME")
+    seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
+    threads: int = Field(default=0, ge=0, le=1024, description="CPU threads; 0: one per core")
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto", description="what computes; auto: a CUDA GPU that can be used (docs/gpu.md), else the CPU"
+    )
+    deterministic: bool = Field(
+        default=True, description="on a GPU: the same bytes on every run; false may be faster (the CPU's always are)"
+    )
 
 
 class Config(Section):
@@ -26,10 +85,7 @@ class Config(Section):
 
     data: DataConfig
     camera: CameraConfig = CameraConfig()
-    model: Annotated[
-        StaticModel | DynamicModel | HumanModel | HumanPredictorModel,
-        Field(discriminator="kind", description="what is trained"),
-    ] = StaticModel()
+    model: Annotated[AnyModel, Field(discriminator="kind", description="what is trained")] = StaticModel()
     init: Annotated[
         PointsInit | RandomInit, Field(discriminator="kind", description="where the first Gaussians come from")
     ] = PointsInit()
@@ -37,8 +93,7 @@ class Config(Section):
         ShColour | NetworkColour | AutoColour, Field(discriminator="kind", description="what colours are made of")
     ] = ShColour()
     strategy: Annotated[
-        Strategy,
-        Field(discriminator="kind", description="how Gaussians are added and removed during training"),
+        Strategy, Field(discriminator="kind", description="how Gaussians are added and removed during training")
     ] = DefaultStrategy()
     optim: OptimConfig = OptimConfig()
     train: TrainConfig = TrainConfig()
@@ -48,10 +103,8 @@ class Config(Section):
 
     @property
     def total_steps(self) -> int:
-        """Steps of training and of the last stage, if there is one."""
         return self.train.steps + (self.prune.steps if self.prune.is_wanted and self.model.made_of_gaussians else 0)
 
     @property
     def stored_sh_degree(self) -> int:
-        """Degree of the harmonics that training begins with."""
         return self.colour.stored_degree(self.model.sh_degree)

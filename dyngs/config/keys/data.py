@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Positive, Section
 from dyngs.files.containment import MAX_MEGAPIXELS
+from dyngs.section import Positive, Section
 
 
 class DataConfig(Section):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Positive, Section
+from dyngs.section import Positive, Section
 
 
 class PointsInit(Section):
@@ -24,8 +24,7 @@ class PointsInit(Section):
         default=100_000, ge=1, description="number of random points; auto: where there are no others"
     )
     half_extent: Positive = Field(
-        default=1.3,
-        description="half the side of their cube around the origin, world units (Blender scenes)",
+        default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
     )
 
 
@@ -37,6 +36,5 @@ class RandomInit(Section):
         default=100_000, ge=1, description="number of random points; auto: where there are no others"
     )
     half_extent: Positive = Field(
-        default=1.3,
-        description="half the side of their cube around the origin, world units (Blender scenes)",
+        default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
     )

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Fraction, Positive, Section
+from dyngs.section import Fraction, Positive, Section
 
 _OF_30000 = "of a 30,000-step run, scaled with train.steps"
 
@@ -68,11 +68,9 @@ class McmcStrategy(Section):
 
     @property
     def growth_limit(self) -> int:
-        """Number of Gaussians from which on none are added."""
         return self.max_gaussians
 
     def limited(self, cap: int) -> McmcStrategy:
-        """Return this strategy with at most ``cap`` as its limit of growth."""
         return self.model_copy(update={"max_gaussians": min(self.max_gaussians, cap)})
 
 
@@ -83,21 +81,17 @@ class FixedStrategy(Section):
 
     @property
     def start(self) -> int:
-        """Step after which Gaussians are added and removed: there is no such time."""
         return 0
 
     @property
     def stop(self) -> int:
-        """Step from which their number is fixed."""
         return 0
 
     @property
     def growth_limit(self) -> int:
-        """Number of Gaussians from which on none are added; 0: none ever are."""
         return 0
 
     def limited(self, cap: int) -> FixedStrategy:
-        """Return this strategy, which has no limit to lower."""
         return self
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.section import Fraction, Section
+from dyngs.section import Fraction, Section
 
 
 class TrainConfig(Section):

@@ -19,51 +19,33 @@ from dyngs.data.loader import Image
 LONGEST_SIDE, IMAGES = 200, 2000
 """Pixels; larger images are shrunk: silhouettes need no more, and noise averages out. Of more images than that,
 each is smaller, so that all of them together take as much memory."""
-SMALLEST_CHANGE = 0.05
-"""Least difference in a channel, of 1, that counts as a change."""
+SMALLEST_CHANGE = 0.05  # Least difference in a channel, of 1, that counts as a change
 NOISE_MULTIPLE = 5.0
 """Differences below so many standard deviations of the noise, as estimated from the median, are no change."""
-SURE = 2.0
-"""A change must reach this multiple of its threshold somewhere, as in hysteresis thresholding (Canny 1986)."""
+SURE = 2.0  # A change must reach this multiple of its threshold somewhere, as in hysteresis thresholding (Canny 1986)
 FEWEST_PIXELS = 6
 DARKEST_SHADOW = 0.35
 SHADOW_TINT = 0.14
 """A shadow leaves at least that fraction of the light and changes no channel by more than this share beyond the
 others."""
 _MAD_TO_STD = 1.4826
-_DARK = 0.03
-"""Added to colours before they are divided."""
+_DARK = 0.03  # Added to colours before they are divided
 
 
 @dataclass(frozen=True)
 class Footage:
-    """Images of one camera that stands still, and what changes in them.
+    """Images of one camera that stands still, and what changes in them."""
 
-    Attributes:
-        camera: (V = 1) of the images' size.
-        times: T, ascending.
-        images: (T, H, W, 3) uint8.
-        changed: (T, H, W) bool: shows something that is elsewhere, or not there, at most other times.
-        counted: (T, H, W) bool; False where the image is masked out.
-        median: (H, W, 3) uint8, what is still.
-    """
-
-    camera: Cameras
-    times: tuple[float, ...]
-    images: np.ndarray
-    changed: np.ndarray
-    counted: np.ndarray
-    median: np.ndarray
+    camera: Cameras  # (V = 1) of the images' size
+    times: tuple[float, ...]  # T, ascending
+    images: np.ndarray  # (T, H, W, 3) uint8
+    changed: np.ndarray  # (T, H, W) bool: shows something that is elsewhere, or not there, at most other times
+    counted: np.ndarray  # (T, H, W) bool; False where the image is masked out
+    median: np.ndarray  # (H, W, 3) uint8, what is still
 
 
 def footage_of(images: Iterable[Image], background: Tensor, total: int = 1) -> Footage:
-    """Return the footage of one camera that stands still, on the CPU.
-
-    Args:
-        images: in order of time.
-        background: (3,) colour behind them.
-        total: number of images of all cameras.
-    """
+    """Return the footage of one camera that stands still, on the CPU."""
     longest = LONGEST_SIDE * min(1.0, (IMAGES / max(total, 1)) ** 0.5)
     shown, counted, times = [], [], []
     camera: Cameras | None = None

@@ -15,17 +15,13 @@ import numpy as np
 
 from dyngs.deform.fixed_cameras.changes import Footage
 
-FIRST_CUBES = 16
-"""Cubes along the longest side of the box that carving begins with."""
-MAX_CUBES = 300_000
-"""Carving stops to divide cubes at this number."""
-LARGEST_PX = 2.0
-"""Pixels that a side covers, in most cameras, when cubes are no longer divided."""
+FIRST_CUBES = 16  # Cubes along the longest side of the box that carving begins with
+MAX_CUBES = 300_000  # Carving stops to divide cubes at this number
+LARGEST_PX = 2.0  # Pixels that a side covers, in most cameras, when cubes are no longer divided
 MAX_LEVELS = 8
 MISSING_FRACTION = 0.25
 """Fraction of the cameras that see a place which may not see the thing there, because something still hides it."""
-ENOUGH_VIEWS = 3
-"""Cameras that must see a change at a place, or all there are."""
+ENOUGH_VIEWS = 3  # Cameras that must see a change at a place, or all there are
 FEWEST_CUBES = 12
 SOLID_FRACTION = 0.3
 """Of a blob, the cubes that most cameras agree on are kept, as long as they are this fraction of all."""
@@ -34,44 +30,30 @@ NEAR = 1e-3
 
 @dataclass(frozen=True)
 class Blob:
-    """A connected part of a visual hull at one time.
+    """A connected part of a visual hull at one time."""
 
-    Attributes:
-        center: (3,) mean of the cubes.
-        radius: of a ball of that volume, world units.
-        cubes: (C, 3) centres.
-        side: of the cubes.
-        color: (3,) mean colour in the images, 0 to 1.
-    """
-
-    center: np.ndarray
-    radius: float
-    cubes: np.ndarray
+    center: np.ndarray  # (3,) mean of the cubes
+    radius: float  # of a ball of that volume, world units
+    cubes: np.ndarray  # (C, 3) centres
     side: float
-    color: np.ndarray
+    color: np.ndarray  # (3,) mean colour in the images, 0 to 1
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Change that one camera sees at one time.
+    """Change that one camera sees at one time."""
 
-    Attributes:
-        projection: (3, 4) matrix from the world to homogeneous pixels.
-        image: (H, W, 3) uint8.
-        changed, counted: (H, W) bool, see ``Footage``.
-        sums, masked: (H + 1, W + 1) summed areas of ``changed``, and of what is not counted.
-    """
-
-    projection: np.ndarray
-    image: np.ndarray
+    projection: np.ndarray  # (3, 4) matrix from the world to homogeneous pixels
+    image: np.ndarray  # (H, W, 3) uint8
+    # changed, counted: (H, W) bool, see ``Footage``
     changed: np.ndarray
     counted: np.ndarray
+    # sums, masked: (H + 1, W + 1) summed areas of ``changed``, and of what is not counted
     sums: np.ndarray
     masked: np.ndarray
 
     @property
     def center(self) -> np.ndarray:
-        """Return the (3,) camera centre."""
         return -np.linalg.solve(self.projection[:, :3], self.projection[:, 3])
 
     @property

@@ -9,12 +9,9 @@ import numpy as np
 
 from dyngs.deform.fixed_cameras.hulls import Blob
 
-MAX_GAP = 3
-"""Times in a row at which a thing may be lost."""
-FEWEST_TIMES = 4
-"""Times at which a thing must be found."""
-FIRST_REACH = 6.0
-"""Radii within which a thing whose velocity is not known is looked for at the next time."""
+MAX_GAP = 3  # Times in a row at which a thing may be lost
+FEWEST_TIMES = 4  # Times at which a thing must be found
+FIRST_REACH = 6.0  # Radii within which a thing whose velocity is not known is looked for at the next time
 REACH, SPEED_REACH = 3.0, 1.5
 """Radii, and fractions of the last displacement, by which a thing may be away from where its velocity takes it."""
 COLOR_REACH, SIZE_REACH = 0.35, 1.2
@@ -26,24 +23,17 @@ what hops turns back, too, but less often than noise does."""
 
 @dataclass(frozen=True)
 class Track:
-    """A thing followed over time.
-
-    Attributes:
-        times: ascending, at which it was found.
-        blobs: it at each of them.
-    """
+    """A thing followed over time."""
 
     times: tuple[float, ...]
     blobs: tuple[Blob, ...]
 
     @property
     def centers(self) -> np.ndarray:
-        """(L, 3) places."""
         return np.stack([blob.center for blob in self.blobs])
 
     @property
     def radius(self) -> float:
-        """Median over time, world units."""
         return float(np.median([blob.radius for blob in self.blobs]))
 
     @property
@@ -63,7 +53,6 @@ class Track:
         return float((steps[1:] * steps[:-1]).sum()) > SAME_WAY * float((steps**2).sum())
 
     def predicted(self, time: float) -> np.ndarray:
-        """Return the (3,) place at ``time`` at constant velocity, that of the last two places."""
         last = self.blobs[-1].center
         if len(self.blobs) < 2:
             return last
@@ -71,7 +60,6 @@ class Track:
         return last + (time - self.times[-1]) * pace
 
     def extended(self, time: float, blob: Blob) -> Track:
-        """Return the track with one blob more."""
         return Track((*self.times, time), (*self.blobs, blob))
 
 

@@ -23,40 +23,26 @@ from dyngs.gaussians.rendering import render
 
 USUAL_FRACTION = 0.4
 """Fraction of the times at which a cube of a thing's own frame lies in its hull, for it to belong to the thing."""
-WHOLE = 0.75
-"""Fraction of the usual radius from which a hull shows the whole thing."""
-SCALE = 0.6
-"""Standard deviation of a seed in distances between seeds."""
+WHOLE = 0.75  # Fraction of the usual radius from which a hull shows the whole thing
+SCALE = 0.6  # Standard deviation of a seed in distances between seeds
 THINNED, FEWEST = 4, 100
 """One seed for so many cubes of a surface, that is for some four pixels, but not fewer for a thing, if it has them."""
-LOGIT = 1.4
-"""Opacity 0.8: where a hull is, something is."""
-FIT = 0.1
-"""Mean error of a spline, in radii of the thing, that is small enough."""
+LOGIT = 1.4  # Opacity 0.8: where a hull is, something is
+FIT = 0.1  # Mean error of a spline, in radii of the thing, that is small enough
 BEND = 1e-4
 """Weight of squared second differences in a fit: it decides where a track has gaps, and straight on at its ends."""
-APART = 3.0
-"""Radii from the centre of a thing within which others are near."""
-PAYS = 0.9
-"""Fraction of the medians' squared error that may be left where seeds cover an image."""
+APART = 3.0  # Radii from the centre of a thing within which others are near
+PAYS = 0.9  # Fraction of the medians' squared error that may be left where seeds cover an image
 SHOWN = 0.4
 """Fraction of the pixels that seeds cover in which an image must change; else something still hides the thing;
 and of images that are not so."""
-JUDGED_TIMES = 8
-"""Times at which seeds are compared with the images."""
-COVERED = 0.1
-"""Opacity from which they cover a pixel."""
+JUDGED_TIMES = 8  # Times at which seeds are compared with the images
+COVERED = 0.1  # Opacity from which they cover a pixel
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Gaussians of one thing at the time ``time``, and how it moves from there.
-
-    Attributes:
-        track: that they come from.
-        time: at which the Gaussians lie where they are.
-        gaussians: S.
-    """
+    """Gaussians of one thing at the time ``time``, and how it moves from there."""
 
     track: Track
     time: float
@@ -64,11 +50,9 @@ class Seeds:
 
     @property
     def center(self) -> np.ndarray:
-        """Return the (3,) place of the track at that time."""
         return self.track.centers[self.track.times.index(self.time)]
 
     def placed(self, index: int) -> Gaussians:
-        """Return the Gaussians where the track is at its ``index``-th time."""
         shift = self.track.centers[index] - self.center
         return self.gaussians.replace(means=self.gaussians.means + torch.from_numpy(shift).float())
 
@@ -80,7 +64,6 @@ def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: in
     seed is the mean over all images in which it is on the side of the camera and the image changes there.
 
     Args:
-        num_terms: of the spherical harmonics; the first is set.
         others: (M, 3) other things that move: the Gaussians begin where the track is apart from them, so that none
             follows the nodes of another thing.
     """
@@ -158,7 +141,6 @@ def _misfit(track: Track, points: Tensor) -> float:
 
 
 def _basis(times: Sequence[float], pieces: int) -> np.ndarray:
-    """Return the (L, P) weights of the control points at ``times``."""
     basis = np.zeros((len(times), pieces + SPAN - 1))
     for row, time in enumerate(times):
         piece = min(int(time * pieces), pieces - 1)
@@ -190,7 +172,6 @@ def _surface(track: Track) -> tuple[np.ndarray, float]:
 
 
 def _colors(points: np.ndarray, track: Track, footage: Sequence[Footage]) -> np.ndarray:
-    """Return (S, 3) mean colours of the ``points`` of a thing, from 0 to 1."""
     total, count = np.zeros((len(points), 3)), np.zeros((len(points), 1))
     outward = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
     for time, center in zip(track.times, track.centers, strict=True):

@@ -20,43 +20,30 @@ from dyngs.deform.nodes import spread_out
 from dyngs.deform.random_gaussians import box_of
 from dyngs.gaussians import Gaussians
 
-ROOM = 0.25
-"""Room around the things that stand still and the cameras, in sides of their box."""
+ROOM = 0.25  # Room around the things that stand still and the cameras, in sides of their box
 LEAST_SHOWN = 0.05
 """Least area that a thing shows over its times, as a fraction of that of the largest: less is noise at things in
 place."""
 MAX_TRACKS = 24
 NODES_PER_TRACK = 40
-NODE_FRACTION = 0.5
-"""Nodes on things that are tracked, as a fraction of all, at most."""
+NODE_FRACTION = 0.5  # Nodes on things that are tracked, as a fraction of all, at most
 
 
 @dataclass(frozen=True)
 class FirstMotion:
-    """Things that travel, as Gaussians and paths.
-
-    Attributes:
-        seeds: of each of them; empty where nothing was found.
-        finding: a line about them.
-    """
+    """Things that travel, as Gaussians and paths."""
 
     seeds: tuple[Seeds, ...] = ()
     finding: str | None = None
 
     @property
     def gaussians(self) -> list[Gaussians]:
-        """Return the Gaussians of each thing."""
         return [one.gaussians for one in self.seeds]
 
     def nodes(self, others: Tensor, most: int, pieces: range) -> tuple[Tensor, Tensor]:
         """Return (S, 3) nodes and the (S, P, 3) control points of their paths.
 
         Those on one thing share its path; those among ``others`` stand still.
-
-        Args:
-            others: (M, 3) moving Gaussians that belong to none of the things.
-            most: S at most.
-            pieces: numbers of pieces that the paths may have.
         """
         tracks = [one.track for one in self.seeds]
         num_pieces = pieces_for(tracks, pieces)
@@ -78,15 +65,7 @@ class FirstMotion:
 def first_motion(
     footage: Sequence[Footage], still: Gaussians, moving: Tensor, extent: float, limit: int
 ) -> FirstMotion:
-    """Return what travels before the cameras of ``footage``, wherever ``still`` Gaussians are or the cameras look on.
-
-    Args:
-        footage: of cameras that stand still; of fewer than two, nothing is found.
-        still: the model so far, for the size of the scene.
-        moving: indices of those of its Gaussians that will move, too.
-        extent: of the scene, world units.
-        limit: number of Gaussians, at most.
-    """
+    """Return what travels before the cameras of ``footage``, where ``still`` Gaussians are or the cameras look."""
     if len(footage) < 2 or limit < 1:
         return FirstMotion()
     tracks = found_tracks(footage, *_box(footage, still, extent))

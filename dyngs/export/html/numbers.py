@@ -20,7 +20,7 @@ from dyngs.deform.scene import DynamicScene, field_scene_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.order import storage_order
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 
@@ -84,7 +84,7 @@ class Lists:
         self._size += len(data)
 
 
-def add_scene(scene: Scene, lists: Lists, tolerance: float) -> dict[str, Any]:
+def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str, Any]:
     """Add the numbers of a scene to ``lists`` and return what the page needs to know about them.
 
     ``tolerance``: world units that a place may be off where motion is fitted.

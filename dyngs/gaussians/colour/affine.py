@@ -13,19 +13,16 @@ from torch import Tensor
 from dyngs.data.loader import Image
 from dyngs.models.renderable import Rendering
 
-SATURATED = 254.5 / 255
-"""A channel this bright may have been any brighter."""
+SATURATED = 254.5 / 255  # A channel this bright may have been any brighter
 GAIN_RIDGE, MIXING_RIDGE = 1e-5, 1e-2
 """Weights of squared deviations from the identity, of gains and of all else, against the mean squared error.
 
 They decide what the pixels do not: the channels of most images are so alike that mixtures of them can mean anything.
 With 3e-4 for the latter, halves of the cup in docs/benchmarks.md had 2 dB less after the fit than before it.
 """
-ROUNDS = 3
-"""Fits in turn, each without the saturated channels that the one before shows brighter still."""
+ROUNDS = 3  # Fits in turn, each without the saturated channels that the one before shows brighter still
 
-Shown = tuple[Image, Rendering]
-"""An image, and the rendering of its one view."""
+Shown = tuple[Image, Rendering]  # An image, and the rendering of its one view
 
 
 def recoloured(affine: Tensor, image: Image, rendering: Rendering, background: Tensor) -> Tensor:
@@ -35,9 +32,6 @@ def recoloured(affine: Tensor, image: Image, rendering: Rendering, background: T
 
     Args:
         affine: (3, 4) M.
-        image: what it is compared with.
-        rendering: of its one view.
-        background: (3,) behind the rendering.
     """
     rgb = rendering.rgb[0]
     background, affine = background.to(rgb.device), affine.to(rgb.device)
@@ -56,7 +50,6 @@ def fitted_affine(shown: Sequence[Shown], background: Tensor, counts: Tensor | N
 
     Args:
         shown: one or more; masked pixels do not count.
-        background: (3,) behind both.
         counts: (H, W) weights beside the masks; None: 1.
     """
     background = background.to(shown[0][1].rgb.device)

@@ -14,11 +14,9 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import Shader
 from dyngs.ops.harmonics import harmonics_basis
 
-DIRECTIONS = 96
-"""Number of directions from which colours are sampled; degree 3 has 16 terms."""
+DIRECTIONS = 96  # Number of directions from which colours are sampled; degree 3 has 16 terms
 
-_FAR = 1e4
-"""Distance of the camera, in largest distances of a Gaussian from the origin."""
+_FAR = 1e4  # Distance of the camera, in largest distances of a Gaussian from the origin
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,6 @@ def sphere(count: int) -> Tensor:
 
 
 def _eye(center: Tensor) -> Cameras:
-    """Return a camera at ``center`` (3,)."""
     pose = torch.eye(4, dtype=center.dtype, device=center.device)
     pose[:3, 3] = -center
     return Cameras(pose[None], torch.eye(3, dtype=center.dtype, device=center.device)[None], 1, 1)

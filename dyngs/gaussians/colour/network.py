@@ -25,41 +25,28 @@ from dyngs.tensor_checks import require_positive, require_tensor
 
 @dataclass(frozen=True)
 class Frame:
-    """Rest pose of a moving body, which its colours follow.
+    """Rest pose of a moving body, which its colours follow."""
 
-    Attributes:
-        places: (N, 3) centres of the drawn Gaussians at rest.
-        turn: (3, 3) rotation of the body from rest to the world.
-    """
-
-    places: Tensor
-    turn: Tensor
+    places: Tensor  # (N, 3) centres of the drawn Gaussians at rest
+    turn: Tensor  # (3, 3) rotation of the body from rest to the world
 
 
 @dataclass(frozen=True)
 class ColourNetwork:
-    """F: what is added to the base colour of a Gaussian, by place, direction, normal and time.
-
-    Attributes:
-        layers: first to last; 3 outputs.
-        box: (2, 3) centre and half sides of the scene, world units.
-        sees_time: time is an input.
-        sees_normals: the cosine between the shortest axis of the Gaussian and the direction, and the direction mirrored
-            at that axis, are inputs.
-    """
+    """F: what is added to the base colour of a Gaussian, by place, direction, normal and time."""
 
     layers: tuple[Layer, ...]
-    box: Tensor
+    box: Tensor  # (2, 3) centre and half sides of the scene, world units
     sees_time: bool
+    # the cosine between the shortest axis of the Gaussian and the direction, and the direction mirrored at that axis,
+    # are inputs
     sees_normals: bool
 
     @property
     def num_values(self) -> int:
-        """Number of values that the network stores."""
         return self.box.numel() + sum(layer.weight.numel() + layer.bias.numel() for layer in self.layers)
 
     def state(self) -> State:
-        """Return the weights and the description of their inputs, for ``network_of``."""
         tensors = {"box": self.box, "sees": torch.tensor([self.sees_time, self.sees_normals], device="cpu")}
         for i, layer in enumerate(self.layers):
             tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}
@@ -111,12 +98,7 @@ def box_around(means: Tensor) -> Tensor:
 
 
 def network_of(state: Mapping[str, Tensor]) -> ColourNetwork | None:
-    """Return the network of a checkpoint, from the state of its colours; None where there is none.
-
-    Raises:
-        KeyError: the state lacks a tensor.
-        ValueError: a tensor is not as the others have it.
-    """
+    """Return the network of a checkpoint, from the state of its colours; None where there is none."""
     count = sum(name.startswith("weight") for name in state)
     if not count:
         return None

@@ -23,45 +23,30 @@ from dyngs.ops.shading import num_inputs
 from dyngs.state import Role, State, StateTensor
 from dyngs.tensor_checks import require_tensor
 
-WARM_UP = 100
-"""Steps in which the network's rate is reached."""
+WARM_UP = 100  # Steps in which the network's rate is reached
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)
 """Fractions of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k steps)."""
 HELD_OUT_EVERY = 8
-_HELD_OUT = 5
-"""Index, in each eight views, of the one that is held out."""
+_HELD_OUT = 5  # Index, in each eight views, of the one that is held out
 
 
 @dataclass(frozen=True)
 class TrainingLooks:
-    """The training views as the scene is drawn for them now.
+    """The training views as the scene is drawn for them now."""
 
-    Attributes:
-        indices: of the views that may be trained on.
-        views: those of some indices, one at a time.
-        options: how to draw.
-        background: (3,) colour.
-    """
-
-    indices: Sequence[int]
-    views: Callable[[Sequence[int]], Iterator[MeasuredView]]
+    indices: Sequence[int]  # of the views that may be trained on
+    views: Callable[[Sequence[int]], Iterator[MeasuredView]]  # those of some indices, one at a time
     options: RenderOptions
     background: Tensor
 
 
 @dataclass(frozen=True)
 class HarmonicsDropped:
-    """Gaussians whose harmonics are dropped for good.
+    """Gaussians whose harmonics are dropped for good."""
 
-    Attributes:
-        text: what was found, for people.
-        rows: (N,) bool, those without harmonics from now on; None: all keep theirs.
-        offsets: (N, 3) colour to add to their base.
-    """
-
-    text: str
-    rows: Tensor | None = None
-    offsets: Tensor | None = None
+    text: str  # what was found, for people
+    rows: Tensor | None = None  # (N,) bool, those without harmonics from now on; None: all keep theirs
+    offsets: Tensor | None = None  # (N, 3) colour to add to their base
 
 
 class ColourTraining:
@@ -77,11 +62,9 @@ class ColourTraining:
 
     @property
     def learned(self) -> Parameters | None:
-        """What ``optimize`` updates; None: nothing."""
         return None
 
     def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
-        """Return differentiable regularizers, weighted, by name."""
         if self.entropy_weight == 0:
             return {}
         return {"opacity entropy": self.entropy_weight * opacity_entropy(gaussians.logit_opacities)}
@@ -109,28 +92,14 @@ class ColourTraining:
         """Go on on ``device``."""
 
     def state(self) -> State:
-        """Return the tensors that a checkpoint must hold beside the scene's colours."""
         return {}
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
-        """Take over the state of the scene's colours and of ``state``, for N Gaussians.
-
-        Raises:
-            KeyError: a tensor is missing.
-            ValueError: one is not as it must be.
-        """
+        """Take over the state of the scene's colours and of ``state``, for N Gaussians."""
 
 
 class NetworkTraining(ColourTraining):
-    """A network that all Gaussians share, learned by Adam.
-
-    Args:
-        options: size and rate.
-        steps: length of the run.
-        box: (2, 3), see ``ColourNetwork``.
-        generator: of the first weights.
-        sees_time: time is an input.
-    """
+    """A network that all Gaussians share, learned by Adam."""
 
     def __init__(
         self, options: NetworkColour, steps: int, box: Tensor, generator: torch.Generator, *, sees_time: bool
@@ -166,13 +135,7 @@ class NetworkTraining(ColourTraining):
 
 
 class AutoTraining(ColourTraining):
-    """Harmonics for all Gaussians at first, later only for those where they are measured to improve images.
-
-    Args:
-        options: what may be given away.
-        steps: length of the run.
-        num_views: training views.
-    """
+    """Harmonics for all Gaussians at first, later only for those where they are measured to improve images."""
 
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)

@@ -24,39 +24,26 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions, render
 from dyngs.ops.harmonics import evaluate_harmonics
 
-_LIFT = 64.0
-"""Added to colours so that none is clamped; float32 keeps 4e-6 of them."""
+_LIFT = 64.0  # Added to colours so that none is clamped; float32 keeps 4e-6 of them
 
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One training image and the N Gaussians that are drawn for it.
+    """One training image and the N Gaussians that are drawn for it."""
 
-    Attributes:
-        gaussians: at its time.
-        camera: one camera.
-        truth: (H, W, 3) on the background.
-        mask: (H, W) weights, or None.
-    """
-
-    gaussians: Gaussians
+    gaussians: Gaussians  # at its time
     camera: Cameras
-    truth: Tensor
+    truth: Tensor  # (H, W, 3) on the background
     mask: Tensor | None
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The Gaussians whose view dependence is worth its cost.
+    """The Gaussians whose view dependence is worth its cost."""
 
-    Attributes:
-        keeps: (N,) bool, Gaussians whose harmonics stay.
-        offsets: (N, 3) colour to add to the base of the others.
-        worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones bring.
-    """
-
-    keeps: Tensor
-    offsets: Tensor
+    keeps: Tensor  # (N,) bool, Gaussians whose harmonics stay
+    offsets: Tensor  # (N, 3) colour to add to the base of the others
+    # worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones bring
     worth_all: float
     worth_kept: float
 
@@ -77,15 +64,7 @@ def find_view_dependent(
     background: Tensor,
     tolerance: float,
 ) -> Finding:
-    """Return the Gaussians whose harmonics are worth their cost, and the colours of the others.
-
-    Args:
-        seen: views that were trained on, one at a time; at least one.
-        held_out: views that were not; at least one.
-        options: how to draw, with the degree of the harmonics that counts.
-        background: (3,) colour.
-        tolerance: dB that may be given away.
-    """
+    """Return the Gaussians whose harmonics are worth their cost, and the colours of the others."""
     means, changes = _mean_and_change(seen, options)
     errors, worths = [], torch.zeros(len(changes), device=changes.device)
     everywhere, nowhere = (
@@ -107,9 +86,6 @@ def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance:
     """Return (N,) bool, the fewest rows, by descending ``changes``, that bring all but ``tolerance`` of the gain.
 
     Args:
-        changes: (N,) what ranks the rows.
-        worths: (N,) by how much each lowers the error.
-        without: the error if no row is chosen.
         tolerance: dB by which the error may be above the lowest along the ranking; none is chosen if that suffices.
     """
     order = changes.argsort(descending=True, stable=True)
@@ -155,5 +131,4 @@ def _squared_error(
 
 
 def _decibels(before: float, after: float) -> float:
-    """Return the gain in dB of an image with the squared error ``after``."""
     return 10 * math.log10(max(before, 1e-12) / max(after, 1e-12))

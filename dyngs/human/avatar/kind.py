@@ -20,38 +20,35 @@ from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.template.body_reader import load_template, rest_shape
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Kind, Setting
+from dyngs.models.kind import RunStart
 from dyngs.models.views import training_cameras
 
 FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
 
 
-def start(setting: Setting) -> GaussianModel:
+def start(run: RunStart) -> GaussianModel:
     """Return the model of a person before the first step.
 
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
-    config, model = setting.config, setting.config.model
+    config, model = run.config, run.config.model
     if not isinstance(model, HumanModel):
         raise TypeError(f"not a person: {model!r}")
-    gaussians, subject = human_start(config, model, setting.capture, setting.images)
-    colours = colours_of(setting, gaussians, sees_time=False)
-    filmed = setting.capture.splits["train"]
+    gaussians, subject = human_start(config, model, run.capture, run.images)
+    colours = colours_of(run, gaussians, sees_time=False)
+    filmed = run.capture.splits["train"]
     cameras = training_cameras(filmed, config.data)
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
     training = HumanTraining(model, subject.motion.frames, rates_of(config), views)
     lit = model.light and model.refine and colours.network is None
     scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
-    return GaussianModel(setting, scene, training, densifier_of(setting), colours)
+    return GaussianModel(run, scene, training, densifier_of(run), colours)
 
 
 def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
     """Return the scene of a checkpoint."""
     scene = HumanScene.restored(Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model"))
     return drawn_as_trained(scene, model, checkpoint)
-
-
-KIND = Kind(HumanModel, start, restore)
 
 
 def human_start(config: Config, model: HumanModel, capture: Capture, images: ImageLoader) -> tuple[Gaussians, Subject]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import Frame
 from dyngs.gaussians.parameters import Parameters
-from dyngs.gaussians.scene import GaussianTimeStep, Scene
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
 from dyngs.human.avatar.corrections import (
     SharedCorrection,
@@ -40,7 +40,7 @@ from dyngs.tensor_checks import require_indices, require_moments, require_positi
 
 
 @dataclass(frozen=True, kw_only=True)
-class HumanScene(Scene):
+class HumanScene(GaussianScene):
     """N Gaussians at rest, m, and a person who moves as a clip says."""
 
     anchors: Anchors  # of the Gaussians, with the template's weights

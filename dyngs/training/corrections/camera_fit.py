@@ -9,19 +9,18 @@ from torch import Tensor
 
 from dyngs.data.loader import Image
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.training.corrections.camera_refinement import corrected, slopes, watched
 
 UPDATES = 60
-FIRST_RATE, LAST_RATE = 2e-3, 1e-4
-"""Learning rates, rad, and as a fraction of the scene's size; log-linear between."""
+FIRST_RATE, LAST_RATE = 2e-3, 1e-4  # Learning rates, rad, and as a fraction of the scene's size; log-linear between
 SSIM_WEIGHT = 0.2
 
 
 def fitted_to_image(
-    scene: Scene,
+    scene: GaussianScene,
     image: Image,
     background: Tensor,
     size: float,
@@ -29,16 +28,7 @@ def fitted_to_image(
     options: RenderOptions | None = None,
     weights: Tensor | None = None,
 ) -> Image:
-    """Return ``image`` with its camera moved to where the scene looks most like it; the lens stays.
-
-    Args:
-        scene: stays as it is.
-        image: with a camera that is nearly right.
-        background: (3,) behind both.
-        size: of the scene, world units.
-        options: as in training; None: those of the scene.
-        weights: (H, W) weights of the pixels beside the image's mask; None: 1.
-    """
+    """Return ``image`` with its camera moved to where the scene looks most like it; the lens stays."""
     options, truth = options or scene.options, image.composite(background)
     counts = image.mask if weights is None or image.mask is None else weights * image.mask
     counts = weights if counts is None else counts

@@ -28,10 +28,8 @@ FIRST_RATE, LAST_RATE = 3e-3, 1e-5
 """Learning rates after ``STARTS`` and at the end, rad, and as a fraction of the scene's size; log-linear between."""
 LENS_RATE = 0.01
 """Rate of focal lengths and principal points, as a fraction of that of poses: a lens is updated in every step."""
-LENS_STARTS = 0.3
-"""Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share."""
-MIN_POSES = 8
-"""Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is."""
+LENS_STARTS = 0.3  # Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share
+MIN_POSES = 8  # Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is
 POSES, LENSES = "poses", "lenses"
 
 
@@ -39,10 +37,6 @@ class CameraCorrections:
     """Small corrections of the cameras of V views, at first none.
 
     A camera that stands still has one correction for all its views, and so has a lens that several views share.
-
-    Args:
-        views: V views.
-        size: of the scene, world units: the unit of translations.
 
     Attributes:
         poses: (P, 6) rotation vectors, rad, and translations in units of ``size``, both in the camera's frame.
@@ -61,7 +55,7 @@ class CameraCorrections:
         self._common = common_motions([views[self._pose_of.index(i)] for i in range(len(self.poses))], size)
 
     def rows(self, index: int) -> tuple[int, int | None]:
-        """Return the row of the pose of view ``index``, and that of its lens; None where that is not refined."""
+        """Return the rows of the pose and of the lens of view ``index``; None where a lens is not refined."""
         lens = self._lens_of[index]
         return self._pose_of[index], lens if self._refines_lens[lens] else None
 
@@ -88,19 +82,12 @@ class CameraCorrections:
         return replace(view, cam_from_world=camera.cam_from_world[0].numpy(), intrinsics=camera.intrinsics[0].numpy())
 
     def remove_common_motion(self) -> None:
-        """Remove from the corrections how all cameras together move, turn and grow."""
         flat = self.poses.view(-1)
         flat -= self._common @ (self._common.T @ flat)
 
 
 def corrected(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) -> Cameras:
-    """Return the camera ``cameras`` (V = 1) with the corrections ``pose`` (6,) and ``lens`` (3,); differentiable.
-
-    Args:
-        cameras: of any scale.
-        pose, lens: as the rows of ``CameraCorrections``.
-        size: unit of translations.
-    """
+    """Return the camera ``cameras`` (V = 1) with the corrections ``pose`` (6,) and ``lens`` (3,); differentiable."""
     pose = pose.to(cameras.cam_from_world)
     rotation = rotation_matrices(torch.cat([pose.new_ones(1), pose[:3] / 2]))  # by |pose| up to its cube
     last = pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])
@@ -121,13 +108,7 @@ def watched(cameras: Cameras) -> Cameras:
 
 
 def slopes(cameras: Cameras, by_pose: Tensor, by_intrinsics: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return the gradients (6,) and (3,) by a further small correction of the pose and of the lens.
-
-    Args:
-        cameras: one camera.
-        by_pose, by_intrinsics: (1, 4, 4) and (1, 3, 3) gradients by its two parts.
-        size: unit of translations.
-    """
+    """Return the gradients (6,) and (3,) by a further small correction of the pose and of the lens."""
     columns, forces = cameras.cam_from_world.detach()[0, :3], by_pose[0, :3]  # both (3, 4)
     turn = torch.linalg.cross(columns, forces, dim=0).sum(1)
     pull = by_intrinsics[0] * cameras.intrinsics.detach()[0]
@@ -140,10 +121,6 @@ def common_motions(views: Sequence[View], size: float) -> Tensor:
     """Return an orthonormal basis (6 P, C), C at most 7, of those corrections of all poses that change no image.
 
     They turn, shift and scale the scene with all its cameras; to first order.
-
-    Args:
-        views: P views of different poses.
-        size: unit of translations.
     """
     poses = np.stack([view.cam_from_world for view in views])
     rotations, centers = poses[:, :3, :3], np.linalg.inv(poses)[:, :3, 3]
@@ -179,13 +156,7 @@ def _numbered(keys: Sequence[Hashable]) -> tuple[list[int], dict[Hashable, int]]
 
 
 class CameraRefinement:
-    """Corrections of the training cameras, and their optimizer.
-
-    Args:
-        views: V training views.
-        size: of the scene, world units.
-        steps: of the run.
-    """
+    """Corrections of the training cameras, and their optimizer."""
 
     def __init__(self, views: Sequence[View], size: float, steps: int) -> None:
         self.corrections = CameraCorrections(views, size)
@@ -200,11 +171,6 @@ class CameraRefinement:
         """Update the corrections of view ``index``; return how many had gradients that are not finite.
 
         A gradient is that by a further correction of the corrected camera; both are so small that they add.
-
-        Args:
-            step: that is being done.
-            index: of the view.
-            cameras: that of its image, from ``watched``, after the backward pass.
         """
         rate, left_out = self.rate(step), torch.zeros((), dtype=torch.int64, device="cpu")
         by_pose, by_intrinsics = cameras.cam_from_world.grad, cameras.intrinsics.grad
@@ -231,7 +197,6 @@ class CameraRefinement:
         return FIRST_RATE * (LAST_RATE / FIRST_RATE) ** min(progress, 1.0)
 
     def state(self) -> dict[str, Tensor]:
-        """Return everything that ``load_state`` needs."""
         state = dict(self._values())
         for name, updates in self._updates.items():
             state |= {f"updates.{name}": updates}

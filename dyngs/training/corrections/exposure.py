@@ -33,24 +33,18 @@ from dyngs.training.shared_places import Draw, log_gains
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little to compare with."""
-TRAVEL = 0.5
-"""How far a gain may move after it was found, at most: rates follow from how often an image is trained on."""
-LAST_RATE = 0.02
-"""Rate at the end over that at the beginning, log-linear between."""
+TRAVEL = 0.5  # How far a gain may move after it was found, at most: rates follow from how often an image is trained on
+LAST_RATE = 0.02  # Rate at the end over that at the beginning, log-linear between
 MAX_RATE = 0.01
-MIXING_RATE = 0.05
-"""Rate of what mixes channels, and of offsets, over that of gains."""
+MIXING_RATE = 0.05  # Rate of what mixes channels, and of offsets, over that of gains
 GAIN_WEIGHT, MIXING_WEIGHT = 0.3, 1.0
 """Weights of the mean squared deviation from the identity: gains differ, channels hardly mix."""
 CELLS, FEWEST_CELLS = 16, 8
 """The ratio is a median over so many cells a side; with fewer that say something there is none."""
-DARK, COVERED = 0.02, 0.1
-"""Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing."""
-ENOUGH = 100
-"""Pixels along the longer side from which only every second one is looked at, and so on."""
+DARK, COVERED = 0.02, 0.1  # Mean colour up to which a cell says nothing; transmittance from which a pixel says nothing
+ENOUGH = 100  # Pixels along the longer side from which only every second one is looked at, and so on
 MAX_GAIN = 8.0
-SMOOTH_WEIGHT = 1.0
-"""Weight of the mean square of its difference from the images before and after, in a video."""
+SMOOTH_WEIGHT = 1.0  # Weight of the mean square of its difference from the images before and after, in a video
 
 
 def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | None:
@@ -66,13 +60,7 @@ def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | N
 
 
 class ViewExposures(Loss):
-    """An affine colour per training image, and their Adam.
-
-    Args:
-        neighbours: for each of V views, the views before and after it in a video; empty: none.
-        steps: of the run.
-        images: of training, from which all gains are found at once; None: each is found from its rendering.
-    """
+    """An affine colour per training image, and their Adam."""
 
     def __init__(self, neighbours: Sequence[Sequence[int]], steps: int, images: ImageLoader | None = None) -> None:
         count = len(neighbours)
@@ -88,13 +76,7 @@ class ViewExposures(Loss):
         self._weights = MIXING_WEIGHT + (GAIN_WEIGHT - MIXING_WEIGHT) * is_gain
 
     def begin(self, step: int, which: Callable[[int], bool], draw: Draw) -> None:
-        """Find the gains of all images at once, if it is time to.
-
-        Args:
-            step: that is being done.
-            which: whether an image may be looked at.
-            draw: the scene, as far as it is learned.
-        """
+        """Find the gains of all images at once, if it is time to."""
         if step != self._begins + 1 or self._images is None:
             return
         looked_at = [i for i in range(len(self._visits)) if which(i)]
@@ -110,14 +92,7 @@ class ViewExposures(Loss):
         return deviation + torch.eye(3, 4, dtype=deviation.dtype, device=deviation.device)
 
     def applied(self, view: tuple[int, int], image: Image, rendering: Rendering, background: Tensor) -> Tensor:
-        """Return (H, W, 3) the rendering of a view as its camera would have made it, for the loss.
-
-        Args:
-            view: its index, and the step that is being done.
-            image: of the view; may be smaller than that of the loader.
-            rendering: of the view.
-            background: (3,) behind both.
-        """
+        """Return (H, W, 3) the rendering of a view as its camera would have made it, for the loss."""
         index, step = view
         if step <= self._begins:
             return rendering.rgb[0]
@@ -128,11 +103,9 @@ class ViewExposures(Loss):
         return up_to_white(shown, image.composite(background))
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
-        """Return the penalty on an image's affine: far from the identity, or from those next to it in time."""
         return self.penalties(look.index)
 
     def penalties(self, index: int) -> dict[str, Tensor]:
-        """Return the penalty on the affine of an image."""
         value = self._values[index]
         total = (self._weights * value.square()).mean()
         beside = self._beside(index)
@@ -164,7 +137,6 @@ class ViewExposures(Loss):
         return {"values": self._values.detach(), "visits": self._visits} | moments
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the state that ``state()`` returned. Raises KeyError, or ValueError for that of other images."""
         visits = require_tensor("visits", state["visits"], self._visits.shape, torch.int64)
         values = require_tensor("values", state["values"], self._values.shape, torch.float32)
         self._adam = AdamState.restored(state, {"values": values})

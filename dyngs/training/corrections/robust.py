@@ -24,35 +24,22 @@ from dyngs.models.renderable import Rendering
 from dyngs.tensor_checks import require_indices, require_tensor
 from dyngs.training.other_views import CELLS, OtherViews, grid_of
 
-EVERY = 4
-"""An image is looked at each so many times that it is trained on; in between its mask stays."""
-WARM_UP = 0.05
-"""Fraction of the run in which everything counts."""
+EVERY = 4  # An image is looked at each so many times that it is trained on; in between its mask stays
+WARM_UP = 0.05  # Fraction of the run in which everything counts
 SEED, GROWN = 5.0, 3.0
 """Multiples of the median residual: from the first a cell is left out, from the second beside such cells."""
-REACH = 2
-"""Cells up to which a cell counts as beside another."""
-SUPPORT = 0.5
-"""Fraction of the 3 x 3 cells around that must be left out, too."""
+REACH = 2  # Cells up to which a cell counts as beside another
+SUPPORT = 0.5  # Fraction of the 3 x 3 cells around that must be left out, too
 CLEARLY = 0.5
 """A place disagrees where the other views differ from the rendering by less than this fraction of what it does."""
-RIM = 1
-"""Cells around what is left out that are left out with it."""
+RIM = 1  # Cells around what is left out that are left out with it
 DISCOUNT = 0.95
 """Weight of the histogram of all looks before against that of the present one: it remembers about twenty."""
-_OCTAVES, _PER_OCTAVE = 12, 16
-"""The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two."""
+_OCTAVES, _PER_OCTAVE = 12, 16  # The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two
 
 
 class RobustMasks:
-    """Masks of the pixels that count, one per training image, brought up to date as it is trained on.
-
-    Args:
-        images: of training.
-        cameras: theirs, V cameras of their full size.
-        steps: of the run.
-        corrected: see ``OtherViews``.
-    """
+    """Masks of the pixels that count, one per training image, brought up to date as it is trained on."""
 
     def __init__(
         self,
@@ -75,16 +62,7 @@ class RobustMasks:
         background: Tensor,
         with_depth: Callable[[Cameras], Rendering],
     ) -> Image:
-        """Return ``image``, of which only those pixels count that agree with the other views; call once a step.
-
-        Args:
-            index: of the view.
-            step: that is being done.
-            image: may be smaller than that of the loader.
-            drawn: (H, W, 3) its rendering.
-            background: (3,) behind both.
-            with_depth: draws the same scene with its expected depth.
-        """
+        """Return ``image``, of which only those pixels count that agree with the other views; call once a step."""
         if step <= self._begins:
             return image
         if int(self._visits[index]) % EVERY == 0:
@@ -122,7 +100,6 @@ class RobustMasks:
         background: Tensor,
         with_depth: Callable[[Cameras], Rendering],
     ) -> None:
-        """Find anew what is left out of an image."""
         grid = grid_of(cameras.width, cameras.height)
         drawn = adaptive_avg_pool2d(drawn.permute(2, 0, 1), grid)
         seen, keeps = self._others.cells_of(index, background)
@@ -160,7 +137,6 @@ class RobustMasks:
 
 
 def _as_cells(cameras: Cameras, grid: tuple[int, int]) -> Cameras:
-    """Return ``cameras`` with one pixel per cell."""
     scale = cameras.intrinsics.new_tensor([grid[1] / cameras.width, grid[0] / cameras.height, 1.0])
     return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, grid[1], grid[0])
 

@@ -12,30 +12,19 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.training.priors.depth_maps import Kind, values_of
+from dyngs.training.priors.depth_maps import DepthForm, values_of
 
-PAIRS = 12
-"""Pairs of images that are compared."""
-MARGIN = 0.97
-"""A prior must lower the error at least to this fraction of its substitute's."""
-_CHANGED = 0.1
-"""Flow is judged at this fraction of the pixels: those that change most."""
-_SIDE = 96
-"""Images are shrunk to about this for depth: hundreds of guesses are compared."""
+PAIRS = 12  # Pairs of images that are compared
+MARGIN = 0.97  # A prior must lower the error at least to this fraction of its substitute's
+_CHANGED = 0.1  # Flow is judged at this fraction of the pixels: those that change most
+_SIDE = 96  # Images are shrunk to about this for depth: hundreds of guesses are compared
 _DEPTHS = 14
-_RANGE = 6.0
-"""Nearest and farthest guess, as a factor of the distance to what the cameras look at."""
+_RANGE = 6.0  # Nearest and farthest guess, as a factor of the distance to what the cameras look at
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Mean photometric errors (0 to 1) over pairs of images.
-
-    Attributes:
-        error: with the prior.
-        without: with its best substitute.
-        pairs: number of pairs compared.
-    """
+    """Mean photometric errors (0 to 1) over pairs of images."""
 
     error: float
     without: float
@@ -52,9 +41,6 @@ def flow_agreement(pairs: Sequence[tuple[Image, Image]]) -> Agreement:
 
     Only where images change most: elsewhere no motion is always right. There, displacements at random help a little,
     too, which is why they are a substitute.
-
-    Args:
-        pairs: images with flow, and those that it leads to.
     """
     sums = torch.zeros(4, device="cpu")
     count = 0
@@ -78,11 +64,7 @@ def flow_agreement(pairs: Sequence[tuple[Image, Image]]) -> Agreement:
 
 
 def track_agreement(pairs: Sequence[tuple[Image, Image, Tensor, Tensor]]) -> Agreement:
-    """Compare colours at both ends of tracks with those at the ends of other tracks.
-
-    Args:
-        pairs: two images, and (P, 2) px of points in each.
-    """
+    """Compare colours at both ends of tracks with those at the ends of other tracks."""
     given = shuffled = 0.0
     for first, second, start, end in pairs:
         before, after = (_blurred(p.rgb_premultiplied) for p in (first, second))
@@ -93,19 +75,15 @@ def track_agreement(pairs: Sequence[tuple[Image, Image, Tensor, Tensor]]) -> Agr
     return Agreement(given / count, shuffled / count, len(pairs))
 
 
-def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: float) -> tuple[Kind, Agreement]:
+def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: float) -> tuple[DepthForm, Agreement]:
     """Compare depth maps with one depth for a whole image; return what they are affine in, and the agreement.
 
     Scale and shift, and the one depth, are those that warp the first image's second neighbour onto it best; the
     third one then judges them.
-
-    Args:
-        triples: images with depth, each with two others that see the same from elsewhere at about its time.
-        distance: of cameras from what they look at, world units.
     """
     sums = torch.zeros(3, device="cpu")
     count = 0
-    kinds: tuple[Kind, Kind] = ("depth", "inverse")
+    kinds: tuple[DepthForm, DepthForm] = ("depth", "inverse")
     for views in triples:
         first, second, third = (_small(p) for p in views)
         if first.depth is None or not bool((first.depth > 0).any()):
@@ -126,10 +104,6 @@ def mask_agreement(pairs: Sequence[tuple[Image, Image]], distance: float) -> Agr
 
     Each pixel may choose its depth. What stands is found on its epipolar line in the other image; from a camera that
     stands, too, at its own place.
-
-    Args:
-        pairs: images with masks, and others of another time.
-        distance: of cameras from what they look at, world units.
     """
     still = moving = 0.0
     count = 0
@@ -154,7 +128,7 @@ def _depths(distance: float) -> list[float]:
     return [distance * _RANGE ** (2 * i / (_DEPTHS - 1) - 1) for i in range(_DEPTHS)]
 
 
-def _aligned_guesses(given: Tensor, kind: Kind, distance: float) -> Iterator[Tensor]:
+def _aligned_guesses(given: Tensor, kind: DepthForm, distance: float) -> Iterator[Tensor]:
     """Yield the map aligned so that its near and far end lie at every pair of guesses."""
     known = given > 0
     values = values_of(given, kind)
@@ -168,7 +142,6 @@ def _aligned_guesses(given: Tensor, kind: Kind, distance: float) -> Iterator[Ten
 
 
 def _warp_error(first: Image, second: Image, depth: Tensor) -> float:
-    """Return the mean of ``_warp_errors``."""
     return float(_warp_errors(first, second, depth).mean())
 
 
@@ -199,13 +172,11 @@ def _small(image: Image) -> Image:
 
 
 def _centers(pixels: Tensor) -> Tensor:
-    """Return the (H * W, 2) centres of pixels, px."""
     y, x = (torch.arange(n, device=pixels.device) + 0.5 for n in pixels.shape[:2])
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
 
 
 def _sampled(pixels: Tensor, places: Tensor) -> Tensor:
-    """Return the (P, 3) bilinear colours of (H, W, 3) ``pixels`` at ``places`` (P, 2) px."""
     height, width = pixels.shape[:2]
     grid = (2 * places / places.new_tensor([width, height]) - 1)[None, None]
     image = pixels.permute(2, 0, 1)[None]
@@ -213,7 +184,6 @@ def _sampled(pixels: Tensor, places: Tensor) -> Tensor:
 
 
 def _blurred(pixels: Tensor) -> Tensor:
-    """Return the (H, W, 3) means over 3x3 pixels."""
     image = torch.nn.functional.pad(pixels.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")
     return torch.nn.functional.avg_pool2d(image, 3, 1)[0].permute(1, 2, 0)
 

@@ -7,17 +7,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-Kind = Literal["depth", "inverse"]
+DepthForm = Literal["depth", "inverse"]
 """Form of the map that is affine in the true depth: the map as it is, or its inverse (the nets of single images)."""
 
 _ROUNDS = 4
-_SOLID = 0.5
-"""Alpha from which the drawn depth means anything."""
+_SOLID = 0.5  # Alpha from which the drawn depth means anything
 _MIN_PIXELS = 16
 _TINY = 1e-6
 
 
-def values_of(depth: Tensor, kind: Kind) -> Tensor:
+def values_of(depth: Tensor, kind: DepthForm) -> Tensor:
     """Return the depths, or their inverses with 0 staying 0."""
     return depth if kind == "depth" else torch.where(depth > 0, 1 / depth.clamp_min(_TINY), 0.0)
 
@@ -40,18 +39,13 @@ def aligned(given: Tensor, wanted: Tensor) -> Tensor | None:
     return a * given + b if bool(a > 0) else None
 
 
-def depth_error(drawn: Tensor, alpha: Tensor, given: Tensor, kind: Kind, mask: Tensor | None = None) -> Tensor | None:
+def depth_error(
+    drawn: Tensor, alpha: Tensor, given: Tensor, kind: DepthForm, mask: Tensor | None = None
+) -> Tensor | None:
     """Return the mean error of the drawn depth relative to the map; None where there is too little to compare.
 
     The map is aligned by scale and shift to what is drawn, without a gradient; |difference| over the median of the
-    aligned values (in depth or inverse depth, see ``Kind``).
-
-    Args:
-        drawn: (H, W) expected depth.
-        alpha: (H, W).
-        given: (H, W) map, 0 where unknown.
-        kind: see ``Kind``.
-        mask: (H, W), 0 does not count.
+    aligned values (in depth or inverse depth, see ``DepthForm``).
     """
     counts = (given > 0) & (drawn > 0) & (alpha.detach() > _SOLID)
     if mask is not None:

@@ -22,30 +22,19 @@ from dyngs.training.priors.agreement import (
     spread_pairs,
     track_agreement,
 )
-from dyngs.training.priors.depth_maps import Kind
+from dyngs.training.priors.depth_maps import DepthForm
 from dyngs.training.priors.point_motion import Glance
 from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
 
-_NEAR_TIME = 0.1
-"""Depth is judged by images whose times differ by less; the less, the less has moved."""
+_NEAR_TIME = 0.1  # Depth is judged by images whose times differ by less; the less, the less has moved
 _BASELINE = 0.1
 """Best distance between the cameras of two images for that, as a fraction of their distance from the scene."""
 
 
 def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves: bool) -> UsedPriors:
-    """Return the priors of a capture that agree with its images; nothing is read where it has none.
-
-    Args:
-        config: names the priors that may be used.
-        capture: of the run.
-        images: of its training views, with maps.
-        moves: whether anything may move in the model: without that, depth alone is of use.
-
-    Raises:
-        DyngsError: a file that is damaged.
-    """
+    """Return the priors of a capture that agree with its images; nothing is read where it has none."""
     wanted, views, lines = config.train.priors, images.views, list[str]()
-    kind: Kind | None = None
+    kind: DepthForm | None = None
     flow_to: dict[int, Glance] = {}
     tracks: PointTracks | None = None
     if "depth" in wanted and any(view.depth_path for view in views):
@@ -65,10 +54,10 @@ def used_priors(config: Config, capture: Capture, images: ImageLoader, *, moves:
         agreement = _judged_masks(config, images)
         lines.append(_line("motion masks", agreement, "the same masks the other way round"))
         masks = agreement.holds
-    return UsedPriors(kind, flow_to, tracks, masks, lines)
+    return UsedPriors(kind, flow_to, tracks, masks, tuple(lines))
 
 
-_NAMES: dict[Kind, str] = {"depth": "depth", "inverse": "inverse depth"}
+_NAMES: dict[DepthForm, str] = {"depth": "depth", "inverse": "inverse depth"}
 
 
 def _line(what: str, found: Agreement, substitute: str) -> str:
@@ -79,7 +68,7 @@ def _line(what: str, found: Agreement, substitute: str) -> str:
     return f"{what}: {verdict} ({errors})"
 
 
-def _judged_depth(config: Config, images: ImageLoader) -> tuple[Kind, Agreement]:
+def _judged_depth(config: Config, images: ImageLoader) -> tuple[DepthForm, Agreement]:
     views = images.views
     cameras = training_cameras(views, config.data)
     distance = distance_to_scene(cameras)

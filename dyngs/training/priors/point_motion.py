@@ -17,8 +17,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 
 _SOLID = 0.5
-_SOFT_PX = 0.5
-"""Charbonnier's constant, px: smaller errors count quadratically."""
+_SOFT_PX = 0.5  # Charbonnier's constant, px: smaller errors count quadratically
 
 
 @dataclass(frozen=True)
@@ -33,13 +32,6 @@ def displacements(start: Gaussians, end: Gaussians, here: Cameras, there: Camera
     """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights it stands for.
 
     Differentiable in the means of both, not in how much each Gaussian covers.
-
-    Args:
-        start: N Gaussians at the time of this image.
-        end: the same ones at the time of the other image.
-        here: camera of this image.
-        there: camera of the other image.
-        options: how to draw.
     """
     (from_px, from_z), (to_px, to_z) = _projected(start.means, here), _projected(end.means, there)
     seen = (from_z > options.near) & (to_z > options.near)
@@ -82,12 +74,10 @@ def track_error(drawn: Tensor, start: Tensor, end: Tensor) -> Tensor | None:
 
 
 def _charbonnier(errors: Tensor) -> Tensor:
-    """Return (P,) robust lengths of ``errors`` (P, 2) px."""
     return (errors.square().sum(-1) + _SOFT_PX**2).sqrt() - _SOFT_PX
 
 
 def _projected(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return (N, 2) positions in px and (N,) depths."""
     pose, k = cameras.cam_from_world[0], cameras.intrinsics[0]
     local = means @ pose[:3, :3].T + pose[:3, 3]
     depth = local[:, 2]

@@ -10,43 +10,28 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.model import Look, Loss
-from dyngs.training.priors.depth_maps import Kind, depth_error
+from dyngs.training.priors.depth_maps import DepthForm, depth_error
 from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
 
-MIN_POINTS = 4
-"""Fewest points that two images must share for their tracks to be compared."""
-WEIGHTS = {"depth": 0.1}
-"""Weight of a loss term where it is not 1."""
-_NEAREST = 8
-"""The other image of tracks is one of so many nearest in time."""
+MIN_POINTS = 4  # Fewest points that two images must share for their tracks to be compared
+WEIGHTS = {"depth": 0.1}  # Weight of a loss term where it is not 1
+_NEAREST = 8  # The other image of tracks is one of so many nearest in time
 
 
 @dataclass(frozen=True)
 class PointTracks:
-    """2D tracks in the training images.
+    """2D tracks in the training images."""
 
-    Attributes:
-        xy: (V, P, 2) px of the full training images.
-        visible: (V, P) bool; a view without tracks has none.
-        glances: camera and time of the V views.
-    """
-
-    xy: Tensor
-    visible: Tensor
-    glances: Sequence[Glance]
+    xy: Tensor  # (V, P, 2) px of the full training images
+    visible: Tensor  # (V, P) bool; a view without tracks has none
+    glances: Sequence[Glance]  # camera and time of the V views
 
     def pair(
         self, index: int, may_use: Callable[[float], bool], generator: torch.Generator
     ) -> tuple[Glance, Tensor, Tensor] | None:
-        """Return another view at random among the nearest in time, and P' points here and there; None: there is none.
-
-        Args:
-            index: of this view.
-            may_use: whether a time may be looked at.
-            generator: chooses.
-        """
+        """Return another view at random among the nearest in time, and P' points here and there, or None."""
         now = self.glances[index].time
         shared = (self.visible & self.visible[index]).sum(1)
         others = [
@@ -64,30 +49,17 @@ class PointTracks:
 
 @dataclass(frozen=True)
 class UsedPriors(Loss):
-    """Priors that agree with the images.
+    """Priors that agree with the images."""
 
-    Attributes:
-        depth: what the depth maps are affine in; None: none are used.
-        flow_to: by training view, the camera and time that its flow leads to; empty: no flow is used.
-        tracks: None: none are used.
-        masks: whether motion masks say what may move.
-        lines: what was found, for people, told once; whoever tells them removes them.
-    """
-
-    depth: Kind | None = None
+    depth: DepthForm | None = None  # what the depth maps are affine in; None: none are used
+    # by training view, the camera and time that its flow leads to; empty: no flow is used
     flow_to: Mapping[int, Glance] = field(default_factory=dict)
-    tracks: PointTracks | None = None
-    masks: bool = False
-    lines: list[str] = field(default_factory=list)
+    tracks: PointTracks | None = None  # None: none are used
+    masks: bool = False  # whether motion masks say what may move
+    lines: tuple[str, ...] = ()  # what was found, for people
 
     def needs_depth(self, image: Image) -> bool:
         return self.depth is not None and image.depth is not None
-
-    def told(self, finding: str | None) -> str | None:
-        """Return the lines that have not been told yet, then ``finding``, and forget them; None: there are none."""
-        lines = [*self.lines, *([] if finding is None else [finding])]
-        self.lines.clear()
-        return "\n".join(lines) or None
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
         found: dict[str, Tensor | None] = {}
@@ -95,11 +67,11 @@ class UsedPriors(Loss):
         if self.depth is not None and image.depth is not None and rendering.depth is not None:
             drawn, alpha = rendering.depth[0], rendering.alpha[0]
             found["depth"] = depth_error(drawn, alpha, image.depth, self.depth, image.mask)
-        if isinstance(scene, Scene) and not scene.is_static and image.time is not None:
+        if isinstance(scene, GaussianScene) and not scene.is_static and image.time is not None:
             found |= self._motion(scene, look)
         return {name: WEIGHTS.get(name, 1.0) * x for name, x in found.items() if x is not None}
 
-    def _motion(self, scene: Scene, look: Look) -> dict[str, Tensor | None]:
+    def _motion(self, scene: GaussianScene, look: Look) -> dict[str, Tensor | None]:
         image, (first, last) = look.image, look.model.window(look.step)
 
         def may_use(time: float) -> bool:
@@ -134,6 +106,5 @@ def _scale(cameras: Cameras, here: Cameras) -> Tensor:
 
 
 def _sized_as(here: Cameras, cameras: Cameras) -> Cameras:
-    """Return ``cameras`` for images as large as those of ``here``."""
     scale = torch.cat([_scale(cameras, here), here.intrinsics.new_ones(1)])
     return Cameras(cameras.cam_from_world, scale[:, None] * cameras.intrinsics, here.width, here.height)

@@ -15,20 +15,17 @@ import numpy as np
 import pytest
 import torch
 from browser import Browser, Page, needs_browser
-from moving_scene import camera, moving_scene, still_scene, write_moving_run
+from moving_scene import camera, moving_scene, sliding_nodes, still_scene, write_moving_run
 from numpy.typing import NDArray
 from PIL import Image
 from scene_kinds import KINDS, onlooker, scene_of_kind
-from tiny_fields import tiny_options
 
 from dyngs.camera import Cameras
 from dyngs.conventions import RasterizeMode
-from dyngs.deform.field import FieldSetup
-from dyngs.deform.fields import new_field
 from dyngs.export.html.page import MOST_VIEWS, SCRIPTS, SHADERS, WrittenPage, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import Scene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr, ssim
 from dyngs.runs.opened import Opened, open_run, opened_scene
 from dyngs.static.scene import StaticScene
@@ -41,7 +38,7 @@ def browser() -> Iterator[Browser]:
 
 
 def write(
-    scene: Scene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
+    scene: GaussianScene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
 ) -> WrittenPage:
     scene = replace(scene, options=options or scene.options, background=torch.ones(3))
     return write_page(replace(opened_scene(scene), stated_up="-y"), path, title=title, views=(view,))
@@ -64,7 +61,7 @@ def shown(page: Page, view: Cameras, time: float) -> torch.Tensor:
     return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
 
 
-def assert_alike(page: Page, scene: Scene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:
+def assert_alike(page: Page, scene: GaussianScene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:
     for time in (0.0, 0.4, 1.0):
         truth = scene.render(view, time, options=options, background=torch.ones(3)).rgb[0].detach()
         found = shown(page, view, time)
@@ -219,11 +216,17 @@ def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving")))
 
 
+@pytest.mark.parametrize(("kind", "count"), [("control_nodes", 0), ("hexplane", 1)])
+def test_a_page_says_where_splines_are_fitted(kind: str, count: int, tmp_path: Path) -> None:
+    """Control nodes move along splines already."""
+    notes = [x for x in write(scene_of_kind(kind), tmp_path / "a.html", onlooker()).notes if "splines are fitted" in x]
+    assert len(notes) == count
+
+
 def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Opened, tmp_path: Path) -> None:
     written = write_page(moving_run, tmp_path / "a.html", time=0.25)
-    header, notes = written.header, written.notes
-    assert len(notes) == 1
-    assert "splines are fitted to the motion" in notes[0]
+    header = written.header
+    assert written.notes == ()
     assert written.num_bytes == (tmp_path / "a.html").stat().st_size
     assert (header["moves"], header["time"], header["background"]) == (True, 0.25, [1.0, 1.0, 1.0])
     assert header["seconds"] >= 1.0
@@ -262,9 +265,6 @@ def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
     return a.shape != b.shape or bool(np.abs(a.astype(int) - b).max() > 40)
 
 
-def sliding_scene() -> Scene:
+def sliding_scene() -> GaussianScene:
     """Five balls of which two go along x."""
-    options = tiny_options("trajectory", everything=False)
-    field = new_field(options, FieldSetup(torch.zeros(3), torch.ones(3), 5, 2, 1.0), torch.Generator())
-    field.parameters["means"].data[:, 0, 0] = 0.5
-    return moving_scene(field)
+    return moving_scene(sliding_nodes())

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyngs.training.priors.depth_maps import Kind, aligned, depth_error, values_of
+from dyngs.training.priors.depth_maps import DepthForm, aligned, depth_error, values_of
 
 
 def true_depth() -> torch.Tensor:
@@ -12,7 +12,7 @@ def true_depth() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("kind", ["depth", "inverse"])
-def test_scale_and_shift_do_not_count(kind: Kind) -> None:
+def test_scale_and_shift_do_not_count(kind: DepthForm) -> None:
     """A map that is affine in the true depth, or in its inverse, has no error."""
     depth = true_depth()
     given = 0.3 * depth + 0.2 if kind == "depth" else 1 / (0.5 / depth + 0.1)

@@ -46,7 +46,7 @@ def test_priors_of_noise_are_ignored_with_one_line_each(tmp_path: Path) -> None:
 def test_priors_that_are_not_requested_are_not_read(tmp_path: Path) -> None:
     with_priors(tmp_path)
     (tmp_path / "tracks.npz").write_bytes(b"")
-    assert found(tmp_path, "train.priors=[]").lines == []
+    assert found(tmp_path, "train.priors=[]").lines == ()
     assert [line[:5] for line in found(tmp_path, "train.priors=[depth]").lines] == ["depth"]
 
 

@@ -105,9 +105,3 @@ def test_tracks_in_images_of_another_size() -> None:
     priors = UsedPriors(tracks=PointTracks(xy.expand(2, 4, 2), torch.ones(2, 4, dtype=torch.bool), glances))
     assert terms(priors, image(), speed=0.0)["tracks"] < 1e-6
     assert terms(priors, image())["tracks"] > 0.01
-
-
-def test_lines_are_told_once() -> None:
-    priors = UsedPriors(lines=["one", "two"])
-    assert priors.told("three") == "one\ntwo\nthree"
-    assert priors.told(None) is None

@@ -1,4 +1,4 @@
-"""Section ``model``, part 3: people, and networks that predict them."""
+"""Section ``model`` of people, and of networks that predict them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.model import SceneModel
-from dyngs.config.keys.section import Fraction, Positive
+from dyngs.section import Fraction, Positive, SceneModel
 
 
 class _OnTemplate(SceneModel):

@@ -1,13 +1,23 @@
-"""Section ``model``, part 1: what all kinds have in common, and static scenes."""
+"""The base classes of all sections of the configuration, and ranges of numbers that several of them use."""
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from dyngs.config.keys.section import CutOff, Positive, Section
 from dyngs.conventions import RasterizeMode
+
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+CutOff = Annotated[float, Field(ge=1e-6, le=0.5)]
+"""Opacity or transmittance below which the rasterizer stops."""
+
+
+class Section(BaseModel):
+    """Base of every section: immutable, unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class ModelSection(Section):
@@ -26,6 +36,9 @@ class ModelSection(Section):
     is_network: ClassVar[bool] = False
     is_posed: ClassVar[bool] = False
     may_move: ClassVar[bool] = False
+    if TYPE_CHECKING:
+        kind: Any = None
+        """Name of the kind."""
 
     @property
     def added_for_motion(self) -> int:
@@ -59,11 +72,3 @@ class SceneModel(ModelSection):
     transmittance_min: CutOff = Field(
         default=1e-4, description="blending of a pixel ends when its transmittance falls below this; 1e-4 in 3DGS"
     )
-
-
-class StaticModel(SceneModel):
-    """3D Gaussian splatting, Mip-Splatting's filters as options."""
-
-    begins_with_points: ClassVar[bool] = True
-
-    kind: Literal["static"] = Field(default="static", description="3D Gaussians of a static scene (3DGS)")

@@ -1,4 +1,4 @@
-"""Section ``model``, part 2: moving scenes, and the deformation fields of ``model.deform``."""
+"""Section ``model`` of moving scenes, and the deformation fields of ``model.deform``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.config.keys.model import SceneModel
-from dyngs.config.keys.section import Fraction, Positive, Section
+from dyngs.section import Fraction, Positive, SceneModel, Section
 
 
 class FieldSection(Section):
@@ -72,20 +71,7 @@ class ControlNodesField(FieldSection):
     )
 
 
-class TrajectoryField(FieldSection):
-    """A polynomial and a Fourier series per Gaussian, no network: for small motion and long clips."""
-
-    kind: Literal["trajectory"] = Field(
-        default="trajectory", description="a polynomial and a Fourier series per Gaussian; no network"
-    )
-    polynomial: int = Field(default=3, ge=0, le=8, description="highest power of time")
-    fourier: int = Field(default=4, ge=0, le=32, description="number of frequencies")
-    lr_means: Positive = Field(
-        default=1.6e-4, description="learning rate of the coefficients of positions, times the scene extent"
-    )
-
-
-DeformField = HexplaneField | MlpField | TrajectoryField | ControlNodesField
+DeformField = HexplaneField | MlpField | ControlNodesField
 
 
 class DynamicModel(SceneModel):

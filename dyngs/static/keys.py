@@ -1,0 +1,17 @@
+"""Section ``model`` of static scenes."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from dyngs.section import SceneModel
+
+
+class StaticModel(SceneModel):
+    """3D Gaussian splatting, Mip-Splatting's filters as options."""
+
+    begins_with_points: ClassVar[bool] = True
+
+    kind: Literal["static"] = Field(default="static", description="3D Gaussians of a static scene (3DGS)")

@@ -1,0 +1,164 @@
+"""What every kind of model promises: all of ``KINDS``, and one that is not made of Gaussians."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from moving_scene import camera
+from tiny_people import NET, people, person
+from toy_kind import registered
+
+from dyngs.config import Config, ModelSection
+from dyngs.config.io import load_config
+from dyngs.errors import DyngsError
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
+from dyngs.kinds import build, restored_model
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import KINDS, kind_of
+from dyngs.models.model import Predictor
+from dyngs.models.renderable import Renderable
+from dyngs.state import Role
+from dyngs.training.prediction import PersonPredictor, new_network
+from dyngs.training.trainer import Trainer
+
+TRAINED = {
+    "static": ("still", ["init.num_random=40"]),
+    "dynamic": ("moving", ["init.num_random=40", "model.motion_from=0.3", "model.motion_threshold=0", "train.steps=6"]),
+    "human": ("person", ["model.resolution=16", "model.fit=false", "model.sh_degree=0"]),
+    "toy": ("still", []),
+}
+"""Fixture with a capture for each kind that is trained on one, and other keys of a small run."""
+NETWORKS = {"human_predictor"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def toy() -> Iterator[None]:
+    with registered():
+        yield
+
+
+@pytest.fixture(params=sorted(TRAINED))
+def config(request: pytest.FixtureRequest) -> Config:
+    """Of a small run of a kind."""
+    capture, keys = TRAINED[request.param]
+    root = request.getfixturevalue(capture)
+    common = [f"data.root={root}", f"model.kind={request.param}", "train.steps=6", "strategy.kind=fixed"]
+    return load_config(None, [*common, *keys])
+
+
+def trained(config: Config, steps: int) -> Trainer:
+    trainer = build(config)
+    assert isinstance(trainer, Trainer)
+    for _ in range(steps):
+        trainer.step()
+    return trainer
+
+
+def same(one: Checkpoint, other: Checkpoint) -> bool:
+    keys = one.tensors.keys() == other.tensors.keys()
+    return keys and all(torch.equal(x, other.tensors[name]) for name, x in one.tensors.items())
+
+
+def test_every_kind_is_here() -> None:
+    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == TRAINED.keys() | NETWORKS
+    for kind in KINDS:
+        assert kind_of(kind.section()) is kind
+        assert issubclass(kind.section, ModelSection)
+
+
+def test_it_is_trained_stored_and_restored(config: Config) -> None:
+    """What a checkpoint holds is taken over as it is, and training goes on with the same bytes."""
+    trainer = trained(config, 4)
+    first, again = trainer.checkpoint(), build(config, restored=True)
+    assert isinstance(again, Trainer)
+    again.restore(first)
+    assert same(first, again.checkpoint())
+    assert again.done == 4
+    assert again.step().loss == trainer.step().loss
+    assert same(trainer.checkpoint(), again.checkpoint())
+    assert not same(first, trainer.checkpoint())
+    assert all(x.requires_grad for x in trainer.model.leaves)
+    state = trainer.model.state()
+    assert state.keys() >= trainer.model.scene.state().keys()
+
+
+def test_its_scene_is_restored_and_drawn(config: Config) -> None:
+    trainer = trained(config, 4)
+    scene, own = restored_model(trainer.checkpoint(), config.model), trainer.model.scene
+    assert isinstance(scene, Renderable)
+    assert scene.state().keys() == own.state().keys()
+    assert all(torch.equal(x.tensor, scene.state()[name].tensor) for name, x in own.state().items())
+    assert all(x.role is not Role.TRAINING for x in scene.drawing_state().values())
+    view = camera(12, 9)
+    for time in (None, 0.0, 0.4, 1.0):
+        with torch.no_grad():
+            drawn = scene.render(view, time)
+            expected = own.render(view, time, options=scene.options, background=scene.background)
+        assert drawn.rgb.shape == (1, 9, 12, 3)
+        assert drawn.alpha.shape == drawn.transmittance.shape == (1, 9, 12)
+        assert bool(drawn.rgb.isfinite().all())
+        assert drawn.depth is None
+        assert torch.equal(drawn.rgb, expected.rgb)
+        assert torch.equal(scene.render(view, scene.time_step(time)).rgb, drawn.rgb)
+    assert not torch.equal(scene.on_background(torch.tensor([0.2, 0.9, 0.5])).render(view).rgb, scene.render(view).rgb)
+    with pytest.raises(DyngsError, match="not a number"):
+        scene.time_step(float("nan"))
+
+
+def test_its_scene_says_when_and_where_it_is(config: Config) -> None:
+    scene = trained(config, 4).model.scene
+    assert list(scene.times) == sorted(set(scene.times))
+    assert all(0 <= time <= 1 for time in scene.times)
+    low, high = scene.bounds
+    assert bool((low <= high).all())
+    assert scene.device == torch.device("cpu")
+    moved = scene.to("cpu")
+    assert moved.times == scene.times
+    assert type(moved) is type(scene)
+    view = camera(12, 9)
+    with torch.no_grad():
+        assert torch.equal(moved.render(view, 0.5).rgb, scene.render(view, 0.5).rgb)
+        seen = scene.render(view, 0.0).rgb
+        assert scene.is_static == all(torch.equal(seen, scene.render(view, time).rgb) for time in (0.5, 1.0))
+
+
+def test_only_what_is_made_of_gaussians_passes_for_that(config: Config) -> None:
+    scene = trained(config, 1).model.scene
+    if config.model.made_of_gaussians:
+        assert require_gaussians(scene, "it") is scene
+        return
+    assert not isinstance(scene, GaussianScene)
+    with pytest.raises(DyngsError, match="it: is not made of Gaussians"):
+        require_gaussians(scene, "it")
+
+
+@pytest.mark.parametrize("name", sorted(NETWORKS))
+def test_a_network_is_trained_stored_and_restored(tmp_path: Path, name: str) -> None:
+    """It is no scene, but predicts one."""
+    values = {"data": {"root": people(tmp_path, (1,))}, "model": NET.model_dump(), "train": {"steps": 3}}
+    config = Config.model_validate(json.loads(json.dumps(values, default=str)))
+    assert config.model.kind == name
+    trainer, again = build(config), build(config, restored=True)
+    trainer.step()
+    first = trainer.checkpoint()
+    again.restore(first)
+    assert same(first, again.checkpoint())
+    assert again.step().loss == trainer.step().loss
+    with pytest.raises(DyngsError, match="a network, not a scene"):
+        restored_model(first, config.model)
+
+
+def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
+    root = people(tmp_path, (1,)) / "p1"
+    network, mean = new_network(NET, torch.Generator().manual_seed(0)), torch.full((3, 32, 32), 0.5)
+    config = Config.model_validate({"data": {"root": root}, "model": NET})
+    predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root))
+    one, three = predictor.predict([0]), predictor.predict([0, 3, 6])
+    for scene in (one, three):
+        assert isinstance(scene, Renderable)
+        assert scene.render(camera(8, 6)).rgb.shape == (1, 6, 8, 3)
+    assert not torch.equal(one.state()["gaussians.sh"].tensor, three.state()["gaussians.sh"].tensor)
