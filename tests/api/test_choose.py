@@ -28,7 +28,7 @@ from dyngs.gaussians.rendering import render
 from dyngs.kinds import with_points
 from dyngs.runs.folder import CHOICES_NAME
 
-LONG = "train.steps=100_000"
+LONG = "train.steps=200_000"
 
 
 def preset(root: Path, *keys: str, name: str = "dynamic") -> Config:
@@ -135,6 +135,17 @@ def test_small_runs_keep_within_a_tenth_and_leave_out_the_last_settings(moving: 
         assert spent <= 0.1 * steps * module._work_of_step(config, view)
         assert plan.runs in (0, 2, 3, 4)
     assert _Plan.of(preset(moving, "train.steps=400_000"), capture, 3).runs == 4
+
+
+def test_small_runs_that_ask_whether_anything_moves_are_not_short(moving: Path) -> None:
+    """Rather are the other settings not asked: motion pays only after it has been followed."""
+    capture = read_capture(preset(moving).data)
+    plans = [
+        _Plan.of(preset(moving, f"train.steps={steps}"), capture, 3, module.STEPS)
+        for steps in range(5000, 200_000, 5000)
+    ]
+    assert {plan.steps for plan in plans} == {0, module.STEPS}
+    assert {plan.runs for plan in plans} == {0, 2, 3, 4}
 
 
 def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
