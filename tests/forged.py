@@ -21,7 +21,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import prefixed, tensors_of
 from dyngs.storage.file import _DTYPES, MAGIC, MAX_HEADER, _Header, _Info, _stored, compressed
-from dyngs.storage.tensors import Coding, Kind
+from dyngs.storage.tensors import Coding, TensorKind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]
@@ -104,7 +104,7 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
         ValueError: the format cannot say that.
     """
     kept = {name: x for name, x in tensors.items() if str(x.dtype).removeprefix("torch.") in _DTYPES}
-    stored = [_stored(name, x, Coding(Kind.EXACT), None) for name, x in sorted(kept.items())]
+    stored = [_stored(name, x, Coding(TensorKind.EXACT), None) for name, x in sorted(kept.items())]
     header = _Header(info=_Info(**info), tensors=tuple(entry for entry, _ in stored))
     packed = compressed(header.model_dump_json().encode(), room=MAX_HEADER)
     body = b"".join([MAGIC, len(packed).to_bytes(4, "little"), packed, *(block for _, block in stored)])

@@ -23,7 +23,7 @@ from dyngs.kinds import assemble
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.search import MOST_HELD_OUT, Limit, Search, Stored
+from dyngs.prune.search import MOST_HELD_OUT, Search, SearchLimit, Stored
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, require_empty
@@ -43,7 +43,7 @@ class Promise:
     before: float
     after: float
     cut: str  # what was taken away, for people; "nothing" where nothing could be
-    limits: tuple[Limit, ...]
+    limits: tuple[SearchLimit, ...]
     views: str  # that losses were measured on, for people
     trials: int
 

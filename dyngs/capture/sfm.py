@@ -17,7 +17,7 @@ import numpy as np
 from dyngs.capture.frame_choice import STILL, chosen_frames, measured
 from dyngs.capture.photos import Photo, copied, digest_of, gather_photos, lay_out
 from dyngs.capture.sfm_features import find_features, match_pairs, matched_images, pairs_to_match
-from dyngs.capture.sfm_mapping import Model, better, mapped, needs_more
+from dyngs.capture.sfm_mapping import SfmModel, better, mapped, needs_more
 from dyngs.capture.sfm_matches import Parallax, angles_deg, matched_pairs, parallax_of, turning_fraction, without_movers
 from dyngs.capture.sfm_work import SfmOptions, SfmTask, quiet_colmap, working
 from dyngs.conventions import ReportProgress, report_nothing
@@ -200,7 +200,7 @@ def _laid_out(work: Path, photos: list[Photo], is_video: bool, options: SfmOptio
     return SfmTask(work / "database.db", work / "images", names, photos, options, report, is_video, used)
 
 
-def _mapped(task: SfmTask) -> tuple[Model, list[str]]:
+def _mapped(task: SfmTask) -> tuple[SfmModel, list[str]]:
     """Return the model, and lines about what was done for it.
 
     Where it is not good, features that disagree with most of their images are left out, and the better one is kept.
@@ -253,7 +253,7 @@ def _film(task: SfmTask) -> str:
     return "film" if task.is_video else "take photos"
 
 
-def _require_depth(model: Model, task: SfmTask) -> None:
+def _require_depth(model: SfmModel, task: SfmTask) -> None:
     """Check that points are seen from directions that differ, by a lens that there can be."""
     if not model.has_real_lens:
         raise DyngsError(
@@ -273,7 +273,7 @@ def _require_depth(model: Model, task: SfmTask) -> None:
     )
 
 
-def _write_model(model: Model, capture: Path, names: dict[str, str]) -> tuple[str, ...]:
+def _write_model(model: SfmModel, capture: Path, names: dict[str, str]) -> tuple[str, ...]:
     """Write the model with the images' own names; return the names of images without a pose."""
     registered = set()
     for image in model.reconstruction.images.values():

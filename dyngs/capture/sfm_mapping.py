@@ -27,7 +27,7 @@ _FOCALS = (0.2, 10.0)
 
 
 @dataclass(frozen=True)
-class Model:
+class SfmModel:
     """A model that ``mapper`` found; ``agreeing`` is the fraction of the matched pairs whose matches fit the poses."""
 
     reconstruction: pycolmap.Reconstruction
@@ -54,7 +54,7 @@ class Model:
         return float(self.reconstruction.compute_mean_reprojection_error())
 
 
-def mapped(task: SfmTask) -> Model | None:
+def mapped(task: SfmTask) -> SfmModel | None:
     """Return the model with most images; None where none could be found.
 
     "auto" is global mapping for a video and incremental mapping for photos, where it is as fast and its poses are
@@ -68,13 +68,13 @@ def mapped(task: SfmTask) -> Model | None:
     return first if first is not None and not needs_more(first, task) else better(first, _found(task, order[1]))
 
 
-def needs_more(model: Model, task: SfmTask) -> bool:
+def needs_more(model: SfmModel, task: SfmTask) -> bool:
     """Whether images are left out, poses do not fit the matches, a lens is none, or the error is large."""
     bad = model.registered < len(task.names) or model.agreeing < GOOD_AGREEMENT or not model.has_real_lens
     return bad or model.error_px > GOOD_ERROR_PX * max(task.side, 1000) / 1000
 
 
-def better(first: Model | None, second: Model | None) -> Model | None:
+def better(first: SfmModel | None, second: SfmModel | None) -> SfmModel | None:
     """Return the model with more images whose pairs agree, then the clearly smaller error, else the first.
 
     Global mapping may give every image a pose and put a part of them elsewhere: such images must not count.
@@ -91,7 +91,7 @@ def better(first: Model | None, second: Model | None) -> Model | None:
     return second if second.error_px < first.error_px * (1 - _SAME_ERROR) else first
 
 
-def _found(task: SfmTask, mapper: Mapper) -> Model | None:
+def _found(task: SfmTask, mapper: Mapper) -> SfmModel | None:
     """Return the model of one mapper with most images; a failure of its solver counts as no model."""
     import pycolmap
 
@@ -106,7 +106,7 @@ def _found(task: SfmTask, mapper: Mapper) -> Model | None:
     if best is None or best.num_reg_images() < 2:
         return None
     task.report("poses, images", best.num_reg_images(), len(task.names))
-    return Model(best, mapper, agreement(best, task.database, task.side))
+    return SfmModel(best, mapper, agreement(best, task.database, task.side))
 
 
 def _most_images(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:

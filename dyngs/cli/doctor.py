@@ -26,7 +26,7 @@ _OPTIONAL = {
 
 
 @dataclass(frozen=True)
-class Finding:
+class Check:
     """One row of the report; ``verdict`` is "ok", "absent" (optional and missing) or "broken"."""
 
     name: str
@@ -55,36 +55,36 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def examine() -> Iterator[Finding]:
-    yield Finding("dyngs", _version("dyngs") or "not installed (run from a source folder)")
-    yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
-    yield Finding("cores", f"{_usable_cores()} usable of {os.cpu_count()}")
+def examine() -> Iterator[Check]:
+    yield Check("dyngs", _version("dyngs") or "not installed (run from a source folder)")
+    yield Check("python", f"{platform.python_version()} on {platform.platform()}")
+    yield Check("cores", f"{_usable_cores()} usable of {os.cpu_count()}")
     for name, module in _REQUIRED.items():
-        yield Finding(name, _version(name) or "") if util.find_spec(module) else Finding(name, "missing", "broken")
+        yield Check(name, _version(name) or "") if util.find_spec(module) else Check(name, "missing", "broken")
     yield from _examine_core()
     yield from _examine_gpu()
     for name, (module, purpose) in _OPTIONAL.items():
         found = util.find_spec(module) is not None
-        yield Finding(name, _version(name) or "") if found else Finding(name, f"needed for {purpose}", "absent")
+        yield Check(name, _version(name) or "") if found else Check(name, f"needed for {purpose}", "absent")
 
 
-def _examine_core() -> Iterator[Finding]:
+def _examine_core() -> Iterator[Check]:
     try:
         from dyngs.ops.native import ISA_NAMES, active_isa, built_isas, core
     except (ImportError, DyngsError) as error:
-        yield Finding("native core", str(error), "broken")
+        yield Check("native core", str(error), "broken")
         return
     isa, newest = active_isa(), core.best_isa()
     value = f"instruction set {isa} ({ISA_NAMES[isa]}), compiled: {', '.join(built_isas())}"
     if newest not in built_isas():
         value += f"; this processor also runs {newest} ({ISA_NAMES[newest]}): install again on it for more speed"
-    yield Finding("native core", value)
+    yield Check("native core", value)
     runtimes = openmp_runtimes()
     if runtimes is not None:
-        yield Finding("OpenMP runtimes", f"{len(runtimes)}: {', '.join(path.name for path in runtimes)}")
+        yield Check("OpenMP runtimes", f"{len(runtimes)}: {', '.join(path.name for path in runtimes)}")
 
 
-def _examine_gpu() -> Iterator[Finding]:
+def _examine_gpu() -> Iterator[Check]:
     """Yield what there is of a CUDA GPU; without one dyngs works, too."""
     try:
         from dyngs.ops.device import findings, why_no_gpu
@@ -92,8 +92,8 @@ def _examine_gpu() -> Iterator[Finding]:
         return
     reason = why_no_gpu()
     for name, value in findings().items():
-        yield Finding(name, value)
-    yield Finding("device", "cuda") if reason is None else Finding("device", f"cpu; for a GPU: {reason}", "absent")
+        yield Check(name, value)
+    yield Check("device", "cuda") if reason is None else Check("device", f"cpu; for a GPU: {reason}", "absent")
 
 
 def openmp_runtimes() -> list[Path] | None:

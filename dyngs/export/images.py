@@ -30,7 +30,7 @@ _DEPTH_SAMPLES = 8
 
 
 @dataclass(frozen=True)
-class Frame:
+class DrawnImage:
     """One rendered image, float32."""
 
     rgb: np.ndarray  # (H, W, 3), composited on the background, clamped to [0, 1]
@@ -51,19 +51,19 @@ class OutputOptions:
 
 def render_frame(
     scene: Renderable, camera: Cameras, time: float | TimeStep | None = None, options: DrawOptions | None = None
-) -> Frame:
+) -> DrawnImage:
     """Render one camera, without gradients.
 
     ``time``: in [0, 1], or the scene at that time, so that it is not computed again. ``options``: None: those of the
-    scene; ``depth`` other than "none" fills ``Frame.depth``.
+    scene; ``depth`` other than "none" fills ``DrawnImage.depth``.
     """
     with torch.no_grad():
         rendering = scene.render(camera, time, options=options)
     depth = None if rendering.depth is None else rendering.depth[0].cpu().numpy()
-    return Frame(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
+    return DrawnImage(rendering.rgb[0].clamp(0, 1).cpu().numpy(), rendering.alpha[0].cpu().numpy(), depth)
 
 
-def path_frames(scene: Renderable, path: CameraPath, options: DrawOptions | None = None) -> Iterator[Frame]:
+def path_frames(scene: Renderable, path: CameraPath, options: DrawOptions | None = None) -> Iterator[DrawnImage]:
     """Yield the frames along a path one by one, so that memory does not grow with their number.
 
     The scene is deformed only where the time differs from that of the frame before. A path without times shows time 0.
@@ -193,7 +193,7 @@ class _FrameWriter:
         if problem[0] is None and self._output.video is not None:
             self.written.append(self._output.video)
 
-    def write(self, stem: str, frame: Frame) -> None:
+    def write(self, stem: str, frame: DrawnImage) -> None:
         rgb = to_uint8(frame.rgb)
         if self._video is not None:
             self._size = self._size or rgb.shape

@@ -19,7 +19,7 @@ from dyngs.camera import Cameras
 from dyngs.config import SceneModel
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import ColourNetwork, Frame, network_of
+from dyngs.gaussians.colour.network import ColourNetwork, RestFrame, network_of
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.checkpoint import Checkpoint
@@ -37,7 +37,7 @@ class GaussianTimeStep(TimeStep):
 
     gaussians: Gaussians
     time: float | None = None
-    frame: Frame | None = None  # where the Gaussians are at rest, if colours follow a body
+    frame: RestFrame | None = None  # where the Gaussians are at rest, if colours follow a body
     # differentiable regularizers, weighted, by name; empty outside training
     penalties: dict[str, Tensor] = field(default_factory=dict)
 

@@ -65,7 +65,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Limit:
+class SearchLimit:
     """Why no more of one kind of thing was taken."""
 
     kind: str  # of thing, a key of ``ALLOWED``
@@ -85,7 +85,7 @@ class Found:
 
     # candidates that keep the promise, each smaller than the one before; the first is the run as it is
     accepted: tuple[Candidate, ...]
-    limits: tuple[Limit, ...]  # why no more was taken, by kind of thing
+    limits: tuple[SearchLimit, ...]  # why no more was taken, by kind of thing
     views: str  # that losses were measured on, for people
     trials: int  # number of fine-tuned candidates, the run as it is included
 
@@ -96,7 +96,7 @@ class Stored:
 
     candidate: Candidate
     file: CoarseFile
-    limit: Limit
+    limit: SearchLimit
 
 
 def evenly_held_out(count: int) -> tuple[int, ...]:
@@ -173,7 +173,9 @@ class Search:
                 continue
             loss = None if file.refused is None else candidate.psnr + candidate.loss - file.refused
             refused = None if loss is None else ("the next step", loss)
-            return Stored(candidate, file, Limit("precision", f"steps {file.factor:.2g} times the usual", refused))
+            return Stored(
+                candidate, file, SearchLimit("precision", f"steps {file.factor:.2g} times the usual", refused)
+            )
         raise DyngsError(f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more")
 
     def _quality(self, scene: GaussianScene) -> float:
@@ -188,7 +190,9 @@ class Search:
             "harmonics": self._fewer_harmonics,
         }
 
-    def _bisected(self, kind: str, levels: Sequence[tuple[str, Cut]], allowed: float) -> tuple[Candidate | None, Limit]:
+    def _bisected(
+        self, kind: str, levels: Sequence[tuple[str, Cut]], allowed: float
+    ) -> tuple[Candidate | None, SearchLimit]:
         """Return the last of ``levels`` that loses at most ``allowed``, as if all before it did; and why no more."""
         found, refused, low, high = None, None, 0, len(levels)
         while low < high:
@@ -205,7 +209,7 @@ class Search:
                 found, low = tried, middle + 1
             else:
                 refused, high = (name, tried.worst), middle
-        return found, Limit(kind, levels[low - 1][0] if low else "nothing", refused)
+        return found, SearchLimit(kind, levels[low - 1][0] if low else "nothing", refused)
 
     def _tried(self, cut: Cut) -> Candidate:
         self.trials += 1

@@ -32,7 +32,7 @@ from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.storage.tensors import (
     COARSENESS,
     Coding,
-    Kind,
+    TensorKind,
     Whole,
     checked_coarseness,
     coding_of,
@@ -165,7 +165,7 @@ class _Entry(_Part):
     name: str
     dtype: str
     shape: tuple[Annotated[int, Field(ge=0, le=2**40)], ...] = Field(max_length=8)
-    kind: Kind
+    kind: TensorKind
     step: float
     by_coarseness: bool
     axis: int
@@ -178,7 +178,7 @@ class _Entry(_Part):
     @property
     def stored_shape(self) -> tuple[int, ...]:
         """Shape of the stored integers: rotations are stored as three."""
-        return (*self.shape[:-1], 3) if self.kind is Kind.ROTATION else self.shape
+        return (*self.shape[:-1], 3) if self.kind is TensorKind.ROTATION else self.shape
 
 
 class _Header(_Part):

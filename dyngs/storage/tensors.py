@@ -142,7 +142,7 @@ def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     return quat_product(torch.from_numpy(left), torch.from_numpy(right)).numpy()
 
 
-class Kind(str, Enum):
+class TensorKind(str, Enum):
     """Ways to convert values to integers."""
 
     EXACT = "exact"
@@ -158,8 +158,12 @@ GAUSSIANS = tuple(field.name for field in fields(Gaussians))
 MAX_COARSENESS = 6  # most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
 COARSENESS = "gaussians.coarseness"
 _BY_COARSENESS = ("gaussians.sh_base", "gaussians.sh_rest")
-_KINDS = {"gaussians.quats": Kind.ROTATION, "gaussians.logit_opacities": Kind.OPACITY, "gaussians.sh_rest": Kind.SPARSE}
-_LIMITS = {Kind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), Kind.OPACITY: OPACITY_STEPS}
+_KINDS = {
+    "gaussians.quats": TensorKind.ROTATION,
+    "gaussians.logit_opacities": TensorKind.OPACITY,
+    "gaussians.sh_rest": TensorKind.SPARSE,
+}
+_LIMITS = {TensorKind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), TensorKind.OPACITY: OPACITY_STEPS}
 FEW = 64  # number of values up to which tensors are stored as they are
 LARGEST_HALF = 65504.0
 MOST_FAR = 1 / 8  # largest fraction of values out of the integer range; with more, all are stored as they are
@@ -180,15 +184,15 @@ FIXED_STEPS = {
 class Coding:
     """Kind and precision with which one tensor is stored."""
 
-    kind: Kind  # of its numbers
+    kind: TensorKind  # of its numbers
     step: float = 0.0  # 0 for the kinds that have none
     by_coarseness: bool = False  # the step of row i is ``2 ** coarseness[i]`` times as large
 
     def __post_init__(self) -> None:
-        has_step = self.kind not in (Kind.EXACT, Kind.HALF)
+        has_step = self.kind not in (TensorKind.EXACT, TensorKind.HALF)
         low, high = _LIMITS.get(self.kind, (SMALLEST_STEP, LARGEST_STEP))
         fits = is_step(self.step) and low <= self.step <= high if has_step else self.step == 0
-        if not fits or (self.by_coarseness and self.kind not in (Kind.GRID, Kind.SPARSE)):
+        if not fits or (self.by_coarseness and self.kind not in (TensorKind.GRID, TensorKind.SPARSE)):
             raise ValueError(f"no such coding: {self}")
 
     def steps(self, coarseness: np.ndarray | None, num_axes: int) -> Steps:
@@ -265,37 +269,37 @@ def coding_of(name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness
     is stored in half precision.
     """
     if name == POSITIVE or steps.get(group_of(name, x) or name) == 0:
-        return Coding(Kind.EXACT)
+        return Coding(TensorKind.EXACT)
     if name in FIXED_STEPS:
-        return Coding(Kind.GRID, FIXED_STEPS[name])
+        return Coding(TensorKind.GRID, FIXED_STEPS[name])
     group = group_of(name, x)
     if group is None or group not in steps:
         fits = x.dtype == torch.float32 and x.numel() > FEW and float(x.abs().max()) <= LARGEST_HALF
-        return Coding(Kind.HALF if fits else Kind.EXACT)
-    kind = _KINDS.get(name, Kind.GRID)
+        return Coding(TensorKind.HALF if fits else TensorKind.EXACT)
+    kind = _KINDS.get(name, TensorKind.GRID)
     low, high = _LIMITS.get(kind, (SMALLEST_STEP, LARGEST_STEP))
-    low = max(low, FINEST_ROTATION) if kind is Kind.ROTATION else low  # files with finer ones are still read
+    low = max(low, FINEST_ROTATION) if kind is TensorKind.ROTATION else low  # files with finer ones are still read
     step = step_below(min(max(steps[group], low), high))
-    if kind in (Kind.GRID, Kind.SPARSE) and int((x.abs() >= LIMIT * step).sum()) > MOST_FAR * x.numel():
-        return Coding(Kind.EXACT)
+    if kind in (TensorKind.GRID, TensorKind.SPARSE) and int((x.abs() >= LIMIT * step).sum()) > MOST_FAR * x.numel():
+        return Coding(TensorKind.EXACT)
     return Coding(kind, step, by_coarseness and name in _BY_COARSENESS)
 
 
 def to_whole(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Whole:
     """Return ``x`` as integers; ``coarseness`` (N,) of its rows, where they have any."""
     values, far = x.detach().contiguous().numpy(), np.zeros((0, 2), dtype=np.int64)
-    if coding.kind is Kind.ROTATION:
+    if coding.kind is TensorKind.ROTATION:
         numbers = rotations_to_grid(values, coding.step)
-    elif coding.kind is Kind.OPACITY:
+    elif coding.kind is TensorKind.OPACITY:
         numbers = opacities_to_grid(values, coding.step)
-    elif coding.kind in (Kind.GRID, Kind.SPARSE):
+    elif coding.kind in (TensorKind.GRID, TensorKind.SPARSE):
         steps = coding.steps(coarseness, values.ndim)
-        numbers, out = to_grid(values, steps, SPARSE if coding.kind is Kind.SPARSE else NEAREST)
+        numbers, out = to_grid(values, steps, SPARSE if coding.kind is TensorKind.SPARSE else NEAREST)
         index = np.flatnonzero(out)
         bits = values.astype(np.float32).ravel()[index].view(np.int32)
         far = np.stack([index, bits.astype(np.int64)], axis=1)
     else:
-        numbers = _bits(values.astype(np.float16) if coding.kind is Kind.HALF else values)
+        numbers = _bits(values.astype(np.float16) if coding.kind is TensorKind.HALF else values)
     return Whole(numbers.astype(np.int64), far)
 
 
@@ -304,11 +308,11 @@ def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.
 
     Raises ValueError, OverflowError: numbers that ``to_whole`` does not make.
     """
-    if coding.kind is Kind.ROTATION:
+    if coding.kind is TensorKind.ROTATION:
         return torch.from_numpy(rotations_from_grid(whole.numbers, coding.step)).to(dtype)
-    if coding.kind is Kind.OPACITY:
+    if coding.kind is TensorKind.OPACITY:
         return torch.from_numpy(opacities_from_grid(whole.numbers, coding.step)).to(dtype)
-    if coding.kind in (Kind.GRID, Kind.SPARSE):
+    if coding.kind in (TensorKind.GRID, TensorKind.SPARSE):
         steps = coding.steps(coarseness, whole.numbers.ndim)
         # numbers that were laid out by columns are no flat array until they are copied into one
         values = np.ascontiguousarray(from_grid(whole.numbers, steps), dtype=np.float32)
@@ -316,7 +320,7 @@ def from_whole(whole: Whole, coding: Coding, dtype: torch.dtype, coarseness: np.
             raise ValueError("a value lies outside its tensor")
         values.reshape(-1)[whole.far[:, 0]] = whole.far[:, 1].astype(np.int32).view(np.float32)
         return torch.from_numpy(values).to(dtype)
-    stored = torch.float16 if coding.kind is Kind.HALF else dtype
+    stored = torch.float16 if coding.kind is TensorKind.HALF else dtype
     return _from_bits(whole.numbers, stored).to(dtype)
 
 

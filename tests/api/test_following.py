@@ -110,13 +110,14 @@ def test_four_do_so_too_and_write_one_run(moving: Path, still: Path, tmp_path: P
 
 
 def test_two_views_for_each_process_differ_by_rounding(still: Path, tmp_path: Path) -> None:
+    """Rotations aside: of the first Gaussians, which are round, their gradient is rounding, of which Adam makes steps."""
     few = {"batch_size": 4, "steps": 3}
     codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "two", **few)])
     assert codes == [0, 0], said
     train(_still(still, tmp_path / "one", **few))
     one, two = (latest_checkpoint(tmp_path / name).part("gaussians") for name in ("one", "two"))
-    for name, x in one.items():
-        torch.testing.assert_close(x, two[name], rtol=1e-4, atol=1e-5)
+    for name in one.keys() - {"quats"}:
+        torch.testing.assert_close(one[name], two[name], rtol=1e-4, atol=1e-5)
 
 
 def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Path) -> None:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import pycolmap
 import pytest
 
-from dyngs.capture.sfm_mapping import Model, better
+from dyngs.capture.sfm_mapping import SfmModel, better
 
 
-def _model(focal: float, known: bool = False) -> Model:
+def _model(focal: float, known: bool = False) -> SfmModel:
     found = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, 480, 270)
     camera.has_prior_focal_length = known
     found.add_camera(camera)
-    return Model(found, "global", 1.0)
+    return SfmModel(found, "global", 1.0)
 
 
 @pytest.mark.parametrize(("focal", "known", "real"), [(400, False, True), (6100, False, False), (6100, True, True)])

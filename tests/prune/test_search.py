@@ -10,7 +10,7 @@ from tiny_fields import busy_config
 from dyngs.config import PruneConfig
 from dyngs.kinds import assemble
 from dyngs.prune.cut import Cut
-from dyngs.prune.search import Candidate, Limit, Search, _fewest, _halved, evenly_held_out
+from dyngs.prune.search import Candidate, Search, SearchLimit, _fewest, _halved, evenly_held_out
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -54,7 +54,7 @@ def test_the_last_step_that_keeps_the_promise(
     assert (None if found is None else found.cut) == (Cut(fraction=fits[-1] / 12) if fits else None)
     assert len(tried) <= 4
     if len(fits) == 12:
-        assert limit == Limit("Gaussians", "12", None)
+        assert limit == SearchLimit("Gaussians", "12", None)
         assert str(limit) == "Gaussians: 12; there was no more to try"
     else:
         assert limit.refused is not None

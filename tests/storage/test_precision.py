@@ -15,7 +15,7 @@ from dyngs.gaussians.rendering import render
 from dyngs.state import part_of
 from dyngs.static.scene import StaticScene
 from dyngs.storage.precision import Draw, Precision, assumed_precision, coarseness_of, measured_precision
-from dyngs.storage.tensors import MAX_COARSENESS, Kind, coding_of, completed, drawable, restored
+from dyngs.storage.tensors import MAX_COARSENESS, TensorKind, coding_of, completed, drawable, restored
 
 
 def tensors() -> dict[str, Tensor]:
@@ -116,7 +116,7 @@ def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
     assert precision.change is not None
     assert precision.change <= 0.01
     means = drawable(scene_of(far))["gaussians.means"]
-    assert coding_of("gaussians.means", means, precision.steps).kind is Kind.EXACT
+    assert coding_of("gaussians.means", means, precision.steps).kind is TensorKind.EXACT
 
 
 def test_a_image_that_is_not_finite_is_not_within_what_is_allowed() -> None:

@@ -39,7 +39,7 @@ from dyngs.storage.tensors import (
     ROTATION_STEP,
     SPARSE,
     Coding,
-    Kind,
+    TensorKind,
     Whole,
     checked_coarseness,
     coding_of,
@@ -66,42 +66,42 @@ def test_names_decide() -> None:
     x = torch.ones(100, 3)
     groups = ("gaussians.means", "gaussians.sh_rest", "model.field.learned.weight")
     steps: dict[str, float] = dict.fromkeys(groups, 0.01)
-    assert coding_of("gaussians.means", x, steps).kind is Kind.GRID
-    assert coding_of("gaussians.sh_rest", x, steps).kind is Kind.SPARSE
-    assert coding_of("model.field.learned.weight12", x, steps).kind is Kind.GRID
-    assert coding_of("model.field.learned.space0", x, steps).kind is Kind.HALF
-    assert coding_of("model.field.learned.space0", 1e6 * x, steps).kind is Kind.EXACT
-    assert coding_of("model.field.box", torch.ones(2, 3), {"model.field.box": 1.0}).kind is Kind.EXACT
-    assert coding_of("model.rows", torch.arange(100), {}).kind is Kind.EXACT
+    assert coding_of("gaussians.means", x, steps).kind is TensorKind.GRID
+    assert coding_of("gaussians.sh_rest", x, steps).kind is TensorKind.SPARSE
+    assert coding_of("model.field.learned.weight12", x, steps).kind is TensorKind.GRID
+    assert coding_of("model.field.learned.space0", x, steps).kind is TensorKind.HALF
+    assert coding_of("model.field.learned.space0", 1e6 * x, steps).kind is TensorKind.EXACT
+    assert coding_of("model.field.box", torch.ones(2, 3), {"model.field.box": 1.0}).kind is TensorKind.EXACT
+    assert coding_of("model.rows", torch.arange(100), {}).kind is TensorKind.EXACT
     assert group_of("model.times", torch.ones(100, dtype=torch.float64)) is None
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.int32, torch.uint8, torch.bool, torch.float32, torch.float64])
 def test_exact_is_exact(dtype: torch.dtype) -> None:
     x = (torch.randn(5, 4, generator=torch.Generator().manual_seed(0)) * 3).abs().to(dtype)
-    back = restored(x, Coding(Kind.EXACT))
+    back = restored(x, Coding(TensorKind.EXACT))
     assert back.dtype == dtype
     assert torch.equal(back, x)
 
 
 def test_half_has_eleven_bits() -> None:
     x = torch.randn(1000, generator=torch.Generator().manual_seed(0))
-    assert ((restored(x, Coding(Kind.HALF)) - x).abs() <= 2.0**-11 * x.abs() + 2.0**-24).all()
+    assert ((restored(x, Coding(TensorKind.HALF)) - x).abs() <= 2.0**-11 * x.abs() + 2.0**-24).all()
 
 
 def test_far_values_are_exact() -> None:
     x = torch.tensor([0.3, 1e30, -3e8, 5.0])
-    whole = to_whole(x, Coding(Kind.GRID, 0.5))
+    whole = to_whole(x, Coding(TensorKind.GRID, 0.5))
     assert whole.far[:, 0].tolist() == [1, 2]
-    assert from_whole(whole, Coding(Kind.GRID, 0.5), torch.float32).tolist() == [0.5, *x[1:].tolist()]
+    assert from_whole(whole, Coding(TensorKind.GRID, 0.5), torch.float32).tolist() == [0.5, *x[1:].tolist()]
 
 
 def test_what_hardly_shows_is_stored_more_coarsely() -> None:
     x = torch.full((3, 2), 0.7)
-    back = restored(x, Coding(Kind.GRID, 0.125, by_coarseness=True), np.array([0, 1, 3]))
+    back = restored(x, Coding(TensorKind.GRID, 0.125, by_coarseness=True), np.array([0, 1, 3]))
     torch.testing.assert_close(back[:, 0], torch.tensor([0.75, 0.75, 1.0]))
     with pytest.raises(ValueError, match="lacks"):
-        restored(x, Coding(Kind.GRID, 0.125, by_coarseness=True))
+        restored(x, Coding(TensorKind.GRID, 0.125, by_coarseness=True))
 
 
 @pytest.mark.parametrize("values", [torch.tensor([0, 7]), torch.tensor([-1, 0]), torch.tensor([0])])
@@ -110,9 +110,11 @@ def test_coarseness_is_checked(values: torch.Tensor) -> None:
         checked_coarseness(values, 2)
 
 
-@given(st.sampled_from(list(Kind)), st.floats(allow_nan=True, allow_infinity=True) | st.just(0.03125), st.booleans())
+@given(
+    st.sampled_from(list(TensorKind)), st.floats(allow_nan=True, allow_infinity=True) | st.just(0.03125), st.booleans()
+)
 @settings(deadline=None, max_examples=40)
-def test_a_coding_is_sound_or_refused(kind: Kind, step: float, by_coarseness: bool) -> None:
+def test_a_coding_is_sound_or_refused(kind: TensorKind, step: float, by_coarseness: bool) -> None:
     try:
         coding = Coding(kind, step, by_coarseness)
     except ValueError:
@@ -138,11 +140,11 @@ def test_far_values_are_exact_in_columns_too() -> None:
     """Columns that repeat make ``packed`` lay the numbers out by columns."""
     x = torch.arange(3.0).repeat(400, 1) * 100
     x[7, 1], x[399, 2] = 3e9, -4e20
-    whole = to_whole(x, Coding(Kind.GRID, 0.5))
+    whole = to_whole(x, Coding(TensorKind.GRID, 0.5))
     packing, data = packed(whole.numbers)
     assert not packing.by_rows
     numbers = unpacked(packing, data, (400, 3))
-    assert torch.equal(from_whole(Whole(numbers, whole.far), Coding(Kind.GRID, 0.5), torch.float32), x)
+    assert torch.equal(from_whole(Whole(numbers, whole.far), Coding(TensorKind.GRID, 0.5), torch.float32), x)
 
 
 NUMBERS = st.floats(-3, 3, width=32) | st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -174,14 +176,14 @@ def test_any_tensor_comes_back_within_its_bound(x: torch.Tensor, name: str, step
     coding = coding_of(name, x, {} if group is None else {group: step}, by_coarseness=by_coarseness)
     rows = np.arange(len(x)) % (MAX_COARSENESS + 1) if coding.by_coarseness else None
     error = (read_again(x, coding, rows).double() - x.double()).abs()
-    if coding.kind is Kind.EXACT:
+    if coding.kind is TensorKind.EXACT:
         assert torch.equal(error, torch.zeros_like(error))
-    elif coding.kind is Kind.HALF:
+    elif coding.kind is TensorKind.HALF:
         assert float(x.abs().max()) <= LARGEST_HALF
         assert bool((error <= 2.0**-11 * x.double().abs() + 2.0**-25).all())
     else:
         steps = torch.as_tensor(coding.steps(rows, x.ndim)).double()
-        fraction = 0.65 if coding.kind is Kind.SPARSE else 0.5
+        fraction = 0.65 if coding.kind is TensorKind.SPARSE else 0.5
         assert is_step(coding.step)
         assert bool((error <= fraction * steps * (1 + 1e-12)).all())
         assert bool((error[(x.double().abs() >= LIMIT * steps)] == 0).all())
@@ -196,7 +198,7 @@ def test_any_other_tensor_comes_back_as_it_was(dtype: torch.dtype, source: st.Da
     x = torch.from_numpy(bits)
     x = (x.view(dtype) if dtype.itemsize == 8 else x.to(dtype)).nan_to_num()
     coding = coding_of("model.anything", x, {})
-    assert coding.kind is Kind.EXACT
+    assert coding.kind is TensorKind.EXACT
     assert torch.equal(read_again(x, coding), x)
 
 

@@ -40,7 +40,7 @@ class Blob:
 
 
 @dataclass(frozen=True)
-class Silhouette:
+class ChangedRegion:
     """Change that one camera sees at one time."""
 
     projection: np.ndarray  # (3, 4) matrix from the world to homogeneous pixels
@@ -98,9 +98,9 @@ class Silhouette:
         return partly | around, wholly & (masked == 0), (partly & (changing > 0)) | around
 
 
-def silhouettes_at(footage: Sequence[Footage], time: float) -> list[Silhouette]:
+def silhouettes_at(footage: Sequence[Footage], time: float) -> list[ChangedRegion]:
     """Return what the cameras that took an image at ``time`` saw to change then."""
-    found: list[Silhouette] = []
+    found: list[ChangedRegion] = []
     for one in footage:
         if time not in one.times:
             continue
@@ -108,11 +108,11 @@ def silhouettes_at(footage: Sequence[Footage], time: float) -> list[Silhouette]:
         pose = one.camera.cam_from_world[0].double().cpu().numpy()[:3]
         projection = one.camera.intrinsics[0].double().cpu().numpy() @ pose
         sums, masked = (np.pad(x.cumsum(0).cumsum(1), ((1, 0), (1, 0))) for x in (one.changed[i], ~one.counted[i]))
-        found.append(Silhouette(projection, one.images[i], one.changed[i], one.counted[i], sums, masked))
+        found.append(ChangedRegion(projection, one.images[i], one.changed[i], one.counted[i], sums, masked))
     return found
 
 
-def blobs_in(views: Sequence[Silhouette], low: np.ndarray, high: np.ndarray) -> list[Blob]:
+def blobs_in(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndarray) -> list[Blob]:
     """Return the connected parts of the visual hull of what ``views`` see to change, in the box ``low`` to ``high``."""
     if len(views) < 2:
         return []
@@ -138,7 +138,7 @@ def blobs_in(views: Sequence[Silhouette], low: np.ndarray, high: np.ndarray) -> 
     return [_blob(views, centers[part], side) for part in parts]
 
 
-def _may_hold(views: Sequence[Silhouette], centers: np.ndarray, side: float) -> np.ndarray:
+def _may_hold(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) -> np.ndarray:
     """Return (C,) bool: whether any part of a cube may satisfy ``_agreed``."""
     seeing, whole, agreeing = np.zeros((3, len(centers)), int)
     for view in views:
@@ -149,7 +149,7 @@ def _may_hold(views: Sequence[Silhouette], centers: np.ndarray, side: float) -> 
     return (agreeing >= min(ENOUGH_VIEWS, len(views))) & (whole <= np.floor(MISSING_FRACTION * seeing))
 
 
-def _agreed(views: Sequence[Silhouette], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _agreed(views: Sequence[ChangedRegion], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (C,) numbers of cameras that see a change at ``points``, and whether they are enough."""
     seeing, agreeing = np.zeros((2, len(points)), int)
     for view in views:
@@ -160,7 +160,7 @@ def _agreed(views: Sequence[Silhouette], points: np.ndarray) -> tuple[np.ndarray
     return agreeing, enough
 
 
-def _largest_px(views: Sequence[Silhouette], centers: np.ndarray, side: float) -> float:
+def _largest_px(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) -> float:
     """Return the pixels that ``side`` covers in the middle of ``centers``: the median over the cameras."""
     middle = np.median(centers, axis=0)
     depths = [max(float(view.pixels(middle[None])[1][0]), NEAR) for view in views]
@@ -202,7 +202,7 @@ def _solid(group: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
     return group
 
 
-def _blob(views: Sequence[Silhouette], points: np.ndarray, side: float) -> Blob:
+def _blob(views: Sequence[ChangedRegion], points: np.ndarray, side: float) -> Blob:
     colors: list[np.ndarray] = []
     for view in views:
         _, changes = view.seen(points)

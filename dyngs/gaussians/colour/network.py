@@ -24,7 +24,7 @@ from dyngs.tensor_checks import require_positive, require_tensor
 
 
 @dataclass(frozen=True)
-class Frame:
+class RestFrame:
     """Rest pose of a moving body, which its colours follow."""
 
     places: Tensor  # (N, 3) centres of the drawn Gaussians at rest
@@ -52,7 +52,7 @@ class ColourNetwork:
             tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}
         return with_role(tensors, Role.SHARED)
 
-    def shader(self, time: float | None, frame: Frame | None = None) -> Shader:
+    def shader(self, time: float | None, frame: RestFrame | None = None) -> Shader:
         """Return the shader at ``time`` (clamped to [0, 1], None is 0); ``frame`` for Gaussians on a body."""
 
         def colors(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ class ColourNetwork:
         return colors
 
     def _seen_from(
-        self, gaussians: Gaussians, center: Tensor, drawn: Tensor, time: float | None, frame: Frame | None
+        self, gaussians: Gaussians, center: Tensor, drawn: Tensor, time: float | None, frame: RestFrame | None
     ) -> Tensor:
         """Return (N, 3) colours seen from ``center``; zero, and not computed, for those that are not ``drawn`` (N,)."""
         rows, dtype = torch.nonzero(drawn)[:, 0], gaussians.means.dtype

@@ -38,7 +38,7 @@ class MeasuredView:
 
 
 @dataclass(frozen=True)
-class Finding:
+class ViewDependence:
     """The Gaussians whose view dependence is worth its cost."""
 
     keeps: Tensor  # (N,) bool, Gaussians whose harmonics stay
@@ -63,7 +63,7 @@ def find_view_dependent(
     options: RenderOptions,
     background: Tensor,
     tolerance: float,
-) -> Finding:
+) -> ViewDependence:
     """Return the Gaussians whose harmonics are worth their cost, and the colours of the others."""
     means, changes = _mean_and_change(seen, options)
     errors, worths = [], torch.zeros(len(changes), device=changes.device)
@@ -79,7 +79,7 @@ def find_view_dependent(
     without, with_all = (math.fsum(column) for column in zip(*errors, strict=True))
     keeps = first_worthwhile(changes, worths, without, tolerance)
     kept = math.fsum(_squared_error(x, means, keeps.float(), options, background).item() for x in held_out)
-    return Finding(keeps, means, _decibels(without, with_all), _decibels(without, kept))
+    return ViewDependence(keeps, means, _decibels(without, with_all), _decibels(without, kept))
 
 
 def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import Frame
+from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
@@ -156,7 +156,7 @@ class HumanScene(GaussianScene):
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
         offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
-        return GaussianTimeStep(gaussians, time, Frame(self.gaussians.means, posing.rotations[0]))
+        return GaussianTimeStep(gaussians, time, RestFrame(self.gaussians.means, posing.rotations[0]))
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.

@@ -13,7 +13,7 @@ from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import Frame
+from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianTimeStep
@@ -83,7 +83,7 @@ class HumanTraining(SceneTraining[HumanScene]):
             if scene.light is not None:
                 penalties["sides"] = SIDES_WEIGHT * difference_of_sides(scene.gaussians, *self._images_in(scene))
         penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
-        frame = Frame(scene.gaussians.means, posing.rotations[0])
+        frame = RestFrame(scene.gaussians.means, posing.rotations[0])
         return GaussianTimeStep(gaussians, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:

@@ -14,7 +14,7 @@ from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import (
     ColourNetwork,
-    Frame,
+    RestFrame,
     box_around,
     network_of,
 )
@@ -118,7 +118,7 @@ def test_colours_turn_with_a_body() -> None:
     gaussians = plain(scene.gaussians)
     turn = rotation_matrices(torch.tensor([[0.3, 0.5, -0.2, 0.7]], dtype=torch.float64))[0]
     shown = torch.ones(2, 5, 2, dtype=torch.int32)
-    at_rest = net.shader(None, Frame(gaussians.means, torch.eye(3, dtype=torch.float64)))
+    at_rest = net.shader(None, RestFrame(gaussians.means, torch.eye(3, dtype=torch.float64)))
     w, x, y, z = torch.nn.functional.normalize(torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), dim=0)
     a, b, c, d = gaussians.quats.unbind(1)
     quats = [
@@ -131,7 +131,7 @@ def test_colours_turn_with_a_body() -> None:
     world_from_world = torch.eye(4, dtype=torch.float64)
     world_from_world[:3, :3], world_from_world[:3, 3] = turn, 2.0
     cameras = replace(scene.cameras, cam_from_world=scene.cam_from_world @ torch.linalg.inv(world_from_world))
-    now = net.shader(None, Frame(gaussians.means, turn))(moved, cameras, shown)
+    now = net.shader(None, RestFrame(gaussians.means, turn))(moved, cameras, shown)
     torch.testing.assert_close(now, at_rest(gaussians, scene.cameras, shown))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.view_dependence import Finding, MeasuredView, find_view_dependent, first_worthwhile
+from dyngs.gaussians.colour.view_dependence import MeasuredView, ViewDependence, find_view_dependent, first_worthwhile
 from dyngs.gaussians.rendering import RenderOptions, render
 
 BLACK = torch.zeros(3)
@@ -43,7 +43,7 @@ def looks(angles: list[float], model: Gaussians, truth: Gaussians, mask: Tensor 
     return [MeasuredView(model, camera(a), render(truth, camera(a)).rgb[0], mask) for a in angles]
 
 
-def find(model: Gaussians, truth: Gaussians, tolerance: float = 0.05, mask: Tensor | None = None) -> Finding:
+def find(model: Gaussians, truth: Gaussians, tolerance: float = 0.05, mask: Tensor | None = None) -> ViewDependence:
     seen = looks([0.37 * i for i in range(17)], model, truth)
     held_out = looks([0.1 + 0.9 * i for i in range(7)], model, truth, mask)
     return find_view_dependent(seen, held_out, RenderOptions(), BLACK, tolerance)
@@ -111,13 +111,13 @@ def test_the_fewest_that_are_worth_nearly_everything(seed: int, count: int, tole
 
 def test_in_words() -> None:
     keeps = torch.arange(100) < 12
-    some = Finding(keeps, torch.zeros(100, 3), 0.35, 0.31)
+    some = ViewDependence(keeps, torch.zeros(100, 3), 0.35, 0.31)
     assert str(some) == (
         "view dependence pays for 12% of the Gaussians: +0.31 dB on held-out training views (for all of them: +0.35 dB)"
     )
-    none = Finding(keeps & False, torch.zeros(100, 3), -0.1, 0.0)
+    none = ViewDependence(keeps & False, torch.zeros(100, 3), -0.1, 0.0)
     assert str(none) == "view dependence does not pay (-0.10 dB on held-out training views): none is stored"
-    assert "does not pay" in str(Finding(torch.zeros(0, dtype=torch.bool), torch.zeros(0, 3), 0.0, 0.0))
+    assert "does not pay" in str(ViewDependence(torch.zeros(0, dtype=torch.bool), torch.zeros(0, 3), 0.0, 0.0))
 
 
 def test_it_does_not_touch_what_it_looks_at() -> None:
