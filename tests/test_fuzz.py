@@ -29,16 +29,16 @@ def fuzz(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """100 changed inputs for each reader: counts, and failures with what is known of them."""
+    """40 changed inputs for each reader: counts, and failures with what is known of them."""
     report = tmp_path_factory.mktemp("fuzz") / "report.json"
-    fuzz("all", "--inputs", "100", "--seed", "0", "--json", str(report))
+    fuzz("all", "--inputs", "40", "--seed", "0", "--json", str(report))
     return json.loads(report.read_text())
 
 
 def test_changed_inputs_are_read_or_refused(tried: dict[str, Any]) -> None:
     assert {name: own["failures"] for name, own in tried.items() if own["failures"]} == {}
     # Few inputs cannot be made; none of these counts.
-    assert {name: own["inputs"] for name, own in tried.items() if own["inputs"] <= 95} == {}
+    assert {name: own["inputs"] for name, own in tried.items() if own["inputs"] <= 38} == {}
     # Of a log, lines that are not whole are left out: hardly any is refused.
     assert [name for name, own in tried.items() if not own["refused"]] in ([], ["logs"])
 

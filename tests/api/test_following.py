@@ -110,7 +110,7 @@ def test_four_do_so_too_and_write_one_run(moving: Path, still: Path, tmp_path: P
 
 
 def test_two_views_for_each_process_differ_by_rounding(still: Path, tmp_path: Path) -> None:
-    """Rotations aside: of the first Gaussians, which are round, their gradient is rounding, of which Adam makes steps."""
+    """Rotations aside: of Gaussians that are round, their gradient is rounding, of which Adam makes full steps."""
     few = {"batch_size": 4, "steps": 3}
     codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "two", **few)])
     assert codes == [0, 0], said

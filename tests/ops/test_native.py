@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from emulated_gpu import compiled, compiler, emulated_kernels, session_folder
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import active_isa, array, built_isas, choose_isa, core, core_for, kernel_threads, num_threads
@@ -134,35 +133,6 @@ def test_formulas_need_no_library_but_the_mathematical_one() -> None:
         assert set(re.findall(r"#include <(\S+)>", text)) <= allowed, header.name
         assert all(f.startswith("math/") for f in re.findall(r'#include "(\S+)"', text)), header.name
         assert not re.findall(r"\bnew\b *[\w(\[]|malloc|vector_size|#pragma omp", text), header.name
-
-
-@pytest.mark.parametrize("name", ["test_math", "test_formulas"])
-def test_formulas_in_cpp(tmp_path: Path, name: str) -> None:
-    """csrc/tests/*.cpp without kernels, built without Python, as by the CMake option DYNGS_TESTS."""
-    program, source = tmp_path / name, ROOT / f"csrc/tests/{name}.cpp"
-    # GNU dialect and contraction as in CMakeLists.txt
-    flags = ["-std=gnu++20", "-O1", "-ffp-contract=fast", "-w", f"-I{ROOT / 'csrc'}"]
-    subprocess.run([compiler(), *flags, str(source), "-o", str(program)], check=True, timeout=100)
-    done = subprocess.run([str(program)], capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0, done.stdout
-    assert "all passed" in done.stdout
-
-
-def test_cuda_kernels_in_cpp(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """csrc/tests/test_cuda_*.cpp: the kernels of csrc/cuda as plain C++, run by an emulation, against csrc/cpu."""
-    tests = [ROOT / f"csrc/tests/test_cuda_{name}.cpp" for name in ("emulator", "render", "train", "deform", "network")]
-    cpu = sorted((ROOT / "csrc/cpu").glob("*.cpp"))
-    # nothing contracted, as in CMakeLists.txt; what hardly takes time to run is compiled quickly
-    common = ("core/api.hpp", "cpu/parallel.hpp", "cpu/simd.hpp", "tests/check.hpp")
-    objects = compiled(tmp_path, [*tests, *cpu], ["-ffp-contract=off", "-fopenmp", "-O0"], common)
-    emulated = emulated_kernels(session_folder(tmp_path_factory))
-    for test, own in zip(tests, objects, strict=False):
-        program = tmp_path / test.stem
-        parts = [own, *emulated, *objects[len(tests) :]]
-        subprocess.run([compiler(), "-fopenmp", *parts, "-o", str(program)], check=True, timeout=300)
-        done = subprocess.run([str(program)], capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "all passed" in done.stdout
 
 
 # --- after a fork -----------------------------------------------------------------------------------------------------
