@@ -161,3 +161,9 @@ class EditResult:
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     zero_moments: frozenset[str] = frozenset()  # fields whose optimizer moments start anew in every row
     finding: str | None = None  # a line for people about why, or None
+
+    def with_rows_in(self, order: Tensor) -> EditResult:
+        """Return the same change with the rows of the new set in ``order`` (N_new,)."""
+        edit = self.edit
+        moved = None if edit is None else TopologyEdit(edit.source[order], edit.is_new[order])
+        return replace(self, edit=moved, changes={name: x[order] for name, x in self.changes.items()})

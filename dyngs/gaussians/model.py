@@ -18,6 +18,7 @@ from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, Traini
 from dyngs.gaussians.colour.view_dependence import MeasuredView
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import GaussianOptimizer
+from dyngs.gaussians.order import morton_order
 from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
@@ -197,7 +198,7 @@ class GaussianModel(Model[GaussianScene]):
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:
-            self._apply(result)
+            self._apply(self._in_memory_order(result))
         self.densifier.perturb(self._optimizer.parameters, lr_means, generator)
         self._scene = self.training.after_step(self._scene, step, result is not None)
         revised = self.training.revised(self._scene, step)
@@ -283,6 +284,13 @@ class GaussianModel(Model[GaussianScene]):
         if result.edit is not None:
             self.colours.follow(result.edit)
             self.training.follow(result.edit)
+
+    def _in_memory_order(self, result: EditResult) -> EditResult:
+        """Return the same change with neighbours in space next to each other: kernels read rows that are in a cache."""
+        if result.edit is None:
+            return result
+        means = result.changes.get("means", result.edit.apply(self._optimizer.parameters.means.detach()))
+        return result.with_rows_in(torch.from_numpy(morton_order(means.cpu().numpy())).to(means.device))
 
     def _measured_harmonics(self, step: int) -> str | None:
         """Drop harmonics that do not pay, if it is time to measure that; return a line about what was found."""

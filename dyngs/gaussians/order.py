@@ -1,4 +1,4 @@
-"""The order in which files hold Gaussians: neighbours in space are neighbours there, and predict each other."""
+"""The order of Gaussians in memory and in files: neighbours in space are neighbours there, and predict each other."""
 
 from __future__ import annotations
 
@@ -7,6 +7,14 @@ import numpy as np
 MORTON_BITS = 20  # Bits per coordinate; 60 in all
 INNER, OUTLYING = 0.01, 64.0
 """Quantile and multiple of the box: points farther out than so many of its sides count as its edge."""
+SPREADING = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that put two zeros before every bit of a number of up to 21 bits."""
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
@@ -20,11 +28,10 @@ def morton_order(points: np.ndarray) -> np.ndarray:
         places = places.clip(inner_low - reach, inner_high + reach)
     low = places.min(0)
     side = max(float((places.max(0) - low).max()), np.finfo(np.float64).tiny)
-    cells = ((places - low) / side * (2**MORTON_BITS - 1)).astype(np.uint64)
-    code = np.zeros(len(points), dtype=np.uint64)
-    for bit in range(MORTON_BITS):
-        for axis in range(3):
-            code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    bits = ((places - low) / side * (2**MORTON_BITS - 1)).astype(np.uint64)
+    for shift, mask in SPREADING:
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    code = bits[:, 0] | bits[:, 1] << np.uint64(1) | bits[:, 2] << np.uint64(2)
     return np.argsort(code, kind="stable")
 
 
