@@ -20,8 +20,8 @@ from dyngs.files.write import write_image, write_text
 CaptureStyle = Literal["teleport", "moving", "fixed"]
 """One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all times."""
 
-_FRONT_DEG, _SECTOR_DEG = -45.0, 64.0  # azimuth from which corners and fixed cameras are seen, and its whole range
-_SWEEP_DEG = 60.0  # of the moving camera
+_FRONT_DEG, _SECTOR_DEG = -45.0, 64.0
+"""Middle and range of the azimuths of fixed and moving cameras, and of all that look into a corner."""
 
 
 @dataclass(frozen=True)
@@ -158,14 +158,14 @@ def _write_split(
 def _single_shots(options: DynamicOptions, style: CaptureStyle, in_front: bool) -> dict[str, list[_Shot]]:
     """One image per training time, by cameras in random order or on a smooth arc; the validation camera is fixed.
 
-    Test cameras lie on an orbit, or ``in_front`` on an arc; those of a moving camera are one, above its middle.
+    Test cameras lie on an orbit, or ``in_front`` on an arc; a moving camera is tested by a fixed one in its middle.
     """
-    random, count = np.random.default_rng(options.seed), options.num_test
+    random, count, gaps = np.random.default_rng(options.seed), options.num_test, max(options.num_times - 1, 1)
     if style == "moving":
-        start = _FRONT_DEG + random.uniform(-2.0, 2.0)
+        count, middle_deg = min(count, gaps), _FRONT_DEG + random.uniform(-2.0, 2.0)
         along = np.array(_even_times(options.num_times)) - 0.5
-        train = _poses(options.distance, start + _SWEEP_DEG * along, 20.0 + 5.0 * np.sin(2 * np.pi * along))
-        fixed = _poses(options.distance, np.array([start]), np.array([28.0]))
+        train = _poses(options.distance, middle_deg + _SECTOR_DEG * along, 20.0 + 5.0 * np.sin(2 * np.pi * along))
+        fixed = _poses(options.distance, np.array([middle_deg]), np.array([28.0]))
         test = np.repeat(fixed, count, axis=0)
     else:
         train = hemisphere_cameras(options.num_times, options.distance, options.seed, in_front)
@@ -176,7 +176,6 @@ def _single_shots(options: DynamicOptions, style: CaptureStyle, in_front: bool) 
             azimuths_deg = _FRONT_DEG + 0.8 * _SECTOR_DEG * (np.array(_even_times(count)) - 0.5)
             test = _poses(options.distance, azimuths_deg, np.full(count, 28.0))
     poses = {"train": train, "val": np.repeat(fixed, options.num_val, axis=0), "test": test}
-    gaps = max(options.num_times - 1, 1)
     times = {
         "train": _even_times(options.num_times),
         "val": _even_times(options.num_val),

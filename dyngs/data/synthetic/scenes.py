@@ -144,9 +144,9 @@ def _room(time: float) -> Scene:
 
 
 def _enter(time: float) -> Scene:
-    along = 4.8 * (time - 0.5) / np.sqrt(2.0)
+    along = 4.6 * (time - 0.5) / np.sqrt(2.0)
     size = 0.24
-    center = (0.4 + along, -0.4 + along, _ROOM_FLOOR + size)
+    center = (0.5 + along, -0.5 + along, _ROOM_FLOOR + size)
     return _in_corner(Box(center, (size, size, size), _die(), yaw=float(np.radians(240.0 * time)), gloss=0.3))
 
 
