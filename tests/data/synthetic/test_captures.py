@@ -86,7 +86,7 @@ def test_cameras_differ_by_seed_only_in_azimuth() -> None:
 def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(name: SceneName, tmp_path: Path) -> None:
     first, second = (write_dynamic_capture(name, tmp_path / part, TINY) for part in ("a", "b"))
     assert _files(first) == _files(second)
-    other = write_dynamic_capture(name, tmp_path / "c", DynamicOptions(**(vars(TINY) | {"seed": 1})))
+    other = write_dynamic_capture(name, tmp_path / "c", replace(TINY, seed=1))
     assert _files(other).keys() == _files(first).keys()
     assert _files(other)["transforms_train.json"] != _files(first)["transforms_train.json"]
 
