@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
-SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "human")
+SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "roll", "collide", "chain", "enter", "human")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
 _OF_A_FIT = {
     "keypoints": ("PATH", "key points: a folder of OpenPose files, or a COCO file"),
@@ -124,15 +124,19 @@ def _add_synth(verbs: args.Commands) -> None:
         "write a small synthetic scene as a capture",
         "Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it moves. still: a "
         "still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that appear, merge "
-        "and vanish. room: videos of a static room with one hopping ball, from fixed cameras. human: a walking person "
-        "from all around, with exact body parameters.",
+        "and vanish. room: videos of a static room with one hopping ball, from fixed cameras. roll: a striped ball "
+        "rolls alone. collide: two balls bounce off each other. chain: a finger of five links bends. enter: a die "
+        "slides into a room and out again. human: a walking person from all around, with exact body parameters.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
-    views = "training views; for room and human: times (default 48, for human 12)"
+    views = "training views; for fixed cameras and human: times (default 48, for human 12)"
     parser.add_argument("--views", type=int, metavar="N", help=views)
-    parser.add_argument("--cameras", type=int, metavar="N", help="training cameras for room and human (default 8)")
+    style = "of scenes that move: another camera at each time (default), one on a smooth arc, or fixed ones (room)"
+    parser.add_argument("--style", choices=("teleport", "moving", "fixed"), help=style)
+    cameras = "training cameras for human, or fixed ones of any scene that moves (default 8)"
+    parser.add_argument("--cameras", type=int, metavar="N", help=cameras)
     seed = "random seed of cameras, for human of the clothes (default 0)"
     parser.add_argument("--seed", type=int, default=0, metavar="N", help=seed)
     varied = "for human: the seed is also that of body shape, light and clip"
@@ -296,8 +300,11 @@ def run_synth(arguments: argparse.Namespace) -> int:
     cameras = 8 if arguments.cameras is None else arguments.cameras
     if size < 1 or views < 1 or seed < 0:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
-    if arguments.cameras is not None and (scene not in ("room", "human") or cameras < 1):
-        raise DyngsError("--cameras must be at least 1, and is for the scenes room and human only")
+    style = arguments.style or ("fixed" if arguments.cameras is not None else None)
+    if arguments.cameras is not None and (cameras < 1 or scene == "still" or style != "fixed"):
+        raise DyngsError("--cameras must be at least 1, and is for scenes that move, with fixed cameras")
+    if arguments.style is not None and scene in ("still", "human"):
+        raise DyngsError("--style is for scenes that move, but not for human")
     if (arguments.varied or arguments.usual_clothes) and scene != "human":
         raise DyngsError("--varied and --usual-clothes are for the scene human only")
     require_new_folder(out)
@@ -309,7 +316,7 @@ def run_synth(arguments: argparse.Namespace) -> int:
     elif scene == "still":
         synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
     else:
-        moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed)
+        moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed, style=style)
         synthetic.write_dynamic_capture(scene, out, moving)
     preset = {"still": "static", "human": "human"}.get(scene, "dynamic")
     print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")

@@ -6,15 +6,22 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, is_seen, render_movers, render_scene
-from dyngs.data.synthetic.scenes import SceneName, scene_at, still_life
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, is_seen, render_scene, render_things
+from dyngs.data.synthetic.scenes import CORNERS, SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import new_folder
 from dyngs.files.write import write_image, write_text
+
+CaptureStyle = Literal["teleport", "moving", "fixed"]
+"""One camera somewhere else at each time, one that moves smoothly, or fixed ones that each take all times."""
+
+_FRONT_DEG, _SECTOR_DEG = -45.0, 64.0
+"""Middle and range of the azimuths of fixed and moving cameras, and of all that look into a corner."""
 
 
 @dataclass(frozen=True)
@@ -46,18 +53,20 @@ class StillOptions(ImageOptions):
 class DynamicOptions(ImageOptions):
     """Options of a capture of a moving scene. The seed also assigns times to cameras.
 
-    Test images lie at times between the training times, those of ``num_val`` are of one fixed camera; in ``room``
-    both numbers only say whether there is a camera of that kind, which is never trained on.
+    Test images lie at times between the training times, those of ``num_val`` are of one fixed camera; with fixed
+    cameras both numbers only say whether there is a camera of that kind, which is never trained on.
 
     Attributes:
-        num_times: training times, evenly spaced in [0, 1]; in ``room`` each camera takes an image at each.
-        num_cameras: training cameras of ``room``.
+        num_times: training times, evenly spaced in [0, 1]; each fixed camera takes an image at each.
+        num_cameras: fixed training cameras.
+        style: how the scene is captured; None: ``room`` by fixed cameras, the others by one that teleports.
     """
 
     num_test: int = 12
     samples: int = 2
     num_times: int = 48
     num_cameras: int = 8
+    style: CaptureStyle | None = None
 
 
 @dataclass(frozen=True)
@@ -93,29 +102,36 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
 def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = DynamicOptions()) -> Path:
     """Write images of the moving scene ``name`` in the layout of D-NeRF; returns ``out``.
 
-    Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the images, RGBA with straight alpha. Each
-    time is seen by one camera somewhere else on the hemisphere. ``room`` is a video of several fixed cameras instead:
-    ``camAA/frame_BBBB.png`` without alpha, frames with ``camera``; test and val have one camera each, never trained on.
+    Files: ``transforms_SPLIT.json`` with ``time`` in [0, 1] per frame, and the images, RGBA with straight alpha, of
+    ``CORNERS`` without alpha. Each time is seen by one camera somewhere else on the hemisphere, or by one on an arc,
+    which a fixed camera in its middle tests. Fixed cameras each take all times: ``camAA/frame_BBBB.png``, frames with
+    ``camera``; test and val have one camera each, never trained on.
 
-    ``motion/`` holds a mask for each image, white where something that moves is seen, and ``true_tracks.npz`` the
-    tracks of points on it (``TrueTracks``). Frames of val and test name their mask (``motion_mask_path``), those of
-    train do not: training would take it as a prior. Raises DyngsError: no such scene, no images asked for, ``out``
-    holds something already, or cannot be written.
+    ``motion/`` holds a mask for each image, white where something that moves is seen, ``things/`` the same as labels
+    (``render_things``), and ``true_tracks.npz`` the tracks of points on it (``TrueTracks``). Frames of val and test
+    name their mask (``motion_mask_path``), those of train do not: training would take it as a prior. Raises DyngsError:
+    no such scene, no images requested, ``out`` holds something already, or cannot be written.
     """
     scene_at(name, 0.0)
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
         raise DyngsError("a synthetic capture needs size, num_times, num_cameras and samples of at least 1")
-    splits = _room_shots(options) if name == "room" else _teleporting_shots(options)
+    style = options.style or ("fixed" if name == "room" else "teleport")
+    splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style, name in CORNERS)
     taken = [(shot.name, shot.time or 0.0, shot.world_from_cam) for shots in splits.values() for shot in shots]
     with new_folder(out) as started:
         for split, shots in splits.items():
-            _write_split(started, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options)
+            _write_split(started, split, shots, lambda shot: scene_at(name, shot.time or 0.0), options, name in CORNERS)
         write_true_tracks(started, true_tracks(lambda time: scene_at(name, time), taken, options.seed))
     return out
 
 
 def _write_split(
-    out: Path, split: str, shots: Sequence[_Shot], scene_of: Callable[[_Shot], Scene], options: ImageOptions
+    out: Path,
+    split: str,
+    shots: Sequence[_Shot],
+    scene_of: Callable[[_Shot], Scene],
+    options: ImageOptions,
+    is_opaque: bool = False,
 ) -> None:
     if not shots:
         return
@@ -123,14 +139,15 @@ def _write_split(
     for shot in shots:
         scene = scene_of(shot)
         rgba = render_scene(scene, shot.world_from_cam, options.size, options.samples)
-        write_image(out / f"{shot.name}.png", rgba if shot.camera is None else rgba[..., :3])
+        write_image(out / f"{shot.name}.png", rgba[..., :3] if is_opaque else rgba)
         frame: dict[str, object] = {"file_path": f"./{shot.name}"}
         if shot.camera is not None:
             frame["camera"] = shot.camera
         if shot.time is not None:
             frame["time"] = shot.time
-            moves = render_movers(scene, shot.world_from_cam, options.size, options.samples)
-            write_image(out / "motion" / f"{shot.name}.png", moves.astype(np.uint8) * 255)
+            things = render_things(scene, shot.world_from_cam, options.size, options.samples)
+            write_image(out / "things" / f"{shot.name}.png", things)
+            write_image(out / "motion" / f"{shot.name}.png", (things > 0).astype(np.uint8) * 255)
             if split != "train":
                 frame["motion_mask_path"] = f"./motion/{shot.name}.png"
         frames.append(frame | {"transform_matrix": shot.world_from_cam.tolist()})
@@ -138,14 +155,27 @@ def _write_split(
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
 
 
-def _teleporting_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
-    """Training cameras on the hemisphere in random order, test cameras on an orbit, one static validation camera."""
-    train = hemisphere_cameras(options.num_times, options.distance, options.seed)
-    train = np.random.default_rng(options.seed).permutation(train)  # the spiral climbs: time would tell the height
-    test = orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=-60.0)
-    fixed = orbit_cameras(1, options.distance, elevation_deg=28.0, start_deg=-60.0)
+def _single_shots(options: DynamicOptions, style: CaptureStyle, in_front: bool) -> dict[str, list[_Shot]]:
+    """One image per training time, by cameras in random order or on a smooth arc; the validation camera is fixed.
+
+    Test cameras lie on an orbit, or ``in_front`` on an arc; a moving camera is tested by a fixed one in its middle.
+    """
+    random, count, gaps = np.random.default_rng(options.seed), options.num_test, max(options.num_times - 1, 1)
+    if style == "moving":
+        count, middle_deg = min(count, gaps), _FRONT_DEG + random.uniform(-2.0, 2.0)
+        along = np.array(_even_times(options.num_times)) - 0.5
+        train = _poses(options.distance, middle_deg + _SECTOR_DEG * along, 20.0 + 5.0 * np.sin(2 * np.pi * along))
+        fixed = _poses(options.distance, np.array([middle_deg]), np.array([28.0]))
+        test = np.repeat(fixed, count, axis=0)
+    else:
+        train = hemisphere_cameras(options.num_times, options.distance, options.seed, in_front)
+        train = random.permutation(train)  # the spiral climbs: time would tell the height
+        test = orbit_cameras(count, options.distance, elevation_deg=28.0, start_deg=-60.0)
+        fixed = orbit_cameras(1, options.distance, elevation_deg=28.0, start_deg=-60.0)
+        if in_front:
+            azimuths_deg = _FRONT_DEG + 0.8 * _SECTOR_DEG * (np.array(_even_times(count)) - 0.5)
+            test = _poses(options.distance, azimuths_deg, np.full(count, 28.0))
     poses = {"train": train, "val": np.repeat(fixed, options.num_val, axis=0), "test": test}
-    gaps, count = max(options.num_times - 1, 1), options.num_test
     times = {
         "train": _even_times(options.num_times),
         "val": _even_times(options.num_val),
@@ -161,16 +191,16 @@ def _teleporting_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
     }
 
 
-def _room_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
-    """Static cameras on an arc before the corner, low and high in turn; the test camera in the middle of the arc."""
+def _fixed_shots(options: DynamicOptions) -> dict[str, list[_Shot]]:
+    """Fixed cameras on an arc in front, low and high in turn; the test camera in the middle of the arc."""
     count = options.num_cameras
     shift = np.random.default_rng(options.seed).uniform(-2.0, 2.0)
-    azimuths_deg = -45.0 + shift + 64.0 * ((np.arange(count) + 0.5) / count - 0.5)
+    azimuths_deg = _FRONT_DEG + shift + _SECTOR_DEG * ((np.arange(count) + 0.5) / count - 0.5)
     elevations_deg = np.where(np.arange(count) % 2 == 0, 16.0, 28.0)
-    middle = -45.0 + shift + (32.0 / count if count % 2 else 0.0)
+    middle = _FRONT_DEG + shift + (0.5 * _SECTOR_DEG / count if count % 2 else 0.0)
     azimuths_deg = np.append(azimuths_deg, [middle, middle])
     elevations_deg = np.append(elevations_deg, [22.0, 34.0])
-    poses = _look_at_origin(options.distance, np.radians(azimuths_deg), np.radians(elevations_deg))
+    poses = _poses(options.distance, azimuths_deg, elevations_deg)
     cameras = {
         "train": range(count),
         "val": (count + 1,) if options.num_val else (),
@@ -190,15 +220,18 @@ def _even_times(count: int) -> list[float]:
     return [i / max(count - 1, 1) for i in range(count)]
 
 
-def hemisphere_cameras(count: int, distance: float, seed: int) -> np.ndarray:
+def hemisphere_cameras(count: int, distance: float, seed: int, in_front: bool = False) -> np.ndarray:
     """(count, 4, 4) OpenGL camera-to-world poses spread evenly over the upper hemisphere, looking at the origin.
 
-    A Fibonacci spiral from 6 to 80 degrees of elevation, rotated by a random azimuth.
+    A Fibonacci spiral from 6 to 80 degrees of elevation, rotated by a random azimuth; ``in_front`` only a sector of it,
+    up to 45 degrees.
     """
     turn = np.random.default_rng(seed).uniform(0.0, 2 * np.pi)
     fraction = (np.arange(count) + 0.5) / max(count, 1)
-    heights = np.sin(np.radians(6.0)) * (1 - fraction) + np.sin(np.radians(80.0)) * fraction
+    heights = np.sin(np.radians(6.0)) * (1 - fraction) + np.sin(np.radians(45.0 if in_front else 80.0)) * fraction
     azimuths = turn + np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
+    if in_front:
+        azimuths = np.radians(_FRONT_DEG + _SECTOR_DEG * (azimuths / (2 * np.pi) % 1.0 - 0.5))
     return _look_at_origin(distance, azimuths, np.arcsin(heights))
 
 
@@ -206,6 +239,10 @@ def orbit_cameras(count: int, distance: float, elevation_deg: float, start_deg: 
     """(count, 4, 4) OpenGL camera-to-world poses on a level circle around the origin."""
     azimuths = np.radians(start_deg) + 2 * np.pi * np.arange(count) / max(count, 1)
     return _look_at_origin(distance, azimuths, np.full(count, np.radians(elevation_deg)))
+
+
+def _poses(distance: float, azimuths_deg: np.ndarray, elevations_deg: np.ndarray) -> np.ndarray:
+    return _look_at_origin(distance, np.radians(azimuths_deg), np.radians(elevations_deg))
 
 
 def _look_at_origin(distance: float, azimuths: np.ndarray, elevations: np.ndarray) -> np.ndarray:

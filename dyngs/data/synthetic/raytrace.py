@@ -1,4 +1,4 @@
-"""A small ray tracer in NumPy: painted balls, boxes and waving sheets under a soft lamp and the sky.
+"""A small ray tracer in NumPy: painted balls, capsules, boxes and waving sheets under a soft lamp and the sky.
 
 It shares no formula with the rasterizer, so that its images are an independent ground truth. A scene is a tuple of
 primitives; a scene that moves is a function from time to such a tuple.
@@ -66,6 +66,48 @@ class Sphere:
         distance = np.sqrt(np.maximum(_dot(offset, offset), 1e-12))
         cosine = np.maximum(_dot(normals, offset) / distance, 0.0)
         return cosine * np.minimum(self.radius / distance, 1.0) ** 2
+
+
+@dataclass(frozen=True)
+class Capsule(Sphere):
+    """A ball swept along its z axis, ``half_length`` to both sides of ``center``; its middle one hides the sky."""
+
+    half_length: float = 0.0
+
+    def _extents(self) -> np.ndarray:
+        return f32([self.radius, self.radius, self.radius + self.half_length])
+
+    def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """The nearest of where a ray enters the ball at either end, and the tube between them."""
+        start, towards = (origins - f32(self.center)) @ f32(self.turn), directions @ f32(self.turn)
+        squared = np.maximum(_dot(towards[:, :2], towards[:, :2]), np.float32(1e-12))
+        half_b = _dot(start[:, :2], towards[:, :2])
+        discriminant = half_b**2 - squared * (_dot(start[:, :2], start[:, :2]) - self.radius**2)
+        tube = (-half_b - np.sqrt(np.maximum(discriminant, 0.0))) / squared
+        is_hit = (discriminant > 0) & (tube > 1e-4) & (np.abs(start[:, 2] + tube * towards[:, 2]) < self.half_length)
+        ends = [np.asarray(self.center) + side * self.half_length * self.turn[:, 2] for side in (-1, 1)]
+        balls = [Sphere((x, y, z), self.radius, self.paint).intersect(origins, directions) for x, y, z in ends]
+        return np.minimum(np.where(is_hit, tube, np.float32(np.inf)), np.minimum(*balls))
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """(R, 3) surface points in the capsule's axes, each divided by its half extent."""
+        return (points - f32(self.center)) @ f32(self.turn) / self._extents()
+
+    def placed(self, local: np.ndarray) -> np.ndarray:
+        return (local * self._extents()) @ f32(self.turn).T + f32(self.center)
+
+    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+        ball = _unit(random.normal(size=(count, 3)))
+        along = random.uniform(-self.half_length, self.half_length, count)
+        on_tube = random.random(count) * (self.radius + self.half_length) < self.half_length
+        tube = np.column_stack([self.radius * _unit(ball[:, :2]), along])
+        ends = self.radius * ball + self.half_length * np.sign(ball[:, 2:]) * [0.0, 0.0, 1.0]
+        return (np.where(on_tube[:, None], tube, ends) / self._extents()).astype(np.float32)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        offset = points - f32(self.center)
+        along = np.clip(offset @ f32(self.turn[:, 2]), -self.half_length, self.half_length)
+        return (offset - along[:, None] * f32(self.turn[:, 2])) / np.float32(self.radius)
 
 
 @dataclass(frozen=True)
@@ -268,14 +310,17 @@ def colours_along(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> n
     return rgb
 
 
-def render_movers(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
-    """(size, size) bool: pixels of ``render_scene`` in which something that moves is seen; light does not count."""
-    seen = np.zeros(size * size, bool)
+def render_things(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3) -> np.ndarray:
+    """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0 none.
+
+    Of several in one pixel the one that most samples see; light does not count.
+    """
+    counts = np.zeros((1 + len(scene.movers), size * size), np.int64)  # the first row stays 0: none
     origin = world_from_cam[:3, 3].astype(np.float32)
     for _, directions in _sampled_rays(world_from_cam, size, samples):
         nearest, distance = _nearest(scene, origin, directions)
-        seen |= (nearest >= scene.movers.start) & np.isfinite(distance)
-    return seen.reshape(size, size)
+        counts[1:] += (nearest == np.array(scene.movers)[:, None]) & np.isfinite(distance)
+    return counts.argmax(axis=0).astype(np.uint8).reshape(size, size)
 
 
 def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -17,6 +18,7 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.geometry import camera_center
 from dyngs.data.read import read_capture
+from dyngs.data.synthetic import raytrace
 from dyngs.data.synthetic.captures import (
     POINTS_PER_THING,
     DynamicOptions,
@@ -29,8 +31,8 @@ from dyngs.data.synthetic.captures import (
     write_dynamic_capture,
     write_still_capture,
 )
-from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, render_movers
-from dyngs.data.synthetic.scenes import SceneName, scene_at
+from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, render_things
+from dyngs.data.synthetic.scenes import CORNERS, SceneName, scene_at
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 
@@ -84,12 +86,12 @@ def test_cameras_differ_by_seed_only_in_azimuth() -> None:
 def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(name: SceneName, tmp_path: Path) -> None:
     first, second = (write_dynamic_capture(name, tmp_path / part, TINY) for part in ("a", "b"))
     assert _files(first) == _files(second)
-    other = write_dynamic_capture(name, tmp_path / "c", DynamicOptions(**(vars(TINY) | {"seed": 1})))
+    other = write_dynamic_capture(name, tmp_path / "c", replace(TINY, seed=1))
     assert _files(other).keys() == _files(first).keys()
     assert _files(other)["transforms_train.json"] != _files(first)["transforms_train.json"]
 
 
-@pytest.mark.parametrize("name", ["spin", "wave", "merge"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in CORNERS])
 def test_one_camera_per_time_is_read_back_as_it_was_written(name: SceneName, tmp_path: Path) -> None:
     capture = _read(write_dynamic_capture(name, tmp_path / "out", TINY))
     assert capture.has_alpha
@@ -138,7 +140,7 @@ def test_each_image_shows_its_scene_at_its_time(name: SceneName, tmp_path: Path)
         expected = render_scene(scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1)
         found = _pixels(root / (frame["file_path"] + ".png"))
         np.testing.assert_array_equal(found, expected[..., : found.shape[2]])
-        assert found.shape[2] == (3 if name == "room" else 4)
+        assert found.shape[2] == (3 if name in CORNERS else 4)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -149,9 +151,12 @@ def test_held_out_images_have_masks_of_what_moves(name: SceneName, tmp_path: Pat
         assert all(("motion_mask_path" in frame) == (split != "train") for frame in frames)
         for frame in frames:
             mask = _pixels(root / "motion" / (frame["file_path"] + ".png"))
-            expected = render_movers(scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1)
-            np.testing.assert_array_equal(mask[..., 0], 255 * expected.astype(np.uint8))
-            assert 0 < expected.mean() < 0.6
+            things = _pixels(root / "things" / (frame["file_path"] + ".png"))
+            expected = render_things(scene_at(name, frame["time"]), np.array(frame["transform_matrix"]), 16, 1)
+            np.testing.assert_array_equal(things[..., 0], expected)
+            np.testing.assert_array_equal(mask[..., 0], 255 * (expected > 0).astype(np.uint8))
+            assert (expected > 0).mean() < 0.6
+            assert expected.any() or name == "enter"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -213,7 +218,11 @@ def test_the_command_knows_all_scenes() -> None:
 
 @pytest.mark.parametrize(
     ("words", "images", "preset"),
-    [(["spin", "--views", "3"], 3, "dynamic"), (["room", "--views", "2", "--cameras", "3"], 6, "dynamic")],
+    [
+        (["spin", "--views", "3"], 3, "dynamic"),
+        (["room", "--views", "2", "--cameras", "3"], 6, "dynamic"),
+        (["room", "--views", "2", "--style", "moving"], 2, "dynamic"),
+    ],
 )
 def test_command_writes_and_says_what_is_next(
     words: list[str], images: int, preset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -233,7 +242,10 @@ def test_command_writes_and_says_what_is_next(
         ("spin used", "exists already"),
         ("spin new --views 0", "--views"),
         ("spin new --seed -1", "--seed"),
-        ("spin new --cameras 3", "--cameras"),
+        ("still new --cameras 3", "--cameras"),
+        ("spin new --style moving --cameras 3", "--cameras"),
+        ("still new --style moving", "--style"),
+        ("human new --style fixed", "--style"),
         ("room new --cameras 0", "--cameras"),
     ],
 )
@@ -256,11 +268,11 @@ CAMERAS = ((16.0, -70.0), (34.0, -45.0), (22.0, -20.0), (45.0, -60.0), (28.0, -3
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
 
 
-def projected(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """(P, 2) pixels of an image of ``SIZE``."""
+def projected(points: np.ndarray, pose: np.ndarray, size: int = SIZE) -> np.ndarray:
+    """(P, 2) pixels of an image of ``size``."""
     x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
-    focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
-    return np.stack([focal * x / -z, focal * y / z], axis=1) + 0.5 * SIZE
+    focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
+    return np.stack([focal * x / -z, focal * y / z], axis=1) + 0.5 * size
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -276,12 +288,98 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     np.testing.assert_array_equal(tracks.moments, range(5))
     for k, (_, time, pose) in enumerate(shots):
         seen = tracks.visible[k]
-        assert seen.mean() > 0.1
+        assert (seen.mean() > 0.1) == (name != "enter" or 0 < time < 1), "what has left is not seen"
         assert seen.mean() < 0.9 or name == "wave", "others are on the far side or hidden, but not of a cloth"
-        mask = np.pad(render_movers(scene_at(name, time), pose, SIZE), 1)
+        labels = np.pad(render_things(scene_at(name, time), pose, SIZE), 1)
         x, y = projected(tracks.points[k][seen], pose).astype(int).T
-        near = np.any([mask[y + dy, x + dx] for dy in range(3) for dx in range(3)], axis=0)
-        assert near.all(), "in the mask or, at an outline, next to it"
+        own = 1 + np.flatnonzero(seen) // POINTS_PER_THING
+        near = np.any([labels[y + dy, x + dx] == own for dy in range(3) for dx in range(3)], axis=0)
+        assert near.all(), "where its own thing is or, at an outline, next to it"
+
+
+@pytest.mark.parametrize("name", ["roll", "collide", "chain", "enter"])
+def test_a_track_keeps_the_colour_that_its_point_has_at_the_start(
+    name: SceneName, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In grey light and without highlights, a pixel is a grey times the paint that its point had at time 0."""
+    for light in ("_SKY", "_GROUND", "_LAMPLIGHT"):
+        monkeypatch.setattr(raytrace, light, (0.4, 0.4, 0.4))
+    pose, times = orbit_cameras(1, 4.0, 28.0, -45.0)[0], (0.0, 0.3, 0.7)
+    scenes = {t: scene_at(name, t) for t in times}
+    tracks = true_tracks(scenes.__getitem__, [(f"v{t}", t, pose) for t in times])
+    movers = [scenes[0.0].primitives[i] for i in scenes[0.0].movers]
+    starts = tracks.points[0].reshape(len(movers), POINTS_PER_THING, 3)
+    paint = np.concatenate([thing.paint(thing.local(own)) for thing, own in zip(movers, starts, strict=True)])
+    for k in (1, 2):
+        seen, scene = tracks.visible[k], scenes[times[k]]
+        dull = replace(scene, primitives=tuple(replace(thing, gloss=0.0) for thing in scene.primitives))
+        x, y = projected(tracks.points[k][seen], pose, 8 * SIZE).astype(int).T
+        pixels = render_scene(dull, pose, 8 * SIZE, 1)[y, x, :3] / 255
+        linear = np.where(pixels < 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
+
+        def fitting(own: np.ndarray, shown: np.ndarray = linear) -> float:
+            light = (shown * own).sum(axis=1, keepdims=True) / (own**2).sum(axis=1, keepdims=True)
+            return float((np.abs(shown - light * own).max(axis=1) < 0.02).mean())
+
+        assert fitting(paint[seen]) > 0.85, "all but those at edges of the texture"
+        assert fitting(np.roll(paint[seen], 7, axis=0)) < 0.45, "the texture tells points from others"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_labels_are_of_the_thing_that_the_ray_of_a_pixel_hits_first(name: SceneName) -> None:
+    scene, pose = scene_at(name, 0.6), orbit_cameras(1, 4.0, 28.0, -45.0)[0]
+    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+    focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
+    local = np.stack([columns - 0.5 * SIZE, 0.5 * SIZE - rows, np.full_like(rows, -focal)], axis=-1).reshape(-1, 3)
+    directions = (local / np.linalg.norm(local, axis=1, keepdims=True) @ pose[:3, :3].T).astype(np.float32)
+    hits = np.stack([thing.intersect(pose[None, :3, 3].astype(np.float32), directions) for thing in scene.primitives])
+    first = np.where(np.isfinite(hits.min(axis=0)), hits.argmin(axis=0), -1)
+    expected = np.maximum(first - scene.movers.start + 1, 0).reshape(SIZE, SIZE)
+    labels = render_things(scene, pose, SIZE, 1)
+    assert (labels != expected).mean() < 1e-3, "but at outlines, by rounding"
+    assert set(np.unique(labels)) == {0, *range(1, 1 + len(scene.movers))}
+
+
+@pytest.mark.parametrize("name", ["roll", "enter", "room"])
+def test_a_moving_camera_goes_along_a_smooth_arc_and_a_fixed_one_tests_it(name: SceneName, tmp_path: Path) -> None:
+    options = replace(TINY, size=4, num_times=30, num_test=6, style="moving")
+    capture = _read(write_dynamic_capture(name, tmp_path / "out", options))
+    train, test = (np.array([camera_center(v.cam_from_world) for v in capture.splits[s]]) for s in ("train", "test"))
+    assert [view.time for view in capture.splits["train"]] == pytest.approx(np.linspace(0, 1, 30))
+    steps_deg = np.degrees(np.arccos((train[1:] * train[:-1]).sum(axis=1) / 16.0))
+    assert 1.0 < steps_deg.min() < steps_deg.max() < 4.0, "no teleport"
+    assert np.degrees(np.arccos((train[0] * train[-1]).sum() / 16.0)) > 50.0
+    assert len(test) == 6
+    assert (test == test[0]).all()
+    assert not {view.time for view in capture.splits["test"]} & {view.time for view in capture.splits["train"]}
+    assert capture.warnings == ()
+    assert capture.has_alpha == (name == "roll")
+
+
+@pytest.mark.parametrize(("name", "count"), [("roll", 4), ("enter", 9)])
+def test_fixed_cameras_each_see_all_times_of_any_scene(name: SceneName, count: int, tmp_path: Path) -> None:
+    root = tmp_path / "out"
+    words = ["data", "synth", name, str(root), "--size", "4", "--views", "3", "--cameras", str(count)]
+    assert main(words) == 0
+    capture = _read(root)
+    seen = [(v.camera_id, v.time, v.cam_from_world.tobytes()) for v in capture.splits["train"]]
+    assert {(camera, time) for camera, time, _ in seen} == {(c, t) for c in range(count) for t in (0.0, 0.5, 1.0)}
+    assert len(seen) == 3 * count
+    assert len({pose for _, _, pose in seen}) == len({(camera, pose) for camera, _, pose in seen}) == count
+    assert {view.camera_id for view in capture.splits["test"]} == {count}
+    assert capture.has_alpha == (name == "roll")
+    assert inspect_capture(root, deep=True).problems == ()
+
+
+def test_what_enters_is_outside_all_images_at_first_and_at_last(tmp_path: Path) -> None:
+    for style in ("teleport", "moving", "fixed"):
+        options = replace(TINY, size=24, num_times=12, num_cameras=9, style=style)
+        root = write_dynamic_capture("enter", tmp_path / style, options)
+        for split in ("train", "test", "val"):
+            frames = json.loads((root / f"transforms_{split}.json").read_text())["frames"]
+            shown = {f["time"]: _pixels(root / "things" / (f["file_path"] + ".png")).any() for f in frames}
+            assert not any(is_shown for time, is_shown in shown.items() if time in (0.0, 1.0))
+            assert all(is_shown for time, is_shown in shown.items() if 0.3 < time < 0.7)
 
 
 def test_points_are_missing_before_their_thing_appears() -> None:
