@@ -77,7 +77,7 @@ MUTATIONS = (
     ("human/avatar/anchors.py", "height == min(heights)", "height == max(heights)", "human/avatar/test_anchors.py"),
     ("human/avatar/posing.py", "3 * z * z - 1", "3 * z * z", "human/avatar/test_posing.py human/avatar/test_scene.py"),
     ("human/avatar/posing.py", "_pose_features(rotations)[1:]", "rotations[1:]", "human/avatar/test_posing.py human/avatar/test_scene.py"),
-    ("training/sampler.py", "self._position += 1", "self._position += 2", "training/test_sampler.py"),
+    ("training/trainer.py", "self._position += 1", "self._position += 2", "training/test_trainer.py"),
     ("training/schedule.py", "step / options.steps >= fraction", "step / options.steps > fraction", "training/test_schedule.py"),
     ("training/schedule.py", "range(period, stop - period + 1, period)", "range(period, stop, period)", "training/test_schedule.py"),
     ("training/schedule.py", "(1 - progress) * math.log(options.lr_means)", "progress * math.log(options.lr_means)", "training/test_schedule.py"),

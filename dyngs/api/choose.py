@@ -41,7 +41,7 @@ from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
 from dyngs.section import Section
-from dyngs.training.interrupt import Interrupts
+from dyngs.training.loop import Interrupts
 
 SMALL_SIDE, SMALL_GAUSSIANS = 128, 15_000  # Of small runs: longest side of the images, px, and most Gaussians
 STEPS, FEWEST_STEPS = 2000, 1000  # Most steps of a small run; with fewer than the latter it says nothing

@@ -14,7 +14,7 @@ from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
 from dyngs.models.renderable import Rendering
 from dyngs.models.views import background_colour
-from dyngs.training.corrections.camera_fit import fitted_to_image
+from dyngs.training.corrections.camera_refinement import fitted_to_image
 
 EXPLAINED = 0.8
 """Fraction of the pixels of a view that count: those where the smaller of two models' errors is smallest."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.training.priors.depth_maps import DepthForm, values_of
+from dyngs.training.priors.used import DepthForm, values_of
 
 PAIRS = 12  # Pairs of images that are compared
 MARGIN = 0.97  # A prior must lower the error at least to this fraction of its substitute's
