@@ -13,8 +13,7 @@ from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
 from dyngs.errors import counted
-from dyngs.prune.score import highest
-from dyngs.prune.stage import default_scores
+from dyngs.prune.stage import default_scores, highest
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE, most_gaussians
 

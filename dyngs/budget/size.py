@@ -15,8 +15,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer, restored_scene
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.ops.device import CPU
-from dyngs.prune.score import highest
-from dyngs.prune.stage import default_scores, probe_images, quality_of
+from dyngs.prune.stage import default_scores, highest, probe_images, quality_of
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER

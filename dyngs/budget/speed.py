@@ -27,8 +27,7 @@ from dyngs.metrics import flip, ssim
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
 from dyngs.ops.device import finish
-from dyngs.prune.score import highest
-from dyngs.prune.stage import default_scores, training_quality
+from dyngs.prune.stage import default_scores, highest, training_quality
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE
 

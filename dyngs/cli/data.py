@@ -156,7 +156,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         raise DyngsError(report.problems[0])
     print(format_report(report))
     if arguments.image is not None:
-        from dyngs.capture.inspection.camera_plot import draw_cameras
+        from dyngs.capture.inspection.report import draw_cameras
 
         draw_cameras(report.capture, arguments.image)
         print(f"written: {arguments.image}")

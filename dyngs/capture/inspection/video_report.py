@@ -19,7 +19,7 @@ from dyngs.capture.multi_video.films import (
     read_given,
     shrunk_grey,
 )
-from dyngs.capture.multi_video.lags import motion_of
+from dyngs.capture.multi_video.starts import motion_of
 from dyngs.data.images.video import opened_video, orientation_of, read_frames, videos_in
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import as_word, counted, reading

@@ -22,8 +22,7 @@ from dyngs.capture.multi_video.films import (
     read_given,
     small_images,
 )
-from dyngs.capture.multi_video.lags import Watcher, motion_of
-from dyngs.capture.multi_video.starts import found_starts, given_starts
+from dyngs.capture.multi_video.starts import Watcher, found_starts, given_starts, motion_of
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import read_numbered_frames, videos_in
