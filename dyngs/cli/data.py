@@ -261,7 +261,7 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
 def run_motion(arguments: argparse.Namespace) -> int:
     """Convert the motion and print a summary."""
     from dyngs.human.motion.amass import write_amass
-    from dyngs.human.motion.read import read_motion
+    from dyngs.human.motion.retarget import read_motion
     from dyngs.human.template.body_reader import default_template, read_body
 
     out: Path = arguments.out

@@ -27,7 +27,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
-from dyngs.prune.stage import PROBED_VIEWS, chosen_scores, probe_images, quality_of
+from dyngs.prune.stage import PROBED_VIEWS, probe_images, quality_of, scores_of
 from dyngs.storage.measure import CoarseFile, coarsest_file
 
 HELD_OUT_FRACTION, MOST_HELD_OUT = 1 / 8, 32
@@ -125,7 +125,7 @@ class Search:
         self.trials = 0
         self._begin = trainer.config, trainer.model.colours
         trainer.held_out = frozenset(self.held_out)
-        self._scores = chosen_scores(trainer)
+        self._scores = scores_of(trainer, trainer.config.prune)
         self._truths = list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         self.views = f"{len(self._truths)} training views held out" if self.held_out else "its only training view"
         if unseen:

@@ -162,10 +162,10 @@ class PruneStage:
 def prune_(trainer: GaussianTrainer) -> Pruned:
     """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their number stays."""
     trainer.model.exchange(trainer.model.scene.unmasked())
-    before, whole = len(trainer.model.scene), training_quality(trainer, trainer.model.scene)
-    remove_(trainer, chosen_scores(trainer) if trainer.config.prune.fraction > 0 else None)
+    before, whole = len(trainer.model.scene), quality_of(trainer, trainer.model.scene)
+    remove_(trainer, scores_of(trainer, trainer.config.prune) if trainer.config.prune.fraction > 0 else None)
     scene, active = trainer.model.scene, 1.0
-    loss = whole - training_quality(trainer, scene.unmasked())
+    loss = whole - quality_of(trainer, scene.unmasked())
     if scene.masks is not None:
         masks = scene.masks
         active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in range(len(masks.times) - 1))
@@ -188,28 +188,17 @@ def remove_(trainer: GaussianTrainer, scores: Tensor | None) -> None:
 
 
 @torch.no_grad()
-def chosen_scores(trainer: GaussianTrainer) -> Tensor:
-    """Return (N,) the score that the configuration asks for."""
-    options, scene = trainer.config.prune, trainer.model.scene.unmasked()
-    return scores_of(importance(scoring_views(trainer, scene), slopes=options.score == "sensitivity"), options)
-
-
-def scores_of(found: Importance, options: PruneConfig) -> Tensor:
-    """Return (N,) the score asked for."""
-    match options.score:
+def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
+    """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first of docs/prune.md."""
+    score, scene = (options or PruneConfig()).score, trainer.model.scene.unmasked()
+    found = importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
+    match score:
         case "variation":
             return found.variation
         case "temporal":
             return found.temporal
         case "contribution" | "sensitivity":
             return found.contribution if found.slopes is None else found.slopes
-
-
-@torch.no_grad()
-def default_scores(trainer: GaussianTrainer) -> Tensor:
-    """Return (N,) how much each Gaussian matters now: the first score of docs/prune.md."""
-    scene = trainer.model.scene.unmasked()
-    return scores_of(importance(scoring_views(trainer, scene), slopes=True), PruneConfig())
 
 
 def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
@@ -234,12 +223,6 @@ def scoring_views(
     return ScoringViews(scene, cameras, times, trainer.model.options, background)
 
 
-@torch.no_grad()
-def training_quality(trainer: GaussianTrainer, scene: GaussianScene) -> float:
-    """Return the mean PSNR of at most 16 training images drawn of ``scene``, dB."""
-    return quality_of(trainer, scene, probe_images(trainer))
-
-
 def probe_images(trainer: GaussianTrainer) -> list[Image]:
     """Return at most 16 training images, evenly chosen."""
     return [trainer.images[i] for i in evenly_spaced(len(trainer.images), PROBED_VIEWS)]
@@ -247,13 +230,16 @@ def probe_images(trainer: GaussianTrainer) -> list[Image]:
 
 @torch.no_grad()
 def quality_of(
-    trainer: GaussianTrainer, scene: GaussianScene, images: Sequence[Image], alpha_min: float | None = None
+    trainer: GaussianTrainer,
+    scene: GaussianScene,
+    images: Sequence[Image] | None = None,
+    alpha_min: float | None = None,
 ) -> float:
-    """Return the mean PSNR of ``images`` drawn of ``scene``, dB; ``alpha_min`` instead of that of training."""
+    """Return the mean PSNR of ``images`` drawn of ``scene``, dB; by default of ``probe_images``, as in training."""
     background, options = sent(background_colour(trainer.background), trainer.device), trainer.model.options
     options = options if alpha_min is None else replace(options, alpha_min=alpha_min)
     scene, values = scene.to(trainer.device), []
-    for image in images:
+    for image in probe_images(trainer) if images is None else images:
         drawn = scene.render(image.cameras, image.time, options=options, background=background).rgb[0]
         values.append(psnr(drawn, image.composite(background), image.mask))
     return fmean(values)
