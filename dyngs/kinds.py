@@ -40,8 +40,7 @@ from dyngs.training.loop import Trainable
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
-from dyngs.training.sampler import ViewSampler
-from dyngs.training.trainer import Trainer
+from dyngs.training.trainer import Trainer, ViewSampler
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 

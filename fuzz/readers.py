@@ -180,7 +180,7 @@ def read_a_body(root: Path) -> object:
 def read_a_motion(root: Path) -> object:
     """Read a motion and make it a clip on a small body."""
     from dyngs.human.motion.motion import motion_clip
-    from dyngs.human.motion.read import read_motion
+    from dyngs.human.motion.retarget import read_motion
 
     motion = read_motion(only(root), small_body(55))
     return motion, motion_clip(motion).at(0.3)

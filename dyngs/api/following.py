@@ -24,8 +24,7 @@ from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
-from dyngs.training.interrupt import Interrupts
-from dyngs.training.loop import Trainable
+from dyngs.training.loop import Interrupts, Trainable
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
 

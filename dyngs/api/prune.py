@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -23,7 +22,7 @@ from dyngs.kinds import assemble
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
-from dyngs.prune.search import MOST_HELD_OUT, Search, SearchLimit, Stored
+from dyngs.prune.search import MOST_HELD_OUT, Promise, Search
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, require_empty
@@ -31,31 +30,6 @@ from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
 
 SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise
-
-
-@dataclass(frozen=True)
-class Promise:
-    """Result of pruning for a given loss."""
-
-    folder: Path  # of the new run; its file is in ``EXPORT_FOLDER`` there
-    asked: float  # largest loss on the views held out, dB
-    # mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest
-    before: float
-    after: float
-    cut: str  # what was taken away, for people; "nothing" where nothing could be
-    limits: tuple[SearchLimit, ...]
-    views: str  # that losses were measured on, for people
-    trials: int
-
-    def __str__(self) -> str:
-        kept = (
-            f"{self.after - self.before:+.2f} dB on {self.views}, drawn from the file ({self.asked:g} dB may be lost)"
-        )
-        if self.cut == "nothing":
-            told = f"nothing can be taken away for {self.asked:g} dB: the run is as it was; {kept}"
-        else:
-            told = f"taken away: {self.cut}; {kept}; {self.trials} trials"
-        return "\n".join([told, *(f"limit: {limit}" for limit in self.limits)])
 
 
 def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
@@ -119,23 +93,15 @@ def prune_within(
     with kernel_threads(config.run.threads or num_cores()), bytewise:
         trainer = assemble(config, restored=True)
         trainer.restore(start)
-        search = Search(trainer, start, tell, _unseen(config, trainer.device))
-        found = search.run(max_loss)
-        stored = search.stored(found, max_loss)
+        chosen, file, promise = Search(trainer, start, tell, _unseen(config, trainer.device)).run(max_loss)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
-        _write(started, stored, seconds_at(run_dir, start.info.step) + time.perf_counter() - begun)
-    chosen = stored.candidate
-    return Promise(
-        folder=out,
-        asked=max_loss,
-        before=chosen.psnr + chosen.loss,
-        after=stored.file.quality,
-        cut=str(chosen.cut),
-        limits=(*found.limits, stored.limit),
-        views=found.views,
-        trials=found.trials,
-    )
+        seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
+        save_checkpoint(started, chosen.checkpoint, seconds)
+        write_config(chosen.config, started)
+        write_scene(started / EXPORT_FOLDER / SCENE_FILE, file.data)
+        write_config(chosen.config, started / EXPORT_FOLDER)
+    return promise
 
 
 def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequence[str]) -> Config:
@@ -164,11 +130,3 @@ def _copy_start(run_dir: Path, folder: Path) -> None:
     for name in (TIMING_NAME, LOG_NAME):
         if (run_dir / name).is_file():
             shutil.copyfile(run_dir / name, folder / name)
-
-
-def _write(folder: Path, stored: Stored, seconds: float) -> None:
-    config = stored.candidate.config
-    save_checkpoint(folder, stored.candidate.checkpoint, seconds)
-    write_config(config, folder)
-    write_scene(folder / EXPORT_FOLDER / SCENE_FILE, stored.file.data)
-    write_config(config, folder / EXPORT_FOLDER)

@@ -14,7 +14,6 @@ from typing import Protocol, cast
 
 from torch import Tensor
 
-from dyngs.api.before_training import with_capture
 from dyngs.api.choose import Choice, choose, write_choices
 from dyngs.api.following import Leader
 from dyngs.budget.cost import CostMeter
@@ -23,13 +22,15 @@ from dyngs.budget.run import LimitedRun
 from dyngs.budget.size import has_file, write_within
 from dyngs.budget.speed import SpeedLimit
 from dyngs.budget.time import Deadline, first_fit, refitted
-from dyngs.config import Config
+from dyngs.capture.unposed import is_unposed, with_poses
+from dyngs.config import Config, HumanModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture, require_folder
 from dyngs.errors import DyngsError, as_word, counted
 from dyngs.evaluate.report import evaluate_run
+from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.kinds import GaussianTrainer, build
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
@@ -67,9 +68,8 @@ from dyngs.runs.progress import Progress
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.extend import told, with_length
-from dyngs.training.interrupt import Interrupts
 from dyngs.training.limits import require_possible, shared
-from dyngs.training.loop import Loop
+from dyngs.training.loop import Interrupts, Loop
 from dyngs.training.memory import memory_forecasts, require_room
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import Trainer
@@ -438,3 +438,22 @@ def num_cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
         return os.cpu_count() or 1
+
+
+def with_capture(
+    config: Config, *, say: Callable[[str], None] = print, report: ReportProgress = report_nothing
+) -> Config:
+    """Return the configuration with a capture that can be trained on; what is found for it is kept for other runs."""
+    data, model = config.data, config.model
+    if model.is_network:
+        return config  # its folder holds a capture per person
+    if not model.is_posed:
+        data = with_poses(data, needs_times=model.may_move, say=say, report=report)
+    elif is_unposed(data):
+        raise DyngsError(
+            f"{data.root}: a person needs a capture with body parameters (docs/human.md); of photos or videos alone a "
+            f"scene can be made: `dyngs train static data.root={data.root}`, or dynamic"
+        )
+    elif isinstance(model, HumanModel) and model.body is None:
+        data = with_fitted_body(data, only_if_needed=not model.fit, say=say, report=report)
+    return config.model_copy(update={"data": data})

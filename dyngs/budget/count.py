@@ -13,8 +13,7 @@ from torch import Tensor
 
 from dyngs.budget.run import LimitedRun
 from dyngs.errors import counted
-from dyngs.prune.score import highest
-from dyngs.prune.stage import default_scores
+from dyngs.prune.stage import highest, scores_of
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE, most_gaussians
 
@@ -35,7 +34,7 @@ class CountLimit:
         """Remove Gaussians after a step of a late stage, if there are too many."""
         count = self.run.trainer.num_gaussians
         if isinstance(event, StepDone) and count > self.most and self.run.stage:
-            before, after = self.run.remove(highest(default_scores(self.run.trainer), 1 - self.most / count))
+            before, after = self.run.remove(highest(scores_of(self.run.trainer), 1 - self.most / count))
             self.before, self.lost = self.before or count, self.lost + before - after
             self.run.say(
                 f"step {event.step}: {self._name}: {count:,} -> {counted(self.most, 'Gaussian')}; "

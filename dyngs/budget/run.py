@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.kinds import GaussianTrainer
-from dyngs.prune.stage import training_quality
+from dyngs.prune.stage import quality_of
 from dyngs.training.events import Message, TopologyChanged
 from dyngs.training.loop import Loop
 
@@ -52,10 +52,10 @@ class LimitedRun:
     def remove(self, kept: Tensor) -> tuple[float, float]:
         """Leave only the Gaussians ``kept`` (N,); return the quality of training images before and after, dB."""
         trainer = self.trainer
-        before, count = training_quality(trainer, trainer.model.scene), trainer.num_gaussians
+        before, count = quality_of(trainer, trainer.model.scene), trainer.num_gaussians
         trainer.model.keep(kept, trainer.done)
         self.loop.tell(TopologyChanged(trainer.done, count, trainer.num_gaussians))
-        return before, training_quality(trainer, trainer.model.scene)
+        return before, quality_of(trainer, trainer.model.scene)
 
     def say(self, text: str) -> None:
         self.loop.tell(Message(text))

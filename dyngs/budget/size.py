@@ -15,8 +15,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer, restored_scene
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.ops.device import CPU
-from dyngs.prune.score import highest
-from dyngs.prune.stage import default_scores, probe_images, quality_of
+from dyngs.prune.stage import highest, probe_images, quality_of, scores_of
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER
@@ -99,7 +98,7 @@ def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> S
 
     chosen = stored(scene, plan.coarseness)
     if chosen is None or chosen.coarser > 1:
-        scores, fraction = default_scores(trainer).cpu(), KEPT
+        scores, fraction = scores_of(trainer).cpu(), KEPT
         while fraction * len(scene) >= 1:
             kept = highest(scores, 1 - fraction)
             found = stored(scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept])

@@ -27,8 +27,7 @@ from dyngs.metrics import flip, ssim
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
 from dyngs.ops.device import finish
-from dyngs.prune.score import highest
-from dyngs.prune.stage import default_scores, training_quality
+from dyngs.prune.stage import highest, quality_of, scores_of
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import CLOSE
 
@@ -152,7 +151,7 @@ class SpeedLimit:
             )
         cost = "it cost nothing"
         if found.before:
-            now = training_quality(trainer, trainer.model.scene)
+            now = quality_of(trainer, trainer.model.scene)
             cost = (
                 f"{found.before:,} -> {counted(count, 'Gaussian')}; {-found.lost:+.2f} dB on training views when that "
                 f"was done ({found.quality:.2f} before, {now:.2f} at the end)"
@@ -184,7 +183,7 @@ class SpeedLimit:
         self.run.reserve = self._reserve()
         if found.seconds <= ACCEPTED / self.fps:
             return
-        fastest = self._fastest(default_scores(trainer))
+        fastest = self._fastest(scores_of(trainer))
         if fastest is None:
             return
         kept, found.seconds = fastest

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from dyngs.capture.multi_video.steadiness import STANDS, displaced_by
+from dyngs.capture.multi_video.films import STANDS, displaced_by
 from dyngs.data.capture import Capture, Silhouette, View, all_views, each_view
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.readers.colmap import find_masks, mask_of

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.data.images.exif import is_lying
-from dyngs.data.images.images import END_MARKERS, ImageHeader, check_image, read_header, read_image, read_mask
+from dyngs.data.images.images import END_MARKERS, ImageHeader, check_image, is_lying, read_header, read_image, read_mask
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.errors import DyngsError, reading
 from dyngs.files.containment import check_size, inside

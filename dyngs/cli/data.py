@@ -160,7 +160,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         raise DyngsError(report.problems[0])
     print(format_report(report))
     if arguments.image is not None:
-        from dyngs.capture.inspection.camera_plot import draw_cameras
+        from dyngs.capture.inspection.report import draw_cameras
 
         draw_cameras(report.capture, arguments.image)
         print(f"written: {arguments.image}")
@@ -265,7 +265,7 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
 def run_motion(arguments: argparse.Namespace) -> int:
     """Convert the motion and print a summary."""
     from dyngs.human.motion.amass import write_amass
-    from dyngs.human.motion.read import read_motion
+    from dyngs.human.motion.retarget import read_motion
     from dyngs.human.template.body_reader import default_template, read_body
 
     out: Path = arguments.out

@@ -12,8 +12,8 @@ from dyngs.errors import DyngsError, as_word
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dyngs.api.prune import Promise
     from dyngs.evaluate.comparison import Cost
+    from dyngs.prune.search import Promise
 
 MAX_LOSS = 0.2
 _EPILOG = """\
@@ -98,7 +98,7 @@ def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, 
     most = MAX_LOSS if arguments.max_loss is None else arguments.max_loss
     promise = prune_within(arguments.run_dir, arguments.out, most, overrides)
     print(promise)
-    return promise.folder, promise
+    return arguments.out, promise
 
 
 def _decibels(text: str) -> float:

@@ -32,7 +32,7 @@ from dyngs.ops.device import device_for
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, found_corrections, has_only_scene_file, load_run
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
-from dyngs.training.corrections.camera_fit import fitted_to_image
+from dyngs.training.corrections.camera_refinement import fitted_to_image
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import GaussianTrainer
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.prune.cut import Cut, FieldSize, apply_cut, field_size, with_field
-from dyngs.prune.stage import PROBED_VIEWS, chosen_scores, probe_images, quality_of
+from dyngs.prune.stage import PROBED_VIEWS, probe_images, quality_of, scores_of
 from dyngs.storage.measure import CoarseFile, coarsest_file
 
 HELD_OUT_FRACTION, MOST_HELD_OUT = 1 / 8, 32
@@ -80,23 +80,27 @@ class SearchLimit:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Result of a search."""
+class Promise:
+    """What is told of the candidate that a search chooses."""
 
-    # candidates that keep the promise, each smaller than the one before; the first is the run as it is
-    accepted: tuple[Candidate, ...]
-    limits: tuple[SearchLimit, ...]  # why no more was taken, by kind of thing
+    asked: float  # largest loss on the views held out, dB
+    # mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like the rest
+    before: float
+    after: float  # that of the file
+    cut: str  # what was taken away, for people; "nothing" where nothing could be
+    limits: tuple[SearchLimit, ...]  # why no more was taken, by kind of thing, and why the file is not rounded more
     views: str  # that losses were measured on, for people
     trials: int  # number of fine-tuned candidates, the run as it is included
 
-
-@dataclass(frozen=True)
-class Stored:
-    """The candidate that is chosen, its file, and why that is not rounded more coarsely."""
-
-    candidate: Candidate
-    file: CoarseFile
-    limit: SearchLimit
+    def __str__(self) -> str:
+        kept = (
+            f"{self.after - self.before:+.2f} dB on {self.views}, drawn from the file ({self.asked:g} dB may be lost)"
+        )
+        if self.cut == "nothing":
+            told = f"nothing can be taken away for {self.asked:g} dB: the run is as it was; {kept}"
+        else:
+            told = f"taken away: {self.cut}; {kept}; {self.trials} trials"
+        return "\n".join([told, *(f"limit: {limit}" for limit in self.limits)])
 
 
 def evenly_held_out(count: int) -> tuple[int, ...]:
@@ -121,15 +125,18 @@ class Search:
         self.trials = 0
         self._begin = trainer.config, trainer.model.colours
         trainer.held_out = frozenset(self.held_out)
-        self._scores = chosen_scores(trainer)
+        self._scores = scores_of(trainer, trainer.config.prune)
         self._truths = list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         self.views = f"{len(self._truths)} training views held out" if self.held_out else "its only training view"
         if unseen:
             self.views = f"{counted(len(self._truths), 'view')} never trained on"
         self._is_fair, self._reference, self._exact_trained = bool(unseen), 0.0, 0.0
 
-    def run(self, max_loss: float) -> Found:
-        """Return what can be taken away for ``max_loss``, dB."""
+    def accepted(self, max_loss: float) -> tuple[list[Candidate], list[SearchLimit]]:
+        """Return candidates that lose at most ``max_loss``, dB, each smaller than the one before; and why no more.
+
+        The first is the run as it is.
+        """
         self._restart()
         config, exact = self._begin[0], quality_of(self.trainer, self.trainer.model.scene, self._truths)
         self._exact_trained = quality_of(self.trainer, self.trainer.model.scene, self._others())
@@ -144,7 +151,7 @@ class Search:
             found, limit = self._bisected(kind, levels, ALLOWED[kind] * max_loss)
             limits.append(limit)
             accepted += [] if found is None else [found]
-        return Found(tuple(accepted), tuple(limits), self.views, self.trials)
+        return accepted, limits
 
     def _fine_tuned(self) -> float:
         """Return the PSNR of the run as it is, fine-tuned; what fine-tuning costs views that it trains on is added."""
@@ -160,12 +167,13 @@ class Search:
         others = [i for i in range(len(self.trainer.images)) if i not in self.held_out]
         return [self.trainer.images[others[i]] for i in evenly_spaced(len(others), PROBED_VIEWS)]
 
-    def stored(self, found: Found, max_loss: float) -> Stored:
+    def run(self, max_loss: float) -> tuple[Candidate, CoarseFile, Promise]:
         """Return the smallest accepted candidate whose file keeps the promise, and that file, rounded as far as it may.
 
         The last resort is the run as it is, whose file is compared with itself.
         """
-        for candidate in reversed(found.accepted):
+        accepted, limits = self.accepted(max_loss)
+        for candidate in reversed(accepted):
             least = candidate.psnr - max(max_loss - candidate.worst, SMALLEST_FILE_LOSS)
             file = coarsest_file(candidate.config, candidate.checkpoint, self._quality, least)
             if file is None:
@@ -173,9 +181,9 @@ class Search:
                 continue
             loss = None if file.refused is None else candidate.psnr + candidate.loss - file.refused
             refused = None if loss is None else ("the next step", loss)
-            return Stored(
-                candidate, file, SearchLimit("precision", f"steps {file.factor:.2g} times the usual", refused)
-            )
+            limits.append(SearchLimit("precision", f"steps {file.factor:.2g} times the usual", refused))
+            before, cut = candidate.psnr + candidate.loss, str(candidate.cut)
+            return candidate, file, Promise(max_loss, before, file.quality, cut, tuple(limits), self.views, self.trials)
         raise DyngsError(f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more")
 
     def _quality(self, scene: GaussianScene) -> float:

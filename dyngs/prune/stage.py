@@ -8,6 +8,7 @@ with the same bytes as one that had the stage in its configuration.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
@@ -20,15 +21,103 @@ from dyngs.config import PruneConfig
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import counted
+from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
-from dyngs.prune.score import Importance, ScoringViews, highest, importance
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
+
+STEEPNESS = 4.0  # Slope of the hyperbolic tangent: second differences of a profile are small numbers
+VOLUME_POWER = 0.1
+
+
+@dataclass(frozen=True)
+class ScoringViews:
+    """A scene, and the views that its Gaussians are scored on: every camera at every time."""
+
+    scene: GaussianScene
+    cameras: Sequence[Cameras]
+    times: Sequence[float | None]
+    options: RenderOptions
+    background: Tensor
+
+
+@dataclass(frozen=True)
+class Importance:
+    """Contributions C (K, N) of N Gaussians at K moments: sums over pixels and views, in one of several ways."""
+
+    fractions: Tensor
+    slopes: Tensor | None
+    opacities: Tensor
+    log_volumes: Tensor
+
+    @property
+    def contribution(self) -> Tensor:
+        return self.fractions.sum(0)
+
+    @property
+    def temporal(self) -> Tensor:
+        return (self._volumes() * self._variation()).sum(0)
+
+    @property
+    def variation(self) -> Tensor:
+        """(N,) sum_k gamma(k) g(k) C(k), the spatio-temporal variation score of 4DGS-1K (Yuan et al. 2025) for a
+        canonical form that moves.
+
+        gamma(k) = V(k)^0.1 with the volume V, over that of the mean Gaussian; g(k) = 1 / (tanh(4 |d(k)|) / 2 + 1/2) in
+        (1, 2] with the second difference d of the profile p over moments. p is the opacity over its maximum where it
+        changes, and otherwise what is seen, C, smoothed by [1 2 1] / 4, over its maximum.
+        """
+        return (self._volumes() * self._variation() * self.fractions).sum(0)
+
+    def _volumes(self) -> Tensor:
+        return (VOLUME_POWER * (self.log_volumes - self.log_volumes.mean())).exp()
+
+    def _variation(self) -> Tensor:
+        fades = bool((self.opacities != self.opacities[:1]).any())
+        profile = self.opacities if fades else _smoothed(self.fractions)
+        profile = profile / profile.amax(0).clamp_min(torch.finfo(profile.dtype).tiny)
+        padded = torch.cat([profile[:1], profile, profile[-1:]])
+        bend = padded[2:] - 2 * profile + padded[:-2]
+        return 1 / (0.5 * torch.tanh(STEEPNESS * bend.abs()) + 0.5)
+
+
+@torch.no_grad()
+def importance(views: ScoringViews, *, slopes: bool) -> Importance:
+    """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the larger half."""
+    scene, options, behind = views.scene, views.options, views.background
+    fractions, opacities, volumes, squares = [], [], [], torch.zeros((), device=behind.device)
+    for time in views.times:
+        moment = scene.time_step(time)
+        now = moment.gaussians
+        sums = [contributions(now, camera, options)[0] for camera in views.cameras]
+        fractions.append(torch.stack(sums).sum(0))
+        opacities.append(now.opacities)
+        volumes.append(now.log_scales.sum(1))
+        if slopes:
+            shader = scene.shader(moment)
+            for camera in views.cameras:
+                squares = squares + sensitivities(now, camera, options, background=behind, shader=shader)[0]
+    return Importance(torch.stack(fractions), squares if slopes else None, torch.stack(opacities), torch.stack(volumes))
+
+
+def highest(scores: Tensor, fraction: float) -> Tensor:
+    """Return (N,) bool: all but the lowest ``fraction`` of ``scores`` (N,), at least one; of equal ones the first."""
+    count = min(max(1, math.ceil(len(scores) * (1 - fraction) - 1e-9)), len(scores))
+    kept = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
+    kept[torch.sort(scores, descending=True, stable=True).indices[:count]] = True
+    return kept
+
+
+def _smoothed(x: Tensor) -> Tensor:
+    """Return (K, N) by [1 2 1] / 4 over K, ends repeated."""
+    padded = torch.cat([x[:1], x, x[-1:]])
+    return (padded[:-2] + 2 * x + padded[2:]) / 4
+
 
 MOVING_VIEWS, MOVING_TIMES = 8, 24  # Numbers of training cameras and times whose pairs are scored in dynamic scenes
 STILL_VIEWS = 100
@@ -73,10 +162,10 @@ class PruneStage:
 def prune_(trainer: GaussianTrainer) -> Pruned:
     """Prune and mask the Gaussians of ``trainer`` as its configuration says; from here on their number stays."""
     trainer.model.exchange(trainer.model.scene.unmasked())
-    before, whole = len(trainer.model.scene), training_quality(trainer, trainer.model.scene)
-    remove_(trainer, chosen_scores(trainer) if trainer.config.prune.fraction > 0 else None)
+    before, whole = len(trainer.model.scene), quality_of(trainer, trainer.model.scene)
+    remove_(trainer, scores_of(trainer, trainer.config.prune) if trainer.config.prune.fraction > 0 else None)
     scene, active = trainer.model.scene, 1.0
-    loss = whole - training_quality(trainer, scene.unmasked())
+    loss = whole - quality_of(trainer, scene.unmasked())
     if scene.masks is not None:
         masks = scene.masks
         active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in range(len(masks.times) - 1))
@@ -99,28 +188,17 @@ def remove_(trainer: GaussianTrainer, scores: Tensor | None) -> None:
 
 
 @torch.no_grad()
-def chosen_scores(trainer: GaussianTrainer) -> Tensor:
-    """Return (N,) the score that the configuration asks for."""
-    options, scene = trainer.config.prune, trainer.model.scene.unmasked()
-    return scores_of(importance(scoring_views(trainer, scene), slopes=options.score == "sensitivity"), options)
-
-
-def scores_of(found: Importance, options: PruneConfig) -> Tensor:
-    """Return (N,) the score asked for."""
-    match options.score:
+def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
+    """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first of docs/prune.md."""
+    score, scene = (options or PruneConfig()).score, trainer.model.scene.unmasked()
+    found = importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
+    match score:
         case "variation":
             return found.variation
         case "temporal":
             return found.temporal
         case "contribution" | "sensitivity":
             return found.contribution if found.slopes is None else found.slopes
-
-
-@torch.no_grad()
-def default_scores(trainer: GaussianTrainer) -> Tensor:
-    """Return (N,) how much each Gaussian matters now: the first score of docs/prune.md."""
-    scene = trainer.model.scene.unmasked()
-    return scores_of(importance(scoring_views(trainer, scene), slopes=True), PruneConfig())
 
 
 def distinct_cameras(cameras: Sequence[Cameras], count: int) -> list[Cameras]:
@@ -145,12 +223,6 @@ def scoring_views(
     return ScoringViews(scene, cameras, times, trainer.model.options, background)
 
 
-@torch.no_grad()
-def training_quality(trainer: GaussianTrainer, scene: GaussianScene) -> float:
-    """Return the mean PSNR of at most 16 training images drawn of ``scene``, dB."""
-    return quality_of(trainer, scene, probe_images(trainer))
-
-
 def probe_images(trainer: GaussianTrainer) -> list[Image]:
     """Return at most 16 training images, evenly chosen."""
     return [trainer.images[i] for i in evenly_spaced(len(trainer.images), PROBED_VIEWS)]
@@ -158,13 +230,16 @@ def probe_images(trainer: GaussianTrainer) -> list[Image]:
 
 @torch.no_grad()
 def quality_of(
-    trainer: GaussianTrainer, scene: GaussianScene, images: Sequence[Image], alpha_min: float | None = None
+    trainer: GaussianTrainer,
+    scene: GaussianScene,
+    images: Sequence[Image] | None = None,
+    alpha_min: float | None = None,
 ) -> float:
-    """Return the mean PSNR of ``images`` drawn of ``scene``, dB; ``alpha_min`` instead of that of training."""
+    """Return the mean PSNR of ``images`` drawn of ``scene``, dB; by default of ``probe_images``, as in training."""
     background, options = sent(background_colour(trainer.background), trainer.device), trainer.model.options
     options = options if alpha_min is None else replace(options, alpha_min=alpha_min)
     scene, values = scene.to(trainer.device), []
-    for image in images:
+    for image in probe_images(trainer) if images is None else images:
         drawn = scene.render(image.cameras, image.time, options=options, background=background).rgb[0]
         values.append(psnr(drawn, image.composite(background), image.mask))
     return fmean(values)

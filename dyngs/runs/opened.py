@@ -193,7 +193,7 @@ class Opened(LoadedRun):
         Raises:
             DyngsError: it is no person, or the file cannot be read.
         """
-        from dyngs.human.motion.read import read_motion  # late: scipy's rotations, which no other drawing needs
+        from dyngs.human.motion.retarget import read_motion  # late: scipy's rotations, which no other drawing needs
 
         person, model = self._person_for(f"--motion {path}")
         scene = person.to("cpu")

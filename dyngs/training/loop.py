@@ -1,9 +1,12 @@
-"""The training loop: steps until the end, and events that tell of them."""
+"""The training loop: steps until the end or an interrupt, and events that tell of them."""
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable
-from typing import Protocol
+from types import FrameType, TracebackType
+from typing import Any, Protocol
 
 from dyngs.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint
@@ -96,3 +99,30 @@ class Loop:
             if self._advice is None:
                 raise
             raise DyngsError(f"{error}. {self._advice()}") from error
+
+
+class Interrupts:
+    """A context manager in which the first Ctrl-C or SIGTERM only sets ``requested``; a second Ctrl-C raises as usual.
+
+    Does nothing outside the main thread, where Python delivers no signals.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Interrupts:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {s: signal.signal(s, self._request) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for which, handler in self._before.items():
+            signal.signal(which, handler)
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.requested = True

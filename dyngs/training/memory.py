@@ -111,7 +111,8 @@ class MemoryForecast:
         if self.free is None or self._growth <= self.free:
             return None
         needed = self.program + self._growth
-        return f"about {_gb(needed)} GB of {self._place} are needed, and {self._there}: give {self._advice()}"
+        there = f"{_gb(self.free + self.program)} are there"
+        return f"about {_gb(needed)} GB of {self._place} are needed, and {there}: give {self._advice()}"
 
     def require_possible(self) -> None:
         """Raise where the run certainly needs more than this machine, or its container, can ever give it."""
@@ -131,10 +132,6 @@ class MemoryForecast:
     def _growth(self) -> int:
         """Bytes that all processes on this machine will still take."""
         return self.processes * (self.total - self.program)
-
-    @property
-    def _there(self) -> str:
-        return f"{_gb((self.free or 0) + self.program)} are there"
 
     @property
     def _fraction(self) -> int:

@@ -32,7 +32,7 @@ from dyngs.ops.loss import l1_ssim_loss
 from dyngs.state import fields_moved_to
 from dyngs.tensor_checks import require_tensor
 from dyngs.training.events import StepReport
-from dyngs.training.sampler import ViewSampler
+from dyngs.training.trainer import ViewSampler
 
 SQUARED_WEIGHT = 1.0  # Weight of the mean squared error in the loss, which counts edges more
 WARM_UP = 0.05  # Fraction of the run in which the highest learning rate is reached

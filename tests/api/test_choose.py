@@ -15,8 +15,7 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
-from dyngs.api.view_scores import explained_pixels
+from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, explained_pixels, write_choices
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
 from dyngs.config.io import load_config, packaged_preset

@@ -50,7 +50,8 @@ def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -
 def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     once = prune_run(run_dir, tmp_path / "once", ASKED)
     twice = prune_run(once, tmp_path / "twice", ("prune.fraction=0.5", "prune.steps=2"))
-    thrice = prune_within(twice, tmp_path / "thrice", 50.0, BRIEFLY, silent).folder
+    thrice = tmp_path / "thrice"
+    prune_within(twice, thrice, 50.0, BRIEFLY, silent)
     sizes = [len(load_run(folder).scene) for folder in (run_dir, once, twice, thrice)]
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
     assert load_run(twice).step == 32
@@ -61,13 +62,13 @@ def test_on_a_gpu_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pyt
     """The search, its file, and the comparison with the run before."""
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
-    here = compared([run_dir, file_of(expected.folder)], 1)
+    here = compared([run_dir, file_of(tmp_path / "here")], 1)
     monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
     with pretend_gpu():
         found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
-        there = compared([run_dir, file_of(found.folder)], 1, GPU)
-    assert replace(found, folder=expected.folder) == expected
-    files = [file_of(x.folder) / SCENE_FILE for x in (found, expected)]
+        there = compared([run_dir, file_of(tmp_path / "there")], 1, GPU)
+    assert found == expected
+    files = [file_of(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert [replace(x, fps=1) for x in there] == [replace(x, fps=1) for x in here]
 
@@ -75,17 +76,19 @@ def test_on_a_gpu_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pyt
 def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     """On views that fine-tuning has not seen; and it is the same each time."""
     told: list[str] = []
+    folder = tmp_path / "a"
     first, again = (prune_within(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b"))
+    assert first == again
     assert told[: len(told) // 2] == told[len(told) // 2 :]
-    for path in (checkpoint_paths(first.folder)[-1], file_of(first.folder) / SCENE_FILE):
-        assert path.read_bytes() == (again.folder / path.relative_to(first.folder)).read_bytes()
+    for path in (checkpoint_paths(folder)[-1], file_of(folder) / SCENE_FILE):
+        assert path.read_bytes() == (tmp_path / "b" / path.relative_to(folder)).read_bytes()
     assert first.before - first.after <= 1.0
-    config = load_resolved(first.folder)
+    config = load_resolved(folder)
     trainer = assemble(config, restored=True)
-    trainer.restore(latest_checkpoint(first.folder))
+    trainer.restore(latest_checkpoint(folder))
     shown = [trainer.images[i] for i in evenly_held_out(len(trainer.images))]
-    assert quality_of(trainer, load_run(file_of(first.folder)).scene, shown) == pytest.approx(first.after, abs=1e-4)
-    before, after = compared([run_dir, file_of(first.folder)], 1)
+    assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(first.after, abs=1e-4)
+    before, after = compared([run_dir, file_of(folder)], 1)
     assert after.num_gaussians < before.num_gaussians
     assert after.stored is not None
     assert after.stored < before.megabytes
@@ -98,7 +101,7 @@ def test_where_nothing_can_go_the_run_stays_as_it_is(
     """Every candidate is worse by 5 dB than what was there."""
     monkeypatch.setattr("dyngs.prune.search.apply_cut", _spoil)
     promise = prune_within(run_dir, tmp_path / "same", 0.2, BRIEFLY, silent)
-    assert checkpoint_paths(promise.folder)[-1].read_bytes() == checkpoint_paths(run_dir)[-1].read_bytes()
+    assert checkpoint_paths(tmp_path / "same")[-1].read_bytes() == checkpoint_paths(run_dir)[-1].read_bytes()
     assert str(promise).startswith("nothing can be taken away for 0.2 dB: the run is as it was")
     assert all(limit.refused is not None and limit.refused[1] > 0.2 for limit in promise.limits[:-1])
     assert promise.before - promise.after <= 0.2

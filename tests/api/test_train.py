@@ -13,9 +13,10 @@ import pytest
 import torch
 from moving_scene import write_timed_capture
 from tiny_fields import KINDS, busy_config, write_tiny_capture
+from tiny_people import NET, people
 from torch import Tensor
 
-from dyngs.api.train import train
+from dyngs.api.train import train, with_capture
 from dyngs.config import (
     Config,
     DataConfig,
@@ -455,3 +456,10 @@ def _spoil_in_step(step: int, monkeypatch: pytest.MonkeyPatch, value: float) -> 
         return real(trainer)
 
     monkeypatch.setattr(Trainer, "step", stepping)
+
+
+def test_the_captures_of_a_network_are_left_as_they_are(tmp_path: Path) -> None:
+    """The folder of captures is itself no capture, and holds many images below."""
+    root = people(tmp_path, (1,))
+    config = Config.model_validate({"data": {"root": root}, "model": NET})
+    assert with_capture(config) == config

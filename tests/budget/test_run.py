@@ -13,7 +13,7 @@ from limited import limited, said
 from dyngs.budget.run import STAGES, stage
 from dyngs.config import Config, DataConfig, PruneConfig, RandomInit, StaticModel, TrainConfig
 from dyngs.kinds import assemble
-from dyngs.prune.stage import training_quality
+from dyngs.prune.stage import quality_of
 from dyngs.training.events import Event, Message, TopologyChanged
 
 PLAIN = Config(data=DataConfig(root=Path("nowhere")))
@@ -53,10 +53,10 @@ def test_a_removal_is_told_with_what_it_costs(still: Path) -> None:
     run = limited(assemble(config))
     told: list[Event] = []
     run.loop.subscribe(told.append)
-    whole = training_quality(run.trainer, run.trainer.model.scene)
+    whole = quality_of(run.trainer, run.trainer.model.scene)
     first = run.trainer.model.scene.gaussians.means[:10].detach().clone()
     before, after = run.remove(torch.arange(40) < 10)
-    assert before == whole != after == training_quality(run.trainer, run.trainer.model.scene)
+    assert before == whole != after == quality_of(run.trainer, run.trainer.model.scene)
     assert torch.equal(run.trainer.model.scene.gaussians.means, first)
     assert told == [TopologyChanged(0, 40, 10)]
     texts = said(run)

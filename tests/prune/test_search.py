@@ -77,7 +77,7 @@ def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> No
     search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.images[0]])
     assert (search.held_out, trainer.held_out) == ((), frozenset())
     assert search.views == "1 view never trained on"
-    whole = search.run(-100.0).accepted
+    whole = search.accepted(-100.0)[0]
     assert [candidate.cut for candidate in whole] == [Cut()]
     assert whole[0].psnr == search._reference
 

@@ -13,7 +13,7 @@ from moving_scene import write_moving_run
 
 import dyngs
 from dyngs.api.train import train
-from dyngs.capture.inspection.camera_plot import draw_cameras
+from dyngs.capture.inspection.report import draw_cameras
 from dyngs.config import DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.data.read import read_capture

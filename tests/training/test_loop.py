@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -10,7 +12,7 @@ from steps import Counting
 from dyngs.errors import DyngsError
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import Event, Message, Started, StepDone, TotalChanged
-from dyngs.training.loop import Loop
+from dyngs.training.loop import Interrupts, Loop
 
 
 def looped(
@@ -136,3 +138,34 @@ def test_the_watch_leaves_pauses_out() -> None:
     assert 1000 <= watch.seconds - before < 1060
     watch.pause(400)
     assert 600 <= watch.seconds - before < 660
+
+
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_only_noted(which: signal.Signals) -> None:
+    before = signal.getsignal(which)
+    with Interrupts() as interrupts:
+        assert not interrupts.requested
+        signal.raise_signal(which)
+        assert interrupts.requested
+    assert signal.getsignal(which) is before
+
+
+def test_a_second_ctrl_c_insists() -> None:
+    with Interrupts() as interrupts:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupts.requested
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_other_threads_may_train_too() -> None:
+    seen = []
+
+    def work() -> None:
+        with Interrupts() as interrupts:
+            seen.append(interrupts.requested)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [False]

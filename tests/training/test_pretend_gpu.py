@@ -177,7 +177,7 @@ def test_views_are_drawn_and_scored_there_alike(
     for few in (
         "human.avatar.pose_fit.WINDOW",
         "human.avatar.pose_fit.MOST_WINDOWS",
-        "training.corrections.camera_fit.UPDATES",
+        "training.corrections.camera_refinement.FIT_UPDATES",
     ):
         monkeypatch.setattr(f"dyngs.{few}", 2)
     kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from moving_scene import TRAIN_TIMES, write_timed_capture
 from torch import Tensor
 
@@ -41,6 +43,7 @@ from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.kinds import GaussianTrainer, assemble, restored_scene
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
 from dyngs.state import Role, State, with_role
+from dyngs.training.trainer import ViewSampler
 
 
 @pytest.fixture(scope="module")
@@ -487,3 +490,44 @@ def test_two_equal_views_in_a_step_are_one_seen_twice(tmp_path: Path) -> None:
     assert torch.equal(2 * seen["seen"], twice["seen"])
     torch.testing.assert_close(2 * seen["grad_sum"], twice["grad_sum"])
     assert losses == pytest.approx(others, rel=1e-6)
+
+
+def anything(index: int) -> bool:
+    return True
+
+
+def test_each_epoch_is_a_new_permutation() -> None:
+    sampler, generator = ViewSampler(20), torch.Generator().manual_seed(0)
+    first, second = ([sampler.next(generator, anything) for _ in range(20)] for _ in range(2))
+    assert sorted(first) == sorted(second) == list(range(20))
+    assert first != second
+
+
+def test_a_restored_sampler_goes_on_as_if_never_stopped() -> None:
+    sampler, generator = ViewSampler(5), torch.Generator().manual_seed(1)
+    for _ in range(7):
+        sampler.next(generator, anything)
+    other, again = ViewSampler(5), torch.Generator()
+    other.load_state({name: x.clone() for name, x in sampler.state().items()})
+    again.set_state(generator.get_state())
+    assert [sampler.next(generator, anything) for _ in range(9)] == [other.next(again, anything) for _ in range(9)]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sets(st.integers(0, 9), min_size=1), st.integers(0, 100))
+def test_only_what_is_wanted_is_drawn_and_each_once_per_epoch(wanted: set[int], seed: int) -> None:
+    sampler, generator = ViewSampler(10), torch.Generator().manual_seed(seed)
+    for _ in range(3):
+        epoch = [sampler.next(generator, lambda i: i in wanted) for _ in wanted]
+        assert sorted(epoch) == sorted(wanted)
+
+
+def test_views_that_are_not_wanted_do_not_cost_randomness() -> None:
+    """As long as an epoch lasts, whatever is passed over: the generator is drawn from once."""
+    sampler, generator = ViewSampler(6), torch.Generator().manual_seed(0)
+    sampler.next(generator, lambda i: i == 3)
+    state = generator.get_state()
+    rest = 6 - int(sampler.state()["position"])
+    for _ in range(rest):
+        sampler.next(generator, anything)
+    assert torch.equal(generator.get_state(), state)

@@ -9,9 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.capture.multi_video.films import VIDEOS_FILE, Film, open_film, read_given, shrunk_grey
-from dyngs.capture.multi_video.lags import motion_of
-from dyngs.capture.multi_video.steadiness import STANDS, displaced_by, displacement
+from dyngs.capture.multi_video.films import (
+    STANDS,
+    VIDEOS_FILE,
+    Film,
+    displaced_by,
+    displacement,
+    open_film,
+    read_given,
+    shrunk_grey,
+)
+from dyngs.capture.multi_video.starts import motion_of
 from dyngs.data.images.video import opened_video, orientation_of, read_frames, videos_in
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import as_word, counted, reading

@@ -12,10 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dyngs.capture.multi_video.camera_poses import FixedModel, camera_name, fixed_model, image_without_movers
-from dyngs.capture.multi_video.films import VIDEOS_FILE, Film, checked_starts, open_film, read_given, small_images
-from dyngs.capture.multi_video.lags import Watcher, motion_of
-from dyngs.capture.multi_video.starts import found_starts, given_starts
-from dyngs.capture.multi_video.steadiness import STANDS, displaced_by
+from dyngs.capture.multi_video.films import (
+    STANDS,
+    VIDEOS_FILE,
+    Film,
+    checked_starts,
+    displaced_by,
+    open_film,
+    read_given,
+    small_images,
+)
+from dyngs.capture.multi_video.starts import Watcher, found_starts, given_starts, motion_of
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import read_numbered_frames, videos_in

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dyngs.data.images.exif import rotated_upright
-from dyngs.data.images.images import files_in
+from dyngs.data.images.images import files_in, rotated_upright
 from dyngs.errors import DyngsError, reading, reason
 from dyngs.files.containment import check_size
 from dyngs.files.wrong_place import VIDEO_SUFFIXES as VIDEO_SUFFIXES

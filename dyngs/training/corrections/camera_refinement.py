@@ -18,7 +18,11 @@ from torch import Tensor
 from dyngs.adam import AdamState
 from dyngs.camera import Cameras
 from dyngs.data.capture import View
+from dyngs.data.loader import Image
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.ops.adam import Count, adam_step_
+from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.tensor_checks import require_tensor
 
@@ -213,3 +217,45 @@ class CameraRefinement:
 
     def _values(self) -> dict[str, Tensor]:
         return {POSES: self.corrections.poses, LENSES: self.corrections.lenses}
+
+
+FIT_UPDATES = 60
+FIRST_FIT_RATE, LAST_FIT_RATE = (
+    2e-3,
+    1e-4,
+)  # Learning rates, rad, and as a fraction of the scene's size; log-linear between
+FIT_SSIM_WEIGHT = 0.2
+
+
+def fitted_to_image(
+    scene: GaussianScene,
+    image: Image,
+    background: Tensor,
+    size: float,
+    *,
+    options: RenderOptions | None = None,
+    weights: Tensor | None = None,
+) -> Image:
+    """Return ``image`` with its camera moved to where the scene looks most like it (iNeRF, Yen-Chen et al. 2021).
+
+    The lens stays.
+    """
+    options, truth = options or scene.options, image.composite(background)
+    counts = image.mask if weights is None or image.mask is None else weights * image.mask
+    counts = weights if counts is None else counts
+    correction = torch.zeros(1, 6, device=image.cameras.cam_from_world.device)
+    first, second = torch.zeros_like(correction), torch.zeros_like(correction)
+    best, least = correction.clone(), float("inf")
+    for update in range(1, FIT_UPDATES + 1):
+        camera = watched(corrected(image.cameras, correction[0], None, size))
+        with torch.enable_grad():
+            rendered = scene.render(camera, image.time, options=options, background=background).rgb[0]
+            loss = l1_ssim_loss(rendered, truth, FIT_SSIM_WEIGHT, counts)
+            by_pose, by_intrinsics = torch.autograd.grad(loss, [camera.cam_from_world, camera.intrinsics])
+        if float(loss.detach()) < least:
+            best, least = correction.clone(), float(loss.detach())
+        rate = FIRST_FIT_RATE * (LAST_FIT_RATE / FIRST_FIT_RATE) ** (update / FIT_UPDATES)
+        adam_step_(
+            correction, slopes(camera, by_pose, by_intrinsics, size)[0][None], first, second, lr=rate, step=update
+        )
+    return replace(image, cameras=corrected(image.cameras, best[0], None, size))

@@ -29,7 +29,7 @@ from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
 from dyngs.state import tensors_of
 from dyngs.tensor_checks import require_tensor
-from dyngs.training.shared_places import Draw, log_gains
+from dyngs.training.other_views import Draw, log_gains
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little to compare with."""

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
+from dyngs.data.geometry import focus_point
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
-from dyngs.training.priors.depth_maps import DepthForm, values_of
+from dyngs.training.priors.used import DepthForm, values_of
 
 PAIRS = 12  # Pairs of images that are compared
 MARGIN = 0.97  # A prior must lower the error at least to this fraction of its substitute's
@@ -91,8 +92,8 @@ def depth_agreement(triples: Sequence[tuple[Image, Image, Image]], distance: flo
         guesses = [list(_aligned_guesses(first.depth, kind, distance)) for kind in kinds]
         constant = [torch.full_like(first.depth, z) * (first.depth > 0) for z in _depths(distance)]
         for i, tried in enumerate((*guesses, constant)):
-            best = min(tried, key=lambda depth: _warp_error(first, second, depth))
-            sums[i] += _warp_error(first, third, best)
+            best = min(tried, key=lambda depth: float(_warp_errors(first, second, depth).mean()))
+            sums[i] += float(_warp_errors(first, third, best).mean())
         count += 1
     plain, inverse, constant_error = (float(x) / max(count, 1) for x in sums)
     kind = kinds[int(inverse < plain)]
@@ -141,10 +142,6 @@ def _aligned_guesses(given: Tensor, kind: DepthForm, distance: float) -> Iterato
             yield torch.where(known, at if kind == "depth" else 1 / at, 0.0)
 
 
-def _warp_error(first: Image, second: Image, depth: Tensor) -> float:
-    return float(_warp_errors(first, second, depth).mean())
-
-
 def _warp_errors(first: Image, second: Image, depth: Tensor) -> Tensor:
     """Return differences of an image from another one that is warped to it by ``depth`` (H, W), where that is known.
 
@@ -190,8 +187,6 @@ def _blurred(pixels: Tensor) -> Tensor:
 
 def distance_to_scene(cameras: Sequence[Cameras]) -> float | None:
     """Return the median distance of cameras from the point that they look at, None where their axes are parallel."""
-    from dyngs.data.geometry import focus_point
-
     poses = torch.linalg.inv(torch.cat([c.cam_from_world for c in cameras]).double())
     focus = focus_point(poses.numpy())
     if focus is None:

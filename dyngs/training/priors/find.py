@@ -22,9 +22,7 @@ from dyngs.training.priors.agreement import (
     spread_pairs,
     track_agreement,
 )
-from dyngs.training.priors.depth_maps import DepthForm
-from dyngs.training.priors.point_motion import Glance
-from dyngs.training.priors.used import MIN_POINTS, PointTracks, UsedPriors
+from dyngs.training.priors.used import MIN_POINTS, DepthForm, Glance, PointTracks, UsedPriors
 
 _NEAR_TIME = 0.1  # Depth is judged by images whose times differ by less; the less, the less has moved
 _BASELINE = 0.1

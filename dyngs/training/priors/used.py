@@ -1,19 +1,139 @@
-"""The priors that a run uses: what they need to be drawn, and their losses."""
+"""The priors that a run uses (depth maps, flow, tracks): what they need to be drawn, and their losses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.model import Look, Loss
-from dyngs.training.priors.depth_maps import DepthForm, depth_error
-from dyngs.training.priors.point_motion import Glance, displacements, flow_error, track_error
+
+_SOFT_PX = 0.5  # Charbonnier's constant, px: smaller errors count quadratically
+
+
+@dataclass(frozen=True)
+class Glance:
+    """The camera and time of another image of the same scene."""
+
+    cameras: Cameras
+    time: float
+
+
+def displacements(start: Gaussians, end: Gaussians, here: Cameras, there: Cameras, options: RenderOptions) -> Tensor:
+    """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights it stands for.
+
+    Differentiable in the means of both, not in how much each Gaussian covers.
+    """
+    (from_px, from_z), (to_px, to_z) = _projected(start.means, here), _projected(end.means, there)
+    seen = (from_z > options.near) & (to_z > options.near)
+    limit = float(here.width + here.height)
+    moved = torch.where(seen[:, None], to_px - from_px, 0.0).clamp(-limit, limit)
+    carried = torch.cat([moved, seen[:, None].to(moved)], dim=1)[None]
+    drawn = render(start.detach(), here, options, shader=lambda *_: carried).rgb[0]
+    total = drawn[..., 2:]
+    return torch.cat([drawn[..., :2] / total.detach().clamp_min(0.1), total], dim=-1)
+
+
+def flow_error(drawn: Tensor, image: Image) -> Tensor | None:
+    """Return the mean Charbonnier error of ``drawn`` (see ``displacements``) in the flow of an image.
+
+    In fractions of the image's longer side, over pixels whose flow is known; None without any.
+    """
+    flow = image.flow
+    if flow is None:
+        return None
+    counts = flow.isfinite().all(-1) & (drawn[..., 2].detach() > _SOLID)
+    if image.mask is not None:
+        counts = counts & (image.mask > 0)
+    if not bool(counts.any()):
+        return None
+    return _charbonnier(drawn[..., :2][counts] - flow[counts]).mean() / max(counts.shape)
+
+
+def track_error(drawn: Tensor, start: Tensor, end: Tensor) -> Tensor | None:
+    """Return the mean Charbonnier error of ``drawn`` at the points ``start`` (P, 2) px, which are at ``end`` (P, 2).
+
+    In fractions of the image's longer side; None where no point lies on anything drawn.
+    """
+    height, width = drawn.shape[:2]
+    grid = (2 * start / start.new_tensor([width, height]) - 1)[None, None]
+    sampled = torch.nn.functional.grid_sample(drawn.permute(2, 0, 1)[None], grid, align_corners=False)[0, :, 0].T
+    counts = sampled[:, 2].detach() > _SOLID
+    if not bool(counts.any()):
+        return None
+    return _charbonnier((start + sampled[:, :2] - end)[counts]).mean() / max(height, width)
+
+
+def _charbonnier(errors: Tensor) -> Tensor:
+    return (errors.square().sum(-1) + _SOFT_PX**2).sqrt() - _SOFT_PX
+
+
+def _projected(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    pose, k = cameras.cam_from_world[0], cameras.intrinsics[0]
+    local = means @ pose[:3, :3].T + pose[:3, 3]
+    depth = local[:, 2]
+    return local[:, :2] / depth.clamp_min(1e-6)[:, None] * k.diagonal()[:2] + k[:2, 2], depth
+
+
+DepthForm = Literal["depth", "inverse"]
+"""Form of the map that is affine in the true depth: the map as it is, or its inverse (the nets of single images)."""
+
+_ROUNDS = 4
+_SOLID = 0.5  # Alpha from which the drawn depth means anything
+_MIN_PIXELS = 16
+_TINY = 1e-6
+
+
+def values_of(depth: Tensor, kind: DepthForm) -> Tensor:
+    """Return the depths, or their inverses with 0 staying 0."""
+    return depth if kind == "depth" else torch.where(depth > 0, 1 / depth.clamp_min(_TINY), 0.0)
+
+
+def aligned(given: Tensor, wanted: Tensor) -> Tensor | None:
+    """Return ``a given + b`` nearest to ``wanted``, both (P,); None where that would turn near and far about.
+
+    Least absolute deviations by reweighted least squares: 10 % of outliers or a moving thing do not tilt it.
+    """
+    weight = torch.ones_like(given)
+    a = b = given.new_zeros(())
+    for _ in range(_ROUNDS):
+        total = weight.sum()
+        mean_x, mean_y = (weight * given).sum() / total, (weight * wanted).sum() / total
+        x = given - mean_x
+        a = (weight * x * (wanted - mean_y)).sum() / (weight * x.square()).sum().clamp_min(_TINY**2)
+        b = mean_y - a * mean_x
+        error = (a * given + b - wanted).abs()
+        weight = 1 / error.clamp_min(0.1 * float(error.median()) + _TINY)
+    return a * given + b if bool(a > 0) else None
+
+
+def depth_error(
+    drawn: Tensor, alpha: Tensor, given: Tensor, kind: DepthForm, mask: Tensor | None = None
+) -> Tensor | None:
+    """Return the mean error of the drawn depth relative to the map; None where there is too little to compare.
+
+    The map is aligned by scale and shift to what is drawn, without a gradient; |difference| over the median of the
+    aligned values (in depth or inverse depth, see ``DepthForm``).
+    """
+    counts = (given > 0) & (drawn > 0) & (alpha.detach() > _SOLID)
+    if mask is not None:
+        counts = counts & (mask > 0)
+    if int(counts.sum()) < _MIN_PIXELS:
+        return None
+    wanted = values_of(drawn[counts], kind)
+    target = aligned(values_of(given[counts], kind), wanted.detach())
+    if target is None:
+        return None
+    return (wanted - target).abs().mean() / wanted.detach().median().clamp_min(_TINY)
+
 
 MIN_POINTS = 4  # Fewest points that two images must share for their tracks to be compared
 WEIGHTS = {"depth": 0.1}  # Weight of a loss term where it is not 1

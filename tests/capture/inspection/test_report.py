@@ -12,8 +12,7 @@ import OpenImageIO as oiio
 import pytest
 from tiny_captures import edit_json, write_cameras_json, write_video
 
-from dyngs.capture.inspection.camera_plot import draw_cameras
-from dyngs.capture.inspection.report import format_report, inspect_capture, report_on
+from dyngs.capture.inspection.report import draw_cameras, format_report, inspect_capture, report_on
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import cam_from_opengl

@@ -24,7 +24,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.errors import DyngsError
 from dyngs.human.motion.motion import Motion
-from dyngs.human.motion.read import read_motion
+from dyngs.human.motion.retarget import read_motion
 from dyngs.human.synthetic.capture import (
     HumanOptions,
     PosedMesh,

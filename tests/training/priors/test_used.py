@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal, cast
 
+import pytest
 import torch
 from moving_scene import MOVING_ROWS, SETUP, Sliding, camera, row_of_balls
 
@@ -10,8 +12,18 @@ from dyngs.data.loader import Image
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.models.model import Drawn, Look, Model
-from dyngs.training.priors.point_motion import Glance
-from dyngs.training.priors.used import PointTracks, UsedPriors
+from dyngs.training.priors.used import (
+    DepthForm,
+    Glance,
+    PointTracks,
+    UsedPriors,
+    aligned,
+    depth_error,
+    displacements,
+    flow_error,
+    track_error,
+    values_of,
+)
 
 HERE = camera(32, 24)
 GENERATOR = torch.Generator().manual_seed(0)
@@ -105,3 +117,106 @@ def test_tracks_in_images_of_another_size() -> None:
     priors = UsedPriors(tracks=PointTracks(xy.expand(2, 4, 2), torch.ones(2, 4, dtype=torch.bool), glances))
     assert terms(priors, image(), speed=0.0)["tracks"] < 1e-6
     assert terms(priors, image())["tracks"] > 0.01
+
+
+def true_depth() -> torch.Tensor:
+    y, x = torch.meshgrid(torch.linspace(0, 1, 12), torch.linspace(0, 1, 16), indexing="ij")
+    return 2 + x + 0.5 * y + (x > 0.5)
+
+
+@pytest.mark.parametrize("kind", ["depth", "inverse"])
+def test_scale_and_shift_do_not_count(kind: DepthForm) -> None:
+    """A map that is affine in the true depth, or in its inverse, has no error."""
+    depth = true_depth()
+    given = 0.3 * depth + 0.2 if kind == "depth" else 1 / (0.5 / depth + 0.1)
+    error = depth_error(depth, torch.ones_like(depth), given, kind)
+    assert error is not None
+    assert float(error) < 1e-5
+
+
+def test_outliers_do_not_tilt_the_alignment() -> None:
+    given = torch.linspace(1, 2, 100)
+    wanted = 3 * given - 1
+    spoiled = wanted.clone()
+    spoiled[::8] = 50
+    found = aligned(given, spoiled)
+    assert found is not None
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0.05)
+    assert aligned(given, -wanted) is None
+
+
+def test_a_step_against_the_gradient_brings_a_wrong_depth_nearer() -> None:
+    truth = true_depth()
+    drawn = truth.clone()
+    drawn[3:6, 3:6] += 0.5
+    drawn.requires_grad_()
+    error = depth_error(drawn, torch.ones_like(drawn), 0.3 * truth, "depth")
+    assert error is not None
+    (slope,) = torch.autograd.grad(error, drawn)
+    assert bool((slope[3:6, 3:6] > 0).all())
+
+
+def test_unknown_transparent_and_masked_pixels_do_not_count() -> None:
+    depth, alpha, mask = true_depth(), torch.ones(12, 16), torch.ones(12, 16)
+    given = depth.clone()
+    given[0] = 0
+    spoiled = depth.clone()
+    spoiled[:3] = 90
+    alpha[1], mask[2] = 0.2, 0
+    error = depth_error(spoiled, alpha, given, "depth", mask)
+    assert error is not None
+    assert float(error) < 1e-5
+    assert depth_error(depth, torch.zeros(12, 16), given, "depth") is None
+
+
+def test_inverses_keep_unknown_pixels() -> None:
+    assert values_of(torch.tensor([0.0, 2.0]), "inverse").tolist() == [0, 0.5]
+
+
+OPTIONS = RenderOptions()
+
+
+def test_what_is_drawn_is_the_displacement_of_the_gaussian_that_shows() -> None:
+    """One ball moves along x at the depth of its centre: focal length times motion over depth."""
+    here = camera(32, 24)
+    start = row_of_balls(1)
+    moved = start.replace(means=start.means + torch.tensor([0.1, 0.0, 0.0]))
+    drawn = displacements(start, moved, here, here, OPTIONS)
+    pose = here.cam_from_world[0]
+    before, after = (x.means[0] @ pose[:3, :3].T + pose[:3, 3] for x in (start, moved))
+    focal = here.intrinsics[0].diagonal()[:2]
+    wanted = focal * (after[:2] / after[2] - before[:2] / before[2])
+    shown = drawn[..., 2] > 0.5
+    assert bool(shown.any())
+    torch.testing.assert_close(drawn[shown][:, :2], wanted.expand(int(shown.sum()), 2), rtol=0, atol=1e-3)
+
+
+def test_gradients_move_the_gaussians_to_where_flow_says() -> None:
+    here = camera(32, 24)
+    start = row_of_balls(1)
+    end = (start.means.clone()).requires_grad_()
+    drawn = displacements(start, start.replace(means=end), here, here, OPTIONS)
+    flow = torch.full((24, 32, 2), torch.nan)
+    flow[drawn[..., 2].detach() > 0.5] = torch.tensor([3.0, 0.0])
+    image = Image("a", here, torch.zeros(24, 32, 3), None, None, 0.0, flow=flow)
+    error = flow_error(drawn, image)
+    assert error is not None
+    (slope,) = torch.autograd.grad(error, end)
+    along = here.cam_from_world[0, :3, :3] @ slope[0]
+    assert float(along[0]) < 0  # the loss falls where the point goes to the right in the image
+    assert flow_error(drawn.detach(), replace(image, flow=torch.full((24, 32, 2), torch.nan))) is None
+    assert flow_error(drawn.detach(), replace(image, mask=torch.zeros(24, 32))) is None
+
+
+def test_tracks_are_right_where_the_points_go() -> None:
+    drawn = torch.zeros(24, 32, 3)
+    drawn[..., 2] = 1
+    drawn[:, 16:, 0] = 4
+    start = torch.tensor([[20.0, 5.0], [4.0, 7.0]])
+    exact = track_error(drawn, start, torch.tensor([[24.0, 5.0], [4.0, 7.0]]))
+    wrong = track_error(drawn, start, start)
+    assert exact is not None
+    assert wrong is not None
+    assert float(exact) == 0
+    assert float(wrong) > 0.04
+    assert track_error(torch.zeros(24, 32, 3), start, start) is None

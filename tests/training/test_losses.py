@@ -9,7 +9,7 @@ from scenes import random_scene
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
-from dyngs.training.step_check import StepCheck
+from dyngs.training.losses import StepCheck
 
 CPU = torch.device("cpu")
 MOVES_BY = "field", "model.deform"
