@@ -212,6 +212,20 @@ def run_python(code: str) -> str:
     return done.stdout
 
 
+def test_every_mutation_names_a_place_and_its_tests() -> None:
+    """``benchmarks/mutate.py`` breaks places by their text, which must be there once."""
+    table = next(
+        node.value
+        for node in ast.parse((ROOT / "benchmarks/mutate.py").read_text(encoding="utf-8")).body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "MUTATIONS"
+    )
+    for file, text, changed, tests in ast.literal_eval(table):
+        assert (ROOT / "dyngs" / file).read_text(encoding="utf-8").count(text) == 1, (file, text)
+        assert text != changed
+        assert tests.split(), file
+        assert all((ROOT / "tests" / test).is_file() for test in tests.split()), (file, tests)
+
+
 def test_import_is_cheap() -> None:
     """One of three processes suffices, because a busy machine only ever makes it slower."""
     code = "import time, torch, numpy; t = time.perf_counter(); import dyngs; print(time.perf_counter() - t)"
