@@ -155,7 +155,7 @@ STEPS, FEWEST_STEPS = 2000, 1000  # Most steps of a small run; with fewer than t
 """Whether anything moves takes the former: of a cloth of 64 px, seen once per time, 1,200 steps found 0.2 dB (standard
 error 0.3) where full runs differ by 2.8 dB; 2,000 steps found 1.0 (0.4)."""
 SPENT = 0.1  # Most of a run's work that small runs may take
-STEP_COST, GAUSSIAN_COST = 20_000, 2  # Work of a step beside its images, and of a Gaussian in it, in pixels
+STEP_COST, GAUSSIAN_COST = 20_000, 2  # Work of a step next to its images, and of a Gaussian in it, in pixels
 FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""

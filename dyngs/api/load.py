@@ -24,7 +24,7 @@ def load(path: Path | str) -> GaussianScene:
 
     Args:
         path: a run folder (its newest checkpoint, or its ``scene.dyngs``), a ``scene.dyngs`` with the ``config.yaml``
-            of its run beside it, an avatar file (``.safetensors``), or a file of Gaussians such as a 3DGS ``.ply``.
+            of its run next to it, an avatar file (``.safetensors``), or a file of Gaussians such as a 3DGS ``.ply``.
 
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.

@@ -28,7 +28,7 @@ USUAL_MORE, UNSEEN = 4000.0, (0.25, 1.0, 2.0)
 """Gaussians that a change usually adds, for a preview that saw none, and the factors on them for the range. Seen:
 colmap_small 3,300 (100 px), stage 1,900 (100 px), fox 7,800 (200 px and 480 px), lego 7,400."""
 PACE, PACE_UNSEEN, MEMORY = 1.3, 2.0, 1.2
-"""Factors, up and down, by which time and memory may differ beside that; time more where no growth was seen, either."""
+"""Factors, up and down, by which time and memory may differ besides; time more where no growth was seen, either."""
 OUTLIER = 4.0
 """Steps that took so many times longer than usual did something else, too."""
 FIRST = 5

@@ -1,4 +1,4 @@
-"""Photos for structure from motion: found below a folder, made readable, rotated upright, masks beside them."""
+"""Photos for structure from motion: found below a folder, made readable, rotated upright, masks next to them."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def copied(source: Path, target: Path) -> None:
 
 
 def lay_out(photos: list[Photo], stored_in: Path, images: Path, masks: dict[str, Path]) -> list[str]:
-    """Write upright images under plain names into ``images`` for COLMAP, masks beside; return the names.
+    """Write upright images under plain names into ``images`` for COLMAP, masks next to; return the names.
 
     COLMAP ignores the orientation of EXIF, and its lists of pairs cannot hold names with white space. The folder must
     not outlive the work, as files in it may be links to the photos; images that are there already are left.

@@ -107,7 +107,7 @@ def estimate_poses(
 ) -> SfmResult:
     """Estimate poses of the images in ``source`` and write a COLMAP capture (``out/images``, ``out/sparse/0``).
 
-    Work is done in a hidden folder beside ``out``; the capture is renamed at the end, so ``out`` is complete or absent.
+    Work is done in a hidden folder next to ``out``; it is renamed at the end, so ``out`` is complete or absent.
     A stopped run leaves that folder, and the next one with the same images and options goes on with its features and
     matches. Of several models the one with most images is kept. Raises DyngsError: too few images, an ``out`` in use, a
     camera that stands still or only rotates, or nothing could be registered, with advice.

@@ -129,7 +129,7 @@ def _enter_focal_lengths(task: SfmTask) -> None:
 _EXHAUSTIVE_PHOTOS, _EXHAUSTIVE_FRAMES = 60, 24
 _STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Distances in the order of names at which images are compared: dense near, sparse far (loops of a few seconds)."""
-_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24  # images that look most alike, compared with each one beside its neighbours
+_ALIKE_FRAMES, _ALIKE_PHOTOS = 6, 24  # images that look most alike, compared with each one next to its neighbours
 _WORDS, _SAMPLE, _ROUNDS = 64, 20_000, 8
 
 

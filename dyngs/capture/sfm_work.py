@@ -160,7 +160,7 @@ _KEY, _LOCK = "task.txt", "lock"
 
 @contextmanager
 def working(out: Path, task: str) -> Iterator[Path]:
-    """Yield the hidden work folder beside ``out``, which holds what a stopped run of the same task has done.
+    """Yield the hidden work folder next to ``out``, which holds what a stopped run of the same task has done.
 
     It is removed when the block ends, and when it raises an error of ours: what failed once fails again. It stays
     where the user or the system stops the program. ``task``: images and options in words; a folder of another task is

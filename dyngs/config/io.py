@@ -114,7 +114,7 @@ def load_resolved(path: Path, overrides: Iterable[str] = (), data_root: Path | N
 def save_config(config: Config, path: Path) -> None:
     """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the new one.
 
-    A ``data.body`` beside the file is written relative to it, so that their folder may be moved.
+    A ``data.body`` next to the file is written relative to it, so that their folder may be moved.
     """
     values = config.model_dump(mode="json")
     body, beside = config.data.body, path.parent.absolute()

@@ -115,7 +115,7 @@ class ImageLoader:
     Once the cache is full, what is in it stays: where every image is requested once per epoch, in a new order each
     time, the one used last is the one needed last. The same index always gives the same bytes, cached or not, decoded
     ahead or not. Safe to use from several threads. Images are decoded on the CPU. Those given out on a GPU are kept
-    there as far as a quarter of its free memory goes; the others are copied beside its work.
+    there as far as a quarter of its free memory goes; the others are copied next to its work.
 
     Attributes:
         corrected: returns the camera of an image, given the index of its view and its camera by the capture; None: the
@@ -274,7 +274,7 @@ class ImageLoader:
 
     @property
     def bytes_to_come(self) -> int:
-        """Bytes that images will take, in the cache or decoded ahead, beside those that they take now."""
+        """Bytes that images will take, in the cache or decoded ahead, next to those that they take now."""
         every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._options.cache_mb * 1e6))
         return max(every - self.cached_bytes, 0)
 

@@ -23,7 +23,7 @@ from dyngs.files.fields import is_number, read_json_object
 from dyngs.files.write import write_text
 
 SECONDS_FILE = "times.json"
-"""Seconds of the images of a capture, beside them: COLMAP's models have no times."""
+"""Seconds of the images of a capture, next to them: COLMAP's models have no times."""
 SAME_TIME = 1e-6
 """Times closer than this are the same time: files of one capture are often rounded differently."""
 MENTIONED_CHANGE = 0.05

@@ -18,7 +18,7 @@ class Decoder:
     """A multilayer perceptron whose last layer starts at zero.
 
     Args:
-        skip: layer whose input is the features once more, beside the hidden units.
+        skip: layer whose input is the features once more, next to the hidden units.
     """
 
     def __init__(

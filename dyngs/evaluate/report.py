@@ -1,4 +1,4 @@
-"""Measures a finished run on held-out views and writes the report beside it."""
+"""Measures a finished run on held-out views and writes the report next to it."""
 
 from __future__ import annotations
 

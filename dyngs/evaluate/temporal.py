@@ -1,7 +1,7 @@
-"""Quality of a model over time: at each moment, and the flicker of its images before a fixed camera.
+"""Quality of a model over time: at each time step, and the flicker of its images before a fixed camera.
 
-Both measures of flicker are in grey levels of 255 and mean absolute values over pixels, channels and moments, of
-images clamped to [0, 1]. Local letters: R a rendered image, G the true one, t its time, k moments in order.
+Both measures of flicker are in grey levels of 255 and mean absolute values over pixels, channels and time steps, of
+images clamped to [0, 1]. Local letters: R a rendered image, G the true one, t its time, k time steps in order.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NO_TIMES = "the images have no times"
 
 @dataclass(frozen=True)
 class TimeScore:
-    """PSNR (dB) at one moment: the mean of the views taken then."""
+    """PSNR (dB) at one time step: the mean of the views taken then."""
 
     time: float
     psnr: float
@@ -62,8 +62,8 @@ def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeSco
 def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
     """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one camera, without truth.
 
-    Where moments are not evenly spaced, R_k is compared with the straight line between its neighbours: 2 |w R_{k-1} +
-    (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 moments, 20 triples of
+    Where time steps are not evenly spaced, R_k is compared with the line between its neighbours: 2 |w R_{k-1} +
+    (1 - w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 time steps, 20 triples of
     neighbours are taken, evenly spaced. A scene in which nothing moves has 0.
     """
     if drawing.scene.is_static:

@@ -79,7 +79,7 @@ def require_new_folder(out: Path) -> None:
 
 @contextmanager
 def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) -> Iterator[Path]:
-    """Yield a hidden folder beside ``out`` that gets its name when the block ends well, and is removed otherwise.
+    """Yield a hidden folder next to ``out`` that gets its name when the block ends well, and is removed otherwise.
 
     Raises DyngsError: by ``require``, before and after; ``out`` cannot be written.
     """
@@ -99,7 +99,7 @@ def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) 
 
 
 def note_sources(capture: Path, *sources: Path) -> None:
-    """Write into a made capture where its photos or videos lie, beside those noted before; no output replaces them."""
+    """Write into a made capture where its photos or videos lie, next to those noted before; no output replaces them."""
     known = _read_sources(capture)
     names = list(dict.fromkeys([*known, *(os.path.abspath(source) for source in sources)]))
     if names != known:

@@ -26,7 +26,7 @@ _MOST_NUMBER_KEYS = 1 << 16
 _LARGEST_KEY = 1 << 31
 """Limit of keys that are numbers: a file can choose large ones whose hashes collide."""
 _MOST_ENTRIES = 1 << 20
-"""Entries, shared ones counted at each occurrence, beside two per byte of the file and those of sparse matrices."""
+"""Entries, shared ones counted at each occurrence, next to two per byte of the file and those of sparse matrices."""
 _DEEPEST = 100
 _LONGEST_KEY = 4096
 _LONGEST_LINE = 1000
@@ -40,7 +40,7 @@ def read_pickle(path: Path) -> object:
     Pickles of Python 2 and uncompressed ones of joblib are read, too. Sparse matrices of SciPy and arrays of chumpy
     become plain arrays; neither package is needed. The result never contains itself and is at most 100 containers deep.
     With shared parts counted at each occurrence, it has at most two entries per byte of the file and a million more,
-    beside those of sparse matrices (``dyngs.files.limits``).
+    next to those of sparse matrices (``dyngs.files.limits``).
 
     Raises:
         DyngsError: the file is missing or damaged, or holds anything else, or asks for too much.

@@ -1,4 +1,4 @@
-"""Files that may go: temporary ones beside their targets, those that killed processes left, and the user's cache."""
+"""Files that may go: temporary ones next to their targets, those that killed processes left, and the user's cache."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NAME = re.compile(r"\.(?P<stem>.+)\.(?P<pid>\d{1,10})-(?P<home>[0-9a-f]{6})\.dy
 
 
 def temporary_beside(path: Path) -> Path:
-    """Return a hidden path beside ``path``, unique to this process, with its suffix; the folder is created if missing.
+    """Return a hidden path next to ``path``, unique to this process, with its suffix; the folder is created if missing.
 
     Temporary files that killed processes left in that folder are removed, once per folder and process.
     """

@@ -16,7 +16,7 @@ from dyngs.files.temporary import temporary_beside
 
 @contextmanager
 def atomic_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; it replaces ``path`` if the block succeeds and is removed otherwise.
+    """Yield a temporary path next to ``path``; it replaces ``path`` if the block succeeds and is removed otherwise.
 
     The folder is created if missing; the temporary name keeps the suffix, by which writers choose the format.
     ``durable``: wait until it is on disk, so that a power cut leaves the old file or the new one, complete.

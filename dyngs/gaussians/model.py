@@ -35,7 +35,7 @@ S = TypeVar("S", bound=GaussianScene)
 
 
 class SceneTraining(Generic[S]):
-    """Training of a kind of scene: of all that it learns beside the Gaussians and their colours, here nothing.
+    """Training of a kind of scene: of all that it learns next to the Gaussians and their colours, here nothing.
 
     Attributes:
         moves_by: name of what moves the Gaussians and the configuration section of its learning rates, for messages.

@@ -30,7 +30,7 @@ harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but
 
 @dataclass(frozen=True)
 class RenderOptions(DrawOptions):
-    """Settings of a render, beside those of ``DrawOptions``.
+    """Settings of a render, next to those of ``DrawOptions``.
 
     Example::
 

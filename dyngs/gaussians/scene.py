@@ -100,7 +100,7 @@ class GaussianScene(Renderable):
 
     @property
     def num_motion_values(self) -> int:
-        """Number of values stored for motion, beside the Gaussians and their colours."""
+        """Number of values stored for motion, next to the Gaussians and their colours."""
         return 0
 
     @property
@@ -193,7 +193,7 @@ class GaussianScene(Renderable):
 
     @abstractmethod
     def _model_state(self) -> State:
-        """Return the state of this kind of scene beside its Gaussians and colours."""
+        """Return the state of this kind of scene next to its Gaussians and colours."""
 
 
 def require_gaussians(scene: Renderable, what: str) -> GaussianScene:

@@ -39,7 +39,7 @@ def measured_alpha_weight(images: Iterable[Image], background: Tensor) -> tuple[
 def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
     """Return the fraction of the opaque pixels whose channels all differ from ``background`` (3,) by ``ALIKE`` or less.
 
-    None where there are no opaque pixels beside a background. Masked pixels do not count.
+    None where there are no opaque pixels next to a background. Masked pixels do not count.
     """
     opaque, alike, shows_background = 0, 0, False
     for image in images:

@@ -200,7 +200,7 @@ class ReadBack:
 
 
 class Upload:
-    """Arrays of the CPU that are copied to a GPU beside its work: by a stream of their own, from pinned memory.
+    """Arrays of the CPU that are copied to a GPU next to its work: by a stream of their own, from pinned memory.
 
     May be made in any thread. What has no such streams gets them when they are asked for.
     """

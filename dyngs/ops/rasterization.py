@@ -25,7 +25,7 @@ MAX_CHANNELS = 40
 MAX_ENTRIES = 2**31 - 1
 LARGEST_ALPHA = 1 - 2.0**-20
 """Beyond it nothing of what lies behind would be left in float32, from which the backward pass restores the rest."""
-MOMENTS = 6  # that the backward pass holds per (Gaussian, tile) pair, beside the gradients of colours
+MOMENTS = 6  # that the backward pass holds per (Gaussian, tile) pair, next to the gradients of colours
 
 
 @dataclass(frozen=True)

@@ -100,10 +100,10 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
 def read_avatar(path: Path) -> LoadedRun:
     """Read the person of a file, upright and at rest; ``dyngs.runs.opened`` moves it as it does one of a run.
 
-    A template other than the free one is looked for beside the file when a motion needs it.
+    A template other than the free one is looked for next to the file when a motion needs it.
 
     Raises:
-        DyngsError: the file is missing, damaged, altered or not an avatar, or the template beside it is another one.
+        DyngsError: the file is missing, damaged, altered or not an avatar, or the template next to it is another one.
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     try:

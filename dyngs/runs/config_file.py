@@ -1,4 +1,4 @@
-"""The configuration in a run folder and the fitted body that it names beside it: the folder may move as a whole."""
+"""The configuration in a run folder and the fitted body that it names next to it: the folder may move as a whole."""
 
 from __future__ import annotations
 

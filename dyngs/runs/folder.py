@@ -111,7 +111,7 @@ def is_done(folder: Path, config: Config) -> bool:
 
 
 def note_asked(folder: Path, asked: Config) -> None:
-    """Write the configuration that was asked for beside that of the run, if the two differ; otherwise there is none."""
+    """Write the configuration that was requested next to that of the run, if the two differ."""
     path, stored = folder / ASKED_NAME, load_resolved(folder)
     if _is_same_run(stored, asked):
         path.unlink(missing_ok=True)

@@ -19,7 +19,7 @@ from dyngs.static.scene import StaticScene
 
 
 class StaticTraining(SceneTraining[StaticScene]):
-    """See ``SceneTraining``; nothing is learned beside the Gaussians and their colours."""
+    """See ``SceneTraining``; nothing is learned next to the Gaussians and their colours."""
 
     def __init__(self, update: FilterUpdate) -> None:
         self._update = update

@@ -246,7 +246,7 @@ def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def stored_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
-    """Return the edit that puts Gaussians beside their neighbours in space, first those that a field moves.
+    """Return the edit that puts Gaussians next to their neighbours in space, first those that a field moves.
 
     ``means``: (N, 3) as they will be read again, which decide the order.
     """

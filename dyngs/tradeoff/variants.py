@@ -101,7 +101,7 @@ class Varied:
         name: a field of ``Variant``.
         values: tried by default, stronger ones later.
         low, high: range of numbers, inclusive; no numbers if ``low > high``.
-        words: allowed beside numbers.
+        words: allowed next to numbers.
         integers: no other numbers.
         trains: every value but that of the run needs training from scratch.
     """

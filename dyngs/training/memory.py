@@ -35,17 +35,17 @@ COPIES = 7
 changes. Measured: 1.65 kB per Gaussian with harmonics of degree 3, whose 59 values take 0.24 kB."""
 NEEDED_COPIES = 4  # Of these, what is there in every step: value, gradient, two moments
 POSING_BYTES = 2600
-"""Bytes of a Gaussian of a person beside that, where the body fit is refined: its anchor, weights of joints, their
+"""Bytes of a Gaussian of a person next to that, where the body fit is refined: its anchor, weights of joints, their
 gradients, and the Gaussian in a pose."""
-MOVING_BYTES = 200  # Bytes beside that of a Gaussian that control nodes move: the Gaussian at a time
+MOVING_BYTES = 200  # Bytes next to that of a Gaussian that control nodes move: the Gaussian at a time
 LOOKUP_COPIES = 12  # Float32 copies of the features that a Gaussian takes from space-time grids: six planes, twice
 ACTIVATION_COPIES = 3
 """Float32 copies of the neurons of a network that moves Gaussians: before and behind, and a gradient."""
 FIELD_COPIES = 5
 """Float32 copies of what all Gaussians of a field share: value, gradient, two moments, and one for the penalties."""
-SHAPE_VALUES = 11  # Values of a Gaussian beside its harmonics: position, rotation, sizes, opacity
+SHAPE_VALUES = 11  # Values of a Gaussian next to its harmonics: position, rotation, sizes, opacity
 DRAWING_BYTES = 200
-"""Bytes per pixel of the largest image that a step takes beside them: rendering, truth, windows of SSIM."""
+"""Bytes per pixel of the largest image that a step takes next to them: rendering, truth, windows of SSIM."""
 STEP_BYTES = 30_000_000  # Bytes of any step: code and buffers that the first one touches
 DECODING_BYTES = 45
 """Bytes per pixel of the file that decoding takes for a while: floats for shrinking and undistorting. Measured, as that
@@ -72,7 +72,7 @@ class MemoryForecast:
     least: int  # Gaussians that there will certainly be at some time
     each: int
     least_each: int
-    free: int | None  # of this machine and this process's limits, beside what is taken already; None: not known
+    free: int | None  # of this machine and this process's limits, next to what is taken already; None: not known
     whole: int | None  # of this machine with its swap, or the limit of its container; None: not known
     all_kept: bool  # every image has its place in the cache
     processes: int = 1
@@ -139,7 +139,7 @@ class MemoryForecast:
         return min(x for x in (self.free, self.whole) if x is not None) // self.processes
 
     def _gaussians_that_fit(self) -> int | None:
-        """Return how many Gaussians there is room for beside the rest; None: not known."""
+        """Return how many Gaussians there is room for next to the rest; None: not known."""
         if self.free is None:
             return None
         return max(self._fraction - (self.total - self.program - self.count * self.each), 0) // self.each
@@ -249,7 +249,7 @@ def require_room(config: Config) -> None:
 
 
 def stored_values(config: Config) -> int:
-    """Return the number of values of a Gaussian that are trained, beside those of a field."""
+    """Return the number of values of a Gaussian that are trained, next to those of a field."""
     return SHAPE_VALUES + 3 * num_sh_terms(config.stored_sh_degree)
 
 
@@ -276,7 +276,7 @@ def _field(config: Config) -> DeformField | None:
 
 
 def field_bytes(config: Config, num_times: int) -> int:
-    """Return the bytes of memory of what a deformation field learns beside its Gaussians; 0 where there is none."""
+    """Return the bytes of memory of what a deformation field learns next to its Gaussians; 0 where there is none."""
     field = _field(config)
     if field is None or num_times < 2:
         return 0

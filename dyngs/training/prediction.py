@@ -132,7 +132,7 @@ class NetworkTrainer:
         return self.num_gaussians
 
     def step(self) -> StepReport:
-        """Train on one person: predicted from one choice of images, compared with others of one moment."""
+        """Train on one person: predicted from one choice of images, compared with others of one time step."""
         step = self.done + 1
         person = self.people[self.sampler.next(self.generator, lambda _: True)]
         choice = self._draw(len(person.choices))
@@ -182,7 +182,7 @@ class NetworkTrainer:
         self.done = checkpoint.info.step
 
     def _targets(self, person: Filmed, inputs: list[int]) -> list[Image]:
-        """Return images of one moment that were not predicted from, where there are any."""
+        """Return images of one time step that were not predicted from, where there are any."""
         views = person.sitter.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
         frame = views[others[self._draw(len(others))]].frame
@@ -327,7 +327,7 @@ def rate_at(model: HumanPredictorModel, step: int, steps: int) -> float:
 
 
 def _choices(sitter: CapturedPerson, model: HumanPredictorModel, generator: torch.Generator) -> list[list[int]]:
-    """Return views to predict from, of a random moment each: one at random, the others chosen to see much.
+    """Return views to predict from, of a random time step each: one at random, the others chosen to see much.
 
     Every other choice has fewer than ``model.source_views``, in turn each number from 1.
     """

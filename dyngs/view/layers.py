@@ -156,7 +156,7 @@ def _motion_colours(scene: GaussianScene) -> Tensor:
 
 
 def _error(rgb: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the mean absolute error as colours (H, W, 3) uint8, black beside the true image."""
+    """Return the mean absolute error as colours (H, W, 3) uint8, black next to the true image."""
     difference = np.abs(rgb.astype(np.float32) / 255.0 - truth).mean(axis=2)
     return color_map(np.nan_to_num(ERROR_GAIN * difference), "magma")
 

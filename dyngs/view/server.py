@@ -173,7 +173,7 @@ class Viewer:
         for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
             server._websock_server.unregister_handler(kind)  # it would pass the page through a host of others
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
-        server.gui.main_panel.dock_right()  # beside the image, not over it
+        server.gui.main_panel.dock_right()  # next to the image, not over it
         begin = viewpoint_of(first)
         _, position = pose_of(begin.start)
         server.scene.set_up_direction(tuple(begin.up))

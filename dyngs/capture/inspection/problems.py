@@ -157,7 +157,7 @@ def listed(lines: Iterable[str]) -> list[str]:
 
 
 def problems_of(capture: Capture, deep: bool) -> list[str]:
-    """Return a line for everything suspicious, beside the capture's own warnings; ``deep``: decode every image."""
+    """Return a line for everything suspicious, next to the capture's own warnings; ``deep``: decode every image."""
     views, train = all_views(capture.splits), capture.splits.get("train", ())
     problems = []
     if not capture.splits.get("test"):

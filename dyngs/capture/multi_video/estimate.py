@@ -45,7 +45,7 @@ def poses_of_videos(
 ) -> str:
     """Make a capture of a folder of videos that ran at once, of fixed cameras; return what was found, as lines.
 
-    All work is done in a folder beside ``out`` which is renamed at the end, so ``out`` is complete or absent. It is in
+    All work is done in a folder next to ``out`` which is renamed at the end, so ``out`` is complete or absent. It is in
     COLMAP's layout, with ``times.json``, and ready to be trained on. Raises DyngsError: a camera that moves, poses or
     offsets that cannot be found, with what to do; an ``out`` in use.
 

@@ -1,4 +1,4 @@
-"""Maps beside images: depth, optical flow, labels, silhouettes; raw numbers, taken at pixels by the nearest sample."""
+"""Maps next to images: depth, optical flow, labels, silhouettes; raw numbers, taken at pixels by the nearest sample."""
 
 from __future__ import annotations
 

@@ -268,7 +268,7 @@ def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
 
 def _focal(source: Mapping[str, object], axis: str, size: int, where: str) -> float | None:
     focal = _number(source.get(f"fl_{axis}"), f"fl_{axis}", where)
-    # An angle beside an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
+    # An angle next to an fl_x for the other axis only repeats it rounded: square pixels are the better guess.
     if focal is None and not any(source.get(key) is not None for key in ("fl_x", "fl_y")):
         angle = _number(source.get(f"camera_angle_{axis}"), f"camera_angle_{axis}", where)
         if angle is None:
@@ -334,7 +334,7 @@ def read_points(path: Path) -> PointCloud:
 
     if not path.is_file():
         raise DyngsError(f"{path}: no such point file; restore it or remove {KEY}")
-    # From an open file: given a path, trimesh would look for textures beside it.
+    # From an open file: given a path, trimesh would look for textures next to it.
     with reading(path, "it must be a .ply file of points; export it again"), path.open("rb") as file:
         loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)
         xyz = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)

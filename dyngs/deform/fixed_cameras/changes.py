@@ -45,7 +45,7 @@ class Footage:
 
 
 def footage_of(images: Iterable[Image], background: Tensor, total: int = 1) -> Footage:
-    """Return the footage of one camera that stands still, on the CPU."""
+    """Return the frames of one camera that stands still, on the CPU."""
     longest = LONGEST_SIDE * min(1.0, (IMAGES / max(total, 1)) ** 0.5)
     shown, counted, times = [], [], []
     camera: Cameras | None = None

@@ -65,7 +65,7 @@ class FirstMotion:
 def first_motion(
     footage: Sequence[Footage], still: Gaussians, moving: Tensor, extent: float, limit: int
 ) -> FirstMotion:
-    """Return what travels before the cameras of ``footage``, where ``still`` Gaussians are or the cameras look."""
+    """Return what travels before the cameras of ``frames``, where ``still`` Gaussians are or the cameras look."""
     if len(footage) < 2 or limit < 1:
         return FirstMotion()
     tracks = found_tracks(footage, *_box(footage, still, extent))

@@ -1,6 +1,6 @@
 """Affine colours: what a camera's exposure and white balance make of the colours of a scene.
 
-Local letters: M (3, 4), a matrix beside an offset; colours c are shown as M[:, :3] c + M[:, 3].
+Local letters: M (3, 4), a matrix next to an offset; colours c are shown as M[:, :3] c + M[:, 3].
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def fitted_affine(shown: Sequence[Shown], background: Tensor, counts: Tensor | N
 
     Args:
         shown: one or more; masked pixels do not count.
-        counts: (H, W) weights beside the masks; None: 1.
+        counts: (H, W) weights next to the masks; None: 1.
     """
     background = background.to(shown[0][1].rgb.device)
     identity = torch.eye(3, 4, dtype=torch.float64, device=background.device)

@@ -50,7 +50,7 @@ class HarmonicsDropped:
 
 
 class ColourTraining:
-    """Harmonics as they are stored: nothing to learn beside them."""
+    """Harmonics as they are stored: nothing to learn next to them."""
 
     def __init__(self, options: ColourSection) -> None:
         self.entropy_weight = options.opacity_entropy
@@ -85,7 +85,7 @@ class ColourTraining:
         """Follow a change of the set of Gaussians."""
 
     def optimize(self, step: int) -> Count:
-        """Update what is learned beside the harmonics, and return the number of rows left out for bad gradients."""
+        """Update what is learned next to the harmonics, and return the number of rows left out for bad gradients."""
         return 0
 
     def place(self, device: torch.device) -> None:

@@ -1,6 +1,6 @@
 """Body poses in which an avatar, which stays as it is, looks most like images, or has their silhouettes.
 
-So do GART (Lei et al. 2024) and Anim-NeRF (Chen et al. 2021) before they score new poses. F moments, V images of one.
+So do GART (Lei et al. 2024) and Anim-NeRF (Chen et al. 2021) before they score new poses. F time steps, V images each.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ class Comparison:
     difference: Callable[[Rendering, Image, Tensor, int], Tensor]
     turn_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
     shift_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
-    views_to_turn: int = 1  # fewest images of one moment from which rotations are fitted; from fewer the translation is
+    views_to_turn: int = (
+        1  # fewest images of a time step from which rotations are fitted; from fewer the translation is
+    )
 
 
 def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
@@ -104,7 +106,7 @@ class FittedPoses:
     """Poses fitted to images."""
 
     scene: HumanScene  # the same person, playing them
-    updates: tuple[int, ...]  # number of updates at each of the F moments
+    updates: tuple[int, ...]  # number of updates at each of the F time steps
 
 
 def fitted_to_images(
@@ -112,8 +114,8 @@ def fitted_to_images(
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
-    All images of a moment decide its pose. The fit begins with the pose that is played, or with that corrected as the
-    moment before was, whichever looks more alike. ``scene`` plays the clip to correct; ``background`` (3,) is behind
+    All images of a time step decide its pose. The fit begins with the pose that is played, or with that corrected as
+    the one before was, whichever looks more alike. ``scene`` plays the clip to correct; ``background`` (3,) is behind
     both.
     """
     groups: dict[float, list[int]] = {}

@@ -138,7 +138,7 @@ class HumanScene(GaussianScene):
         return self._derived["clip"]
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
-        """Return the person at ``time`` of the clip, clamped to it; None is the first moment.
+        """Return the person at ``time`` of the clip, clamped to it; None is the first time step.
 
         Who keeps one pose is posed once, but for gradients.
         """

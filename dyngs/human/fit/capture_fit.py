@@ -60,7 +60,7 @@ class FitEffort:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known beside images and given poses."""
+    """What is known next to images and given poses."""
 
     joints: Joints3D | None = None  # in 3D, of frames of the capture, see ``dyngs.human.fit.keypoints``; None without
     # the capture is one camera that stands at the origin, with a guessed focal length to be refined

@@ -47,7 +47,7 @@ _LOOKED_AT, _PRESENT = 128, 0.2
 
 @dataclass(frozen=True)
 class FitInputs:
-    """What is given beside the capture; everything may be None."""
+    """What is given next to the capture; everything may be None."""
 
     keypoints: Path | None = None  # folder or file of 2D key points
     masks: Path | None = None  # folder of masks, white = the person

@@ -62,8 +62,8 @@ def shape_of(body: BodyTemplate, known: BodyFrames) -> torch.Tensor:
 LONGEST_SIDE = 320
 """Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is compared at that
 size, since its edges are those of its images."""
-CHECKED = 3  # moments, at most, at which a view is left out to see what the fit is worth
-_FEWEST_VIEWS = 3  # of a moment, so that one of them can be left out
+CHECKED = 3  # time steps, at most, at which a view is left out to see what the fit is worth
+_FEWEST_VIEWS = 3  # of a time step, so that one of them can be left out
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:
 
 
 def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
-    """Return one view of each of some moments, and the others of these moments to fit to.
+    """Return one view of each of some time steps, and the others of these time steps to fit to.
 
     Moments with too few views lose none.
     """

@@ -1,4 +1,4 @@
-"""Exposure and white balance of each training image, learned beside the scene.
+"""Exposure and white balance of each training image, learned next to the scene.
 
 A camera that chooses its exposure by itself shows the same place brighter in one image than in the next. So each
 image has an affine colour, 3 x 4, that its rendering goes through before the loss, as 3DGS has since its second
@@ -7,7 +7,7 @@ release. The mean over all images is the identity, so that the scene has the col
 Gains of all images are found at once, by the places that they share, as soon as the scene has a depth; then Adam
 refines them. Adam alone is too slow for a short run, and leaves a scene bright where bright images were taken.
 
-Local letters: V views, M (V, 3, 4) deviations from the identity, matrix beside offset.
+Local letters: V views, M (V, 3, 4) deviations from the identity, matrix next to offset.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class ViewExposures(Loss):
         """Set the gains of an image to the median ratio, over cells, of it to its rendering ``shown``.
 
         A rendering that is not sharp yet has the right mean in cells, whereas least squares would take it for flat.
-        Where too little is to be seen it takes after those beside it.
+        Where too little is to be seen it takes after those next to it.
         """
         every = max(1, max(shown.shape[:2]) // ENOUGH)
         few = slice(every // 2, None, every), slice(every // 2, None, every)

@@ -27,8 +27,8 @@ from dyngs.training.other_views import CELLS, OtherViews, grid_of
 EVERY = 4  # An image is looked at each so many times that it is trained on; in between its mask stays
 WARM_UP = 0.05  # Fraction of the run in which everything counts
 SEED, GROWN = 5.0, 3.0
-"""Multiples of the median residual: from the first a cell is left out, from the second beside such cells."""
-REACH = 2  # Cells up to which a cell counts as beside another
+"""Multiples of the median residual: from the first a cell is left out, from the second next to such cells."""
+REACH = 2  # Cells up to which a cell counts as next to another
 SUPPORT = 0.5  # Fraction of the 3 x 3 cells around that must be left out, too
 CLEARLY = 0.5
 """A place disagrees where the other views differ from the rendering by less than this fraction of what it does."""
