@@ -223,8 +223,7 @@ void test_lane_sums() {
   for (int i = 0; i < kCount; ++i)
     for (int lane = 0; lane < kLanes; ++lane) x[i][lane] = static_cast<S>(1000 * i + (lane * lane * 7 + i) % 31);
   lane_sums(x, sums);
-  for (int i = 0; i < kCount; ++i)
-    expect_near("sum of lanes " + std::to_string(i), sums[i], horizontal_sum(x[i]), 0);
+  for (int i = 0; i < kCount; ++i) expect_near("sum of lanes " + std::to_string(i), sums[i], horizontal_sum(x[i]), 0);
 }
 
 // Selections and comparisons, lane by lane, of which each is of its own half or quarter of a packet on older processors.

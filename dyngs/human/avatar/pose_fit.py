@@ -36,9 +36,7 @@ class Comparison:
     difference: Callable[[Rendering, Image, Tensor, int], Tensor]
     turn_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
     shift_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
-    views_to_turn: int = (
-        1  # fewest images of a time step from which rotations are fitted; from fewer the translation is
-    )
+    views_to_turn: int = 1  # images of a time step from which on rotations are fitted; with fewer the shift is
 
 
 def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
