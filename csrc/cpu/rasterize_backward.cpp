@@ -203,7 +203,7 @@ void sum_slots(const Splats<S>& s, int num_fields, const Entries& entries, const
     for (int64_t i = begin; i < end; ++i) {
       if (i + kPrefetchedSlots < rows) {  // slots lie in the order of depth
         const S* ahead = slots + int64_t{entries.slot_ranges[2 * (i + kPrefetchedSlots)]} * fields;
-        __builtin_prefetch(ahead), __builtin_prefetch(ahead + 64 / sizeof(S));
+        __builtin_prefetch(ahead), __builtin_prefetch(ahead + fields);
       }
       double sum[kFields > 0 ? kFields : kMaxFields];
       std::fill(sum, sum + fields, 0.0);
