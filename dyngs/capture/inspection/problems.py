@@ -145,7 +145,7 @@ def _ill_posed(capture: Capture) -> list[str]:
         return []
     return [
         f"{len(views)} images, each at a time of its own, {angles.mean():.0f} degrees apart on average: what moves "
-        "is seen from one side only at each time; expect a still result"
+        "is seen from one side only at each time; expect a static result"
     ]
 
 

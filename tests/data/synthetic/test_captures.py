@@ -164,7 +164,7 @@ def test_inspection_finds_nothing_suspicious(name: SceneName, tmp_path: Path) ->
     """But that so few images, each of a time of its own, show what moves from one side only; the room has cameras."""
     problems = inspect_capture(write_dynamic_capture(name, tmp_path / "out", TINY), deep=True).problems
     assert len(problems) == (name != "room")
-    assert all(line.endswith("expect a still result") for line in problems)
+    assert all(line.endswith("expect a static result") for line in problems)
 
 
 def test_one_time_and_many_test_images_are_allowed(tmp_path: Path) -> None:
