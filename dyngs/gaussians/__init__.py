@@ -145,6 +145,10 @@ class TopologyEdit:
         moved[self.is_new] = 0
         return moved
 
+    def in_order(self, order: Tensor) -> TopologyEdit:
+        """Return the same edit with the rows of the new set in ``order`` (N_new,)."""
+        return TopologyEdit(self.source[order], self.is_new[order])
+
     @staticmethod
     def select(index: Tensor) -> TopologyEdit:
         """Return the edit that keeps the rows at ``index`` (long or bool)."""
@@ -161,9 +165,3 @@ class EditResult:
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     zero_moments: frozenset[str] = frozenset()  # fields whose optimizer moments start anew in every row
     finding: str | None = None  # a line for people about why, or None
-
-    def with_rows_in(self, order: Tensor) -> EditResult:
-        """Return the same change with the rows of the new set in ``order`` (N_new,)."""
-        edit = self.edit
-        moved = None if edit is None else TopologyEdit(edit.source[order], edit.is_new[order])
-        return replace(self, edit=moved, changes={name: x[order] for name, x in self.changes.items()})

@@ -287,10 +287,13 @@ class GaussianModel(Model[GaussianScene]):
 
     def _in_memory_order(self, result: EditResult) -> EditResult:
         """Return the same change with neighbours in space next to each other: kernels read rows that are in a cache."""
-        if result.edit is None:
+        edit = result.edit
+        if edit is None:
             return result
-        means = result.changes.get("means", result.edit.apply(self._optimizer.parameters.means.detach()))
-        return result.with_rows_in(torch.from_numpy(morton_order(means.cpu().numpy())).to(means.device))
+        means = result.changes.get("means", edit.apply(self._optimizer.parameters.means.detach()))
+        order = torch.from_numpy(morton_order(means.cpu().numpy())).to(means.device)
+        changes = {name: x[order] for name, x in result.changes.items()}
+        return replace(result, edit=edit.in_order(order), changes=changes)
 
     def _measured_harmonics(self, step: int) -> str | None:
         """Drop harmonics that do not pay, if it is time to measure that; return a line about what was found."""

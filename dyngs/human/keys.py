@@ -93,7 +93,7 @@ class HumanPredictorModel(_OnTemplate):
         default=6, ge=1, description="different choices of source views per person in training; their maps are cached"
     )
     target_views: int = Field(
-        default=2, ge=1, description="images of one moment that a prediction is compared with in each step"
+        default=2, ge=1, description="images of one time step that a prediction is compared with in each step"
     )
     widths: tuple[Annotated[int, Field(ge=8)], ...] = Field(
         default=(24, 32, 48, 64),

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from tiny_fields import busy_config, write_tiny_capture
 
 from dyngs.gaussians.order import morton_order, storage_order
+from dyngs.kinds import assemble
 
 
 def test_corners_of_a_cube_follow_the_z_curve() -> None:
@@ -39,3 +43,17 @@ def test_an_outlier_does_not_put_the_others_into_one_cell() -> None:
     order = morton_order(with_outlier)
     along = points[order[order < 2000]]
     assert np.linalg.norm(np.diff(along, axis=0), axis=1).mean() < 0.15
+
+
+def test_a_scene_that_grows_stays_in_order(tmp_path: Path) -> None:
+    """Until motion begins, which adds Gaussians at the end, and between steps: these move them."""
+    trainer = assemble(busy_config(write_tiny_capture(tmp_path / "capture"), tmp_path / "run", "control_nodes"))
+    checked = 0
+    while not trainer.num_moving:
+        before = trainer.model.scene.gaussians.means
+        trainer.step()
+        means = trainer.model.scene.gaussians.means
+        if len(means) != len(before) and not trainer.num_moving:
+            assert (morton_order(means.detach().numpy()) == np.arange(len(means))).all()
+            checked += 1
+    assert checked > 1

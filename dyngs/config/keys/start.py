@@ -18,7 +18,7 @@ class PointsInit(Section):
     triangulate: int = Field(
         default=24,
         ge=0,
-        description="images of one moment to triangulate points from where the capture has none; 0: do not",
+        description="images of one time step to triangulate points from where the capture has none; 0: do not",
     )
     num_random: int = Field(
         default=100_000, ge=1, description="number of random points; auto: where there are no others"
