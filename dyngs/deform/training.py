@@ -110,8 +110,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         if scene.field is None:
             return 0
-        progress = self.schedule.rates.progress(step, since=self.schedule.decays)
-        return scene.field.parameters.step(step - self.schedule.fine, progress)
+        rates = self.schedule.rates
+        progress = rates.progress(step, since=self.schedule.decays)
+        return scene.field.parameters.step(step - self.schedule.fine, progress, rates.factor)
 
     def learned(self, scene: DynamicScene) -> Parameters | None:
         return None if scene.field is None else scene.field.parameters

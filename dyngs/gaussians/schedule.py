@@ -14,6 +14,8 @@ from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 MIN_START = 100  # Densification never starts earlier: the first gradients say little
 MIN_RESET_GAP = 400  # Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)
 RESET_FRACTION = 0.2  # Fraction of a short run between opacity resets
+MOST_BETWEEN_CHANGES, CHANGE_FRACTION = 100, 0.05
+"""Steps between changes of the set, at most and as a fraction of the run: a short run has ten of them, too."""
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
@@ -27,6 +29,7 @@ class Rates:
 
     steps: int
     tuning: int = 0  # steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``
+    factor: float = 1.0  # on all rates, see ``rate_factor``
 
     def progress(self, step: int, since: int = 0) -> float:
         """Return 0 up to step ``since``, rising to 1 at the end: the progress of rates that fall from ``since`` on."""
@@ -39,7 +42,25 @@ class Rates:
 
 def rates_of(config: Config) -> Rates:
     """Return the course of the learning rates of a run."""
-    return Rates(config.train.steps, config.prune.steps)
+    return Rates(config.train.steps, config.prune.steps, rate_factor(config))
+
+
+def rate_factor(config: Config) -> float:
+    """Return the factor on all learning rates: ``optim.rate_factor``, else by the length of the run.
+
+    What is learned has to come as far in fewer steps. PLACEHOLDER
+    """
+    asked = config.optim.rate_factor
+    if asked is not None:
+        return asked
+    return 1.0 if config.model.is_posed else max(1.0, math.sqrt(PUBLISHED_STEPS / config.train.steps))
+
+
+def learning_rates(config: Config) -> OptimConfig:
+    """Return ``config.optim`` with the rates of this run: those given, times ``rate_factor``."""
+    factor, given = rate_factor(config), config.optim
+    names = (name for name in OptimConfig.model_fields if name.startswith("lr_"))
+    return given.model_copy(update={name: factor * getattr(given, name) for name in names} | {"rate_factor": 1.0})
 
 
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
@@ -61,22 +82,27 @@ def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white
     start, which clears white floaters; in shorter runs it costs more than it brings.
     """
     start = max(scaled(strategy.start, steps), min(strategy.start, MIN_START))
-    stop = scaled(strategy.stop, steps)
+    stop, every = scaled(strategy.stop, steps), steps_between_changes(strategy, steps)
     match strategy:
         case McmcStrategy():
-            return DensifySchedule(start, stop, strategy.every)
+            return DensifySchedule(start, stop, every)
         case DefaultStrategy():
-            every = strategy.reset_every
-            if every is None:
-                return DensifySchedule(start, stop, strategy.every, prune_scale_after=steps)
+            reset_every = strategy.reset_every
+            if reset_every is None:
+                return DensifySchedule(start, stop, every, prune_scale_after=steps)
             recovery = max(MIN_RESET_GAP, round(RESET_FRACTION * steps))
-            period = max(scaled(every, steps), min(every, recovery))
+            period = max(scaled(reset_every, steps), min(reset_every, recovery))
             resets = tuple(range(period, stop - period + 1, period))
             if white_background and steps >= PUBLISHED_STEPS and start < period:
                 resets = (start, *resets)
-            return DensifySchedule(start, stop, strategy.every, resets, prune_scale_after=period)
+            return DensifySchedule(start, stop, every, resets, prune_scale_after=period)
         case _:
             assert_never(strategy)
+
+
+def steps_between_changes(strategy: DefaultStrategy | McmcStrategy, steps: int) -> int:
+    """Return the steps between changes of the set of Gaussians in a run of ``steps``."""
+    return strategy.every or max(1, min(MOST_BETWEEN_CHANGES, round(CHANGE_FRACTION * steps)))
 
 
 def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    HumanModel,
+    McmcStrategy,
+    OptimConfig,
+    SceneModel,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.deform.schedule import deform_schedule
 from dyngs.gaussians.schedule import (
     GROWTH,
@@ -20,7 +32,10 @@ from dyngs.gaussians.schedule import (
     filter_steps,
     grad_threshold,
     growth_per_change,
+    learning_rates,
     means_rate,
+    rate_factor,
+    rates_of,
 )
 from dyngs.models.schedule import image_divisor
 
@@ -64,12 +79,47 @@ def test_short_runs() -> None:
     assert densify_schedule(DefaultStrategy(), 10, white_background=True).resets == ()
 
 
+@pytest.mark.parametrize(("steps", "every"), [(1, 1), (500, 25), (1000, 50), (2000, 100), (30_000, 100)])
+def test_short_runs_change_as_often(steps: int, every: int) -> None:
+    for strategy in (DefaultStrategy(), McmcStrategy()):
+        assert densify_schedule(strategy, steps, white_background=False).every == every
+        asked = strategy.model_copy(update={"every": 7})
+        assert densify_schedule(asked, steps, white_background=False).every == 7
+
+
 def test_short_runs_densify_from_a_lower_gradient_on() -> None:
     strategy = DefaultStrategy()
     assert grad_threshold(strategy, 30_000) == grad_threshold(strategy, 60_000) == strategy.grad_threshold
     thresholds = [grad_threshold(strategy, steps) for steps in (500, 2000, 7000, 29_999)]
     assert thresholds == sorted(thresholds)
     assert thresholds[0] > 0.25 * strategy.grad_threshold
+
+
+def _config(steps: int, model: SceneModel | None = None, **optim: float) -> Config:
+    return Config(
+        data=DataConfig(root=Path("capture")),
+        model=model or StaticModel(),
+        optim=OptimConfig.model_validate(optim),
+        train=TrainConfig(steps=steps),
+    )
+
+
+def test_rates_fit_the_length() -> None:
+    """Those published at their length and beyond, higher ones in a shorter run; a number that was given holds."""
+    factors = [rate_factor(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)]
+    assert factors == sorted(factors, reverse=True)
+    assert factors[-2:] == [1, 1]
+    assert rate_factor(_config(500, rate_factor=1.5)) == 1.5
+    assert rate_factor(_config(500, HumanModel())) == 1, "not measured on people"
+    assert rates_of(_config(500, DynamicModel())).factor == factors[1]
+
+
+def test_given_rates_are_multiplied_too() -> None:
+    published, given = OptimConfig(), {"lr_means": 1.0, "lr_quats": 0.5}
+    assert learning_rates(_config(30_000)) == OptimConfig(rate_factor=1)
+    short = learning_rates(_config(700, rate_factor=3, **given))
+    assert (short.lr_means, short.lr_quats, short.lr_opacities) == (3, 1.5, 3 * published.lr_opacities)
+    assert learning_rates(_config(700, rate_factor=1, **given)) == OptimConfig(rate_factor=1, **given)
 
 
 def test_means_rate_is_log_linear_times_the_extent() -> None:
