@@ -39,6 +39,7 @@ from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.errors import DyngsError, counted
 from dyngs.files.write import write_text
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.schedule import rate_factors
 from dyngs.kinds import GaussianTrainer, assemble, with_points
 from dyngs.metrics import psnr
 from dyngs.models.renderable import Rendering
@@ -289,8 +290,11 @@ def as_static(config: Config) -> Config:
 
 
 def _at_rest(config: Config) -> Config:
+    """Return ``config`` without motion, and with the same learning rates as with it."""
     shared = {key: getattr(config.model, key) for key in StaticModel.model_fields if key != "kind"}
-    return config.model_copy(update={"model": StaticModel.model_validate(shared)})
+    of_means, _ = rate_factors(config)
+    optim = config.optim.model_copy(update={"rate_factor": of_means})
+    return config.model_copy(update={"model": StaticModel.model_validate(shared), "optim": optim})
 
 
 def _requested(given: Section, usual: Section) -> Section:

@@ -110,9 +110,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         if scene.field is None:
             return 0
-        rates = self.schedule.rates
-        progress = rates.progress(step, since=self.schedule.decays)
-        return scene.field.parameters.step(step - self.schedule.fine, progress, rates.factor)
+        progress = self.schedule.rates.progress(step, since=self.schedule.decays)
+        return scene.field.parameters.step(step - self.schedule.fine, progress)
 
     def learned(self, scene: DynamicScene) -> Parameters | None:
         return None if scene.field is None else scene.field.parameters

@@ -49,14 +49,14 @@ class Parameters:
     def num_values(self) -> int:
         return sum(x.numel() for x in self._tensors.values())
 
-    def step(self, step: int, progress: float, factor: float = 1.0) -> Count:
+    def step(self, step: int, progress: float) -> Count:
         """Update all tensors, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
-            progress: 0 at the first update, 1 at the last; decides the rates, which are multiplied by ``factor``.
+            progress: 0 at the first update, 1 at the last; decides the rates.
         """
         progress = min(progress, 1.0)
-        return self.update(step, factor * (self.decay**progress if self.decay > 0 else 1 - progress))
+        return self.update(step, self.decay**progress if self.decay > 0 else 1 - progress)
 
     def update(self, step: int, factor: float) -> Count:
         """As ``step``, with all rates multiplied by ``factor``."""

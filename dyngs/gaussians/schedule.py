@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from typing_extensions import assert_never
 
-from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
+from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, StaticModel, Strategy, TrainConfig
 from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 
@@ -16,6 +16,8 @@ MIN_RESET_GAP = 400  # Steps that opacities need to recover from a reset (at a r
 RESET_FRACTION = 0.2  # Fraction of a short run between opacity resets
 MOST_BETWEEN_CHANGES, CHANGE_FRACTION = 100, 0.05
 """Steps between changes of the set, at most and as a fraction of the run: a short run has ten of them, too."""
+MEANS_POWER, POWER = 1 / 2, 1 / 3
+"""Powers of 30,000 / steps that learning rates of positions, and all others, are multiplied by (docs/benchmarks.md)."""
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
@@ -29,7 +31,6 @@ class Rates:
 
     steps: int
     tuning: int = 0  # steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``
-    factor: float = 1.0  # on all rates, see ``rate_factor``
 
     def progress(self, step: int, since: int = 0) -> float:
         """Return 0 up to step ``since``, rising to 1 at the end: the progress of rates that fall from ``since`` on."""
@@ -42,25 +43,26 @@ class Rates:
 
 def rates_of(config: Config) -> Rates:
     """Return the course of the learning rates of a run."""
-    return Rates(config.train.steps, config.prune.steps, rate_factor(config))
+    return Rates(config.train.steps, config.prune.steps)
 
 
-def rate_factor(config: Config) -> float:
-    """Return the factor on all learning rates: ``optim.rate_factor``, else by the length of the run.
+def rate_factors(config: Config) -> tuple[float, float]:
+    """Return the factors on the learning rates of positions and on all others.
 
-    What is learned has to come as far in fewer steps. PLACEHOLDER
+    As many steps less, positions have to come as far: ``optim.rate_factor`` on all, else by the length of the run.
     """
-    asked = config.optim.rate_factor
+    asked, short = config.optim.rate_factor, max(1.0, PUBLISHED_STEPS / config.train.steps)
     if asked is not None:
-        return asked
-    return 1.0 if config.model.is_posed else max(1.0, math.sqrt(PUBLISHED_STEPS / config.train.steps))
+        return asked, asked
+    return (short**MEANS_POWER, short**POWER) if isinstance(config.model, StaticModel) else (1.0, 1.0)
 
 
 def learning_rates(config: Config) -> OptimConfig:
-    """Return ``config.optim`` with the rates of this run: those given, times ``rate_factor``."""
-    factor, given = rate_factor(config), config.optim
-    names = (name for name in OptimConfig.model_fields if name.startswith("lr_"))
-    return given.model_copy(update={name: factor * getattr(given, name) for name in names} | {"rate_factor": 1.0})
+    """Return ``config.optim`` with the rates of this run: those given, times their factors."""
+    given, (of_means, of_others) = config.optim, rate_factors(config)
+    rates = {name: getattr(given, name) for name in OptimConfig.model_fields if name.startswith("lr_")}
+    changed = {k: rate * (of_means if k.startswith("lr_means") else of_others) for k, rate in rates.items()}
+    return given.model_copy(update=changed | {"rate_factor": 1.0})
 
 
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:

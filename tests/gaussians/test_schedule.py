@@ -34,8 +34,7 @@ from dyngs.gaussians.schedule import (
     growth_per_change,
     learning_rates,
     means_rate,
-    rate_factor,
-    rates_of,
+    rate_factors,
 )
 from dyngs.models.schedule import image_divisor
 
@@ -104,14 +103,19 @@ def _config(steps: int, model: SceneModel | None = None, **optim: float) -> Conf
     )
 
 
-def test_rates_fit_the_length() -> None:
-    """Those published at their length and beyond, higher ones in a shorter run; a number that was given holds."""
-    factors = [rate_factor(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)]
+def test_rates_of_a_static_scene_fit_the_length() -> None:
+    """Those published at their length and beyond, higher ones in a shorter run, positions most."""
+    factors = [rate_factors(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)]
     assert factors == sorted(factors, reverse=True)
-    assert factors[-2:] == [1, 1]
-    assert rate_factor(_config(500, rate_factor=1.5)) == 1.5
-    assert rate_factor(_config(500, HumanModel())) == 1, "not measured on people"
-    assert rates_of(_config(500, DynamicModel())).factor == factors[1]
+    assert factors[-2:] == [(1, 1), (1, 1)]
+    assert all(of_means > of_others for of_means, of_others in factors[:-2])
+    assert rate_factors(_config(500, rate_factor=1.5)) == (1.5, 1.5)
+
+
+@pytest.mark.parametrize("model", [HumanModel(), DynamicModel()])
+def test_rates_of_what_moves_are_the_published_ones_at_any_length(model: SceneModel) -> None:
+    assert rate_factors(_config(500, model)) == (1, 1)
+    assert rate_factors(_config(500, model, rate_factor=2)) == (2, 2)
 
 
 def test_given_rates_are_multiplied_too() -> None:
