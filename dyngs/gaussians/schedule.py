@@ -47,9 +47,10 @@ def rates_of(config: Config) -> Rates:
 
 
 def rate_factors(config: Config) -> tuple[float, float]:
-    """Return the factors on the learning rates of positions and on all others.
+    """Return the factors on the learning rates of positions and of all else, where the published ones have 1.
 
-    As many steps less, positions have to come as far: ``optim.rate_factor`` on all, else by the length of the run.
+    In fewer steps what is learned has to come as far. ``optim.rate_factor`` decides; else the length of the run does,
+    for static scenes: in a moving one, Gaussians that learn as fast repaint each image instead of following it.
     """
     asked, short = config.optim.rate_factor, max(1.0, PUBLISHED_STEPS / config.train.steps)
     if asked is not None:
@@ -110,8 +111,7 @@ def steps_between_changes(strategy: DefaultStrategy | McmcStrategy, steps: int) 
 def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
     """Return the gradient norm from which Gaussians are cloned or split in a run of ``steps``.
 
-    Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; a lower
-    threshold makes up for it. The fourth root was measured on lego: +0.5 dB at 2,000 steps, +0.3 dB at 7,000.
+    A short run has fewer changes; a lower threshold makes up for it. The fourth root was measured on lego: +0.5 dB at 2,000 steps, +0.3 dB at 7,000.
     """
     return strategy.grad_threshold * min(1.0, steps / PUBLISHED_STEPS) ** 0.25
 
@@ -119,8 +119,7 @@ def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
 def growth_per_change(steps: int) -> float:
     """Return the fraction of Gaussians that MCMC adds per change.
 
-    Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; each then adds
-    more, up to a quarter, and the count follows the same curve over the run.
+    A short run has fewer changes; each then adds more, up to a quarter, and the count follows the same curve.
     """
     rate = math.log1p(GROWTH) * max(PUBLISHED_STEPS / steps, 1.0)
     return max(GROWTH, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
