@@ -111,7 +111,8 @@ def steps_between_changes(strategy: DefaultStrategy | McmcStrategy, steps: int) 
 def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
     """Return the gradient norm from which Gaussians are cloned or split in a run of ``steps``.
 
-    A short run has fewer changes; a lower threshold makes up for it. The fourth root was measured on lego: +0.5 dB at 2,000 steps, +0.3 dB at 7,000.
+    A short run has fewer changes; a lower threshold makes up for it. The fourth root was measured on lego: +0.5 dB at
+    2,000 steps, +0.3 dB at 7,000.
     """
     return strategy.grad_threshold * min(1.0, steps / PUBLISHED_STEPS) ** 0.25
 

@@ -105,8 +105,8 @@ class OptimConfig(Section):
     rate_factor: float | None = Field(
         default=None,
         gt=0,
-        description="multiplies all rates below, also given ones; 1: exactly these; null: in static scenes positions by "
-        "the square root of 30000 / train.steps, all others by its cube root, 1 at least",
+        description="multiplies all rates below, also given ones; 1: exactly these; null: in static scenes those of "
+        "positions by the square root of 30000 / train.steps, all others by its cube root, 1 at least",
     )
     lr_means: Positive = Field(default=1.6e-4, description="learning rate of positions, times the scene extent")
     lr_means_final: Positive = Field(
