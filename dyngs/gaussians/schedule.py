@@ -16,8 +16,9 @@ MIN_RESET_GAP = 400  # Steps that opacities need to recover from a reset (at a r
 RESET_FRACTION = 0.2  # Fraction of a short run between opacity resets
 MOST_BETWEEN_CHANGES, CHANGE_FRACTION = 100, 0.05
 """Steps between changes of the set, at most and as a fraction of the run: a short run has ten of them, too."""
-MEANS_POWER, POWER = 1 / 2, 1 / 3
-"""Powers of 30,000 / steps that learning rates of positions, and all others, are multiplied by (docs/benchmarks.md)."""
+MEANS_POWER, POWER, SHORTEST = 1 / 2, 1 / 3, 500
+"""Powers of 30,000 / steps that learning rates of positions, and all others, are multiplied by (docs/benchmarks.md);
+those of runs shorter than the last are its own."""
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
@@ -52,7 +53,7 @@ def rate_factors(config: Config) -> tuple[float, float]:
     In fewer steps what is learned has to come as far. ``optim.rate_factor`` decides; else the length of the run does,
     for static scenes: in a moving one, Gaussians that learn as fast repaint each image instead of following it.
     """
-    asked, short = config.optim.rate_factor, max(1.0, PUBLISHED_STEPS / config.train.steps)
+    asked, short = config.optim.rate_factor, PUBLISHED_STEPS / max(SHORTEST, min(config.train.steps, PUBLISHED_STEPS))
     if asked is not None:
         return asked, asked
     return (short**MEANS_POWER, short**POWER) if isinstance(config.model, StaticModel) else (1.0, 1.0)

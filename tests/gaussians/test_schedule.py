@@ -103,6 +103,7 @@ def test_rates_of_a_static_scene_fit_the_length() -> None:
     """Those published at their length and beyond, higher ones in a shorter run, positions most."""
     factors = [rate_factors(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)]
     assert factors == sorted(factors, reverse=True)
+    assert factors[0] == factors[1] == pytest.approx((60 ** (1 / 2), 60 ** (1 / 3)))
     assert factors[-2:] == [(1, 1), (1, 1)]
     assert all(of_means > of_others for of_means, of_others in factors[:-2])
     assert rate_factors(_config(500, OptimConfig(rate_factor=1.5))) == (1.5, 1.5)

@@ -106,7 +106,7 @@ class OptimConfig(Section):
         default=None,
         gt=0,
         description="multiplies all rates below, also given ones; 1: exactly these; null: in static scenes those of "
-        "positions by the square root of 30000 / train.steps, all others by its cube root, 1 at least",
+        "positions by the square root of 30000 / train.steps, all others by its cube root; from 500 to 30000 steps",
     )
     lr_means: Positive = Field(default=1.6e-4, description="learning rate of positions, times the scene extent")
     lr_means_final: Positive = Field(
