@@ -70,7 +70,7 @@ class Regions:
         if image.labels is None:
             return {}
         labels = image.labels if image.alpha is None else image.labels * (image.alpha > 0)
-        found = labels[labels != 0].unique().tolist()
+        found = labels[labels != 0].unique().cpu().tolist()
         scores = {label: _psnr_inside(labels == label, image, rendered, truth) for label in found}
         return {label: score for label, score in scores.items() if score is not None}
 
