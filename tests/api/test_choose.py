@@ -24,6 +24,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import render
+from dyngs.gaussians.schedule import rate_factors
 from dyngs.kinds import with_points
 from dyngs.runs.folder import CHOICES_NAME
 
@@ -185,6 +186,13 @@ def test_as_static_has_the_static_preset_and_what_was_requested(moving: Path) ->
     assert found.model == StaticModel(sh_degree=2)
     assert (found.train.ssim_weight, found.optim.lr_means) == (0.5, 1e-3)
     assert (found.strategy.kind, found.strategy.growth_limit) == ("mcmc", 77)
+
+
+def test_small_runs_with_and_without_motion_learn_equally_fast(moving: Path) -> None:
+    """Else a static scene would win by its faster learning, which a full run hardly has."""
+    config = preset(moving, "train.steps=1000")
+    assert rate_factors(module._at_rest(config)) == rate_factors(config) == (1, 1)
+    assert rate_factors(as_static(config)) > (1, 1)
 
 
 def test_choices_are_a_table_in_the_run_folder(tmp_path: Path) -> None:
