@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.config import ControlNodesField, DeformField, HexplaneField, MlpField
+from dyngs.config import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup
 from dyngs.deform.fixed_cameras.start import FirstMotion
+from dyngs.deform.free import FreePrimitives
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
 from dyngs.state import Role, State, with_role
@@ -27,6 +28,8 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
             return Mlp(options, setup, generator)
         case ControlNodesField():
             return ControlNodes(options, setup, generator)
+        case FreeField():
+            return FreePrimitives(options, setup, generator)
         case _:
             assert_never(options)
 

@@ -71,7 +71,16 @@ class ControlNodesField(FieldSection):
     )
 
 
-DeformField = HexplaneField | MlpField | ControlNodesField
+class FreeField(Section):
+    """Gaussians that each have a moment, a span and a velocity of their own (after FreeTimeGS, Wang et al. 2025)."""
+
+    kind: Literal["free"] = Field(
+        default="free",
+        description="each moving Gaussian has its own moment, span and velocity (after FreeTimeGS); for several cameras",
+    )
+
+
+DeformField = HexplaneField | MlpField | ControlNodesField | FreeField
 
 
 class DynamicModel(SceneModel):

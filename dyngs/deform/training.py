@@ -10,16 +10,19 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import ControlNodesField, DynamicModel
+from dyngs.config import ControlNodesField, DynamicModel, FreeField
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
+from dyngs.deform.fixed_cameras.seeds import seeds_over_time
+from dyngs.deform.free import FreePrimitives, FreeStart, copied_over_time
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
 from dyngs.deform.scene import DynamicScene
@@ -38,6 +41,10 @@ SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error alw
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
 MIN_MOVING_FRACTION = 0.02  # Fraction of surely moving Gaussians up to which the scene counts as still
+
+
+SEEDS = 12_000
+SPAN_GAPS = 0.6
 
 
 @dataclass(frozen=True)
@@ -113,6 +120,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
         return scene.field.parameters.step(step - self.schedule.fine, progress)
 
+    def resting(self, scene: DynamicScene) -> Tensor | None:
+        return scene.moving if scene.field is not None and scene.field.rows_rest else None
+
     def learned(self, scene: DynamicScene) -> Parameters | None:
         return None if scene.field is None else scene.field.parameters
 
@@ -139,7 +149,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         first = self._first_motion(now.detach(), rows)
         if not errs and not first.seeds:
             return None
-        if first.seeds:
+        start = None
+        if isinstance(self.options.deform, FreeField):
+            start = self._free_start(now.detach().select(rows), first)
+            result = replace(with_gaussians(now.detach(), start.added), finding=first.finding)
+        elif first.seeds:
             result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
         else:
             num_added = self.options.num_random_moving
@@ -148,7 +162,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
-        if first.seeds and isinstance(self.options.deform, ControlNodesField):
+        if start is not None:
+            field = FreePrimitives(self.options.deform, setup, self._generator)
+            field = field.started(start.centers, start.spans, start.velocities)
+            self._on_its_way(True)
+        elif first.seeds and isinstance(self.options.deform, ControlNodesField):
             others = now.means.detach()[rows].cpu()  # tracks and seeds are found on the CPU
             field = field_on_its_way(self.options.deform, fields_moved_to(setup, "cpu"), first, others)
             self._on_its_way(True)
@@ -181,10 +199,27 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def _first_motion(self, still: Gaussians, rows: Tensor) -> FirstMotion:
         """Return what travels before fixed cameras, for a field that can begin on its way."""
-        if not isinstance(self.options.deform, ControlNodesField):
+        if not isinstance(self.options.deform, (ControlNodesField, FreeField)):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still, rows, self.capture.extent, limit)
+
+    def _free_start(self, still: Gaussians, first: FirstMotion) -> FreeStart:
+        begun = copied_over_time(still, len(self.times))
+        gap = 1 / max(len(self.times) - 1, 1)
+        limit = SEEDS // max(sum(len(one.track.times) for one in first.seeds), 1)
+        added, centers, velocities = list(begun.added), [begun.centers], [begun.velocities]
+        for one in first.seeds:
+            track = one.track
+            pace = np.gradient(track.centers, np.array(track.times), axis=0)
+            for time, v, g in zip(track.times, pace, seeds_over_time(track, self.capture.standing(), limit, still.sh.shape[1]), strict=True):
+                added.append(g)
+                centers.append(torch.full((len(g),), time))
+                velocities.append(torch.from_numpy(v).float().expand(len(g), 3))
+        c = torch.cat(centers)
+        spans = torch.cat([begun.spans, torch.full((len(c) - len(begun.spans),), SPAN_GAPS * gap)])
+        print("free start", len(still), len(begun.spans), len(c), [len(a) for a in added[-3:]])
+        return FreeStart(tuple(added), c, spans, torch.cat(velocities))
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
         """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""

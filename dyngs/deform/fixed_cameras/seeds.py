@@ -72,7 +72,7 @@ def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: in
     if count < len(points):
         side *= math.sqrt(len(points) / count)
         points = points[np.linspace(0, len(points) - 1, count).round().astype(int)]
-    colors = _colors(points, track, footage)
+    colors, _ = _colors(points, track, footage)
     begin = _apart(track, others)
     count = len(points)
     sh = torch.zeros(count, num_terms, 3, device="cpu")
@@ -85,6 +85,35 @@ def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: in
         sh=sh,
     )
     return Seeds(track, track.times[begin], gaussians)
+
+
+def seeds_over_time(track: Track, footage: Sequence[Footage], limit: int, num_terms: int) -> list[Gaussians]:
+    """Return at most ``limit`` Gaussians on the surface of what ``track`` follows, for each of its times.
+
+    Each has the mean of its colours in the images of its time; of all times, where none shows it then.
+    """
+    points, side = _surface(track)
+    count = min(limit, len(points))
+    if count < len(points):
+        side *= math.sqrt(len(points) / count)
+        points = points[np.linspace(0, len(points) - 1, count).round().astype(int)]
+    usual, _ = _colors(points, track, footage)
+    found = []
+    for time, blob in zip(track.times, track.blobs, strict=True):
+        colors, seen = _colors(points, Track((time,), (blob,)), footage)
+        colors = np.where(seen, colors, usual)
+        sh = torch.zeros(count, num_terms, 3, device="cpu")
+        sh[:, 0] = torch.from_numpy((colors - 0.5) / SH_C0).float()
+        found.append(
+            Gaussians(
+                means=torch.from_numpy(points + blob.center).float(),
+                quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
+                log_scales=torch.full((count, 3), math.log(SCALE * side), device="cpu"),
+                logit_opacities=torch.full((count,), LOGIT, device="cpu"),
+                sh=sh,
+            )
+        )
+    return found
 
 
 def pays(seeds: Seeds, footage: Sequence[Footage]) -> bool:
@@ -171,7 +200,7 @@ def _surface(track: Track) -> tuple[np.ndarray, float]:
     return np.array(sorted(kept - inner), float) * side, side
 
 
-def _colors(points: np.ndarray, track: Track, footage: Sequence[Footage]) -> np.ndarray:
+def _colors(points: np.ndarray, track: Track, footage: Sequence[Footage]) -> tuple[np.ndarray, np.ndarray]:
     total, count = np.zeros((len(points), 3)), np.zeros((len(points), 1))
     outward = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
     for time, center in zip(track.times, track.centers, strict=True):
@@ -185,4 +214,4 @@ def _colors(points: np.ndarray, track: Track, footage: Sequence[Footage]) -> np.
                 total[rows] += view.image[y, x] / 255
                 count[rows] += 1
     usual = total.sum(0) / max(count.sum(), 1)
-    return np.where(count > 0, total / np.maximum(count, 1), usual)
+    return np.where(count > 0, total / np.maximum(count, 1), usual), count > 0
