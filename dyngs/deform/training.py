@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,8 +19,7 @@ from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
-from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
-from dyngs.deform.fixed_cameras.seeds import seeds_over_time
+from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion, moments
 from dyngs.deform.free import FreePrimitives, FreeStart, copied_over_time
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
@@ -151,7 +149,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             return None
         start = None
         if isinstance(self.options.deform, FreeField):
-            start = self._free_start(now.detach().select(rows), first)
+            start = self._free_start(now.detach(), now.detach().select(rows))
             result = replace(with_gaussians(now.detach(), start.added), finding=first.finding)
         elif first.seeds:
             result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
@@ -204,18 +202,14 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still, rows, self.capture.extent, limit)
 
-    def _free_start(self, still: Gaussians, first: FirstMotion) -> FreeStart:
+    def _free_start(self, now: Gaussians, still: Gaussians) -> FreeStart:
         begun = copied_over_time(still, len(self.times))
         gap = 1 / max(len(self.times) - 1, 1)
-        limit = SEEDS // max(sum(len(one.track.times) for one in first.seeds), 1)
         added, centers, velocities = list(begun.added), [begun.centers], [begun.velocities]
-        for one in first.seeds:
-            track = one.track
-            pace = np.gradient(track.centers, np.array(track.times), axis=0)
-            for time, v, g in zip(track.times, pace, seeds_over_time(track, self.capture.standing(), limit, still.sh.shape[1]), strict=True):
-                added.append(g)
-                centers.append(torch.full((len(g),), time))
-                velocities.append(torch.from_numpy(v).float().expand(len(g), 3))
+        for one in moments(self.capture.standing(), now, self.capture.extent, SEEDS):
+            added.append(one.gaussians)
+            centers.append(torch.full((len(one.gaussians),), one.time))
+            velocities.append(torch.from_numpy(one.velocity).float().expand(len(one.gaussians), 3))
         c = torch.cat(centers)
         spans = torch.cat([begun.spans, torch.full((len(c) - len(begun.spans),), SPAN_GAPS * gap)])
         print("free start", len(still), len(begun.spans), len(c), [len(a) for a in added[-3:]])

@@ -87,33 +87,73 @@ def seeds_of(track: Track, footage: Sequence[Footage], limit: int, num_terms: in
     return Seeds(track, track.times[begin], gaussians)
 
 
-def seeds_over_time(track: Track, footage: Sequence[Footage], limit: int, num_terms: int) -> list[Gaussians]:
-    """Return at most ``limit`` Gaussians on the surface of what ``track`` follows, for each of its times.
+@dataclass(frozen=True)
+class Moment:
+    """Gaussians on one thing at one time, and its velocity then."""
 
-    Each has the mean of its colours in the images of its time; of all times, where none shows it then.
+    time: float
+    gaussians: Gaussians
+    velocity: np.ndarray  # (3,) world units per clip
+
+
+def moments_of(track: Track, footage: Sequence[Footage], thinned: float, num_terms: int) -> list[Moment]:
+    """Return Gaussians on the surface of what ``track`` follows, one for ``thinned`` of its cubes, for each of its times.
+
+    Each has the mean of its colours in the images of its time; of all times, where none shows it then. What travels has
+    the surface that is usual over time; of other things it is that of the hull of a time. Left out are times at which
+    the Gaussians, drawn over the cameras' medians, are not nearer to the images than the medians alone.
     """
-    points, side = _surface(track)
-    count = min(limit, len(points))
-    if count < len(points):
-        side *= math.sqrt(len(points) / count)
-        points = points[np.linspace(0, len(points) - 1, count).round().astype(int)]
-    usual, _ = _colors(points, track, footage)
-    found = []
-    for time, blob in zip(track.times, track.blobs, strict=True):
-        colors, seen = _colors(points, Track((time,), (blob,)), footage)
-        colors = np.where(seen, colors, usual)
-        sh = torch.zeros(count, num_terms, 3, device="cpu")
-        sh[:, 0] = torch.from_numpy((colors - 0.5) / SH_C0).float()
-        found.append(
-            Gaussians(
-                means=torch.from_numpy(points + blob.center).float(),
-                quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
-                log_scales=torch.full((count, 3), math.log(SCALE * side), device="cpu"),
-                logit_opacities=torch.full((count,), LOGIT, device="cpu"),
-                sh=sh,
-            )
-        )
+    usual, side = _surface(track)
+    pace = np.gradient(track.centers, np.array(track.times), axis=0) if len(track.times) > 1 else np.zeros((1, 3))
+    found: list[Moment] = []
+    for time, blob, velocity in zip(track.times, track.blobs, pace, strict=True):
+        here = Track((time,), (blob,))
+        points, size = (usual, side) if track.travels else _surface(here)
+        rows = np.linspace(0, len(points) - 1, max(round(len(points) / thinned), 1)).round().astype(int)
+        points, size = points[rows], size * math.sqrt(len(points) / len(rows))
+        colors, _ = _colors(points, here, footage)
+        gaussians = _on_surface(points + blob.center, size, colors, num_terms)
+        if _pays_at(time, gaussians, footage):
+            found.append(Moment(time, gaussians, velocity * track.travels))
     return found
+
+
+def num_cubes(track: Track) -> int:
+    return len(_surface(track)[0]) * len(track.times)
+
+
+def _on_surface(points: np.ndarray, side: float, colors: np.ndarray, num_terms: int) -> Gaussians:
+    count = len(points)
+    sh = torch.zeros(count, num_terms, 3, device="cpu")
+    sh[:, 0] = torch.from_numpy((colors - 0.5) / SH_C0).float()
+    return Gaussians(
+        means=torch.from_numpy(points).float(),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device="cpu").repeat(count, 1),
+        log_scales=torch.full((count, 3), math.log(SCALE * side), device="cpu"),
+        logit_opacities=torch.full((count,), LOGIT, device="cpu"),
+        sh=sh,
+    )
+
+
+def _pays_at(time: float, gaussians: Gaussians, footage: Sequence[Footage]) -> bool:
+    before = after = 0.0
+    looked_at = shown = 0
+    for one in (one for one in footage if time in one.times):
+        i = one.times.index(time)
+        with torch.no_grad():
+            drawn = render(gaussians, one.camera)
+        alpha = drawn.alpha[0].reshape(*one.changed.shape[1:], 1)
+        covered = (alpha[..., 0] > COVERED) & torch.from_numpy(one.counted[i])
+        if not bool(covered.any()):
+            continue
+        looked_at += 1
+        if float(torch.from_numpy(one.changed[i])[covered].float().mean()) < SHOWN:
+            continue
+        shown += 1
+        truth, still = (torch.from_numpy(x).float() / 255 for x in (one.images[i], one.median))
+        before += float((still - truth).square().sum(-1)[covered].sum())
+        after += float((drawn.rgb[0] + (1 - alpha) * still - truth).square().sum(-1)[covered].sum())
+    return shown >= SHOWN * looked_at and after < PAYS * before
 
 
 def pays(seeds: Seeds, footage: Sequence[Footage]) -> bool:

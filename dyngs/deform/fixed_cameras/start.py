@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.hulls import blobs_in, silhouettes_at
 from dyngs.deform.fixed_cameras.linking import Track, linked
-from dyngs.deform.fixed_cameras.seeds import Seeds, fitted, pays, pieces_for, seeds_of
+from dyngs.deform.fixed_cameras.seeds import Moment, Seeds, fitted, moments_of, num_cubes, pays, pieces_for, seeds_of
 from dyngs.deform.nodes import spread_out
 from dyngs.deform.random_gaussians import box_of
 from dyngs.gaussians import Gaussians
@@ -88,6 +88,21 @@ def first_motion(
     things = "1 thing travels" if len(seeds) == 1 else f"{len(seeds)} things travel"
     finding = f"{things} before the fixed cameras, found at {lengths} of {total} times: {count} Gaussians begin there"
     return FirstMotion(tuple(seeds), finding)
+
+
+def moments(footage: Sequence[Footage], still: Gaussians, extent: float, limit: int) -> list[Moment]:
+    if len(footage) < 2 or limit < 1:
+        return []
+    low, high = _box(footage, still, extent)
+    times = sorted({time for one in footage for time in one.times})
+    tracks = linked(times, [blobs_in(silhouettes_at(footage, time), low, high) for time in times])
+    total = sum(map(num_cubes, tracks))
+    found = []
+    for t in tracks:
+        m = moments_of(t, footage, max(total / limit, 1.0), still.sh.shape[1])
+        print("track", len(t.times), "travels", t.travels, "radius", t.radius, "cubes", num_cubes(t)/len(t.times), "kept", len(m), t.centers.mean(0))
+        found += m
+    return found
 
 
 def found_tracks(footage: Sequence[Footage], low: np.ndarray, high: np.ndarray) -> list[Track]:
