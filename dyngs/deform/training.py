@@ -20,6 +20,7 @@ from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion, moments
+from dyngs.deform.fixed_cameras.surfaces import surface_changes
 from dyngs.deform.free import FreePrimitives, FreeStart, copied_over_time
 from dyngs.deform.motion import bake_, measure_motion
 from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
@@ -30,6 +31,7 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.parameters import Parameters
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
@@ -69,6 +71,7 @@ class TrainingViews:
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False  # in place, so that images show what is still exactly alike
     standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
+    options: RenderOptions = RenderOptions()  # how training images are drawn
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):
@@ -206,7 +209,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         begun = copied_over_time(still, len(self.times))
         gap = 1 / max(len(self.times) - 1, 1)
         added, centers, velocities = list(begun.added), [begun.centers], [begun.velocities]
-        for one in moments(self.capture.standing(), now, self.capture.extent, SEEDS):
+        standing = self.capture.standing()
+        changed = surface_changes(standing, now, self.capture.options, SEEDS)
+        print("changed", [len(x.gaussians) for x in changed])
+        for one in [*moments(standing, now, self.capture.extent, SEEDS), *changed]:
             added.append(one.gaussians)
             centers.append(torch.full((len(one.gaussians),), one.time))
             velocities.append(torch.from_numpy(one.velocity).float().expand(len(one.gaussians), 3))
