@@ -7,6 +7,7 @@ than its own size is learned from the views of its times alone, which should be 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from dyngs.config import FreeField
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
+from dyngs.deform.fixed_cameras.seeds import Moment
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.state import Role
@@ -24,13 +26,17 @@ SHIFT = 0.5  # Spans by which a new Gaussian is earlier or later than the one it
 LR_CENTERS, LR_SPANS, LR_VELOCITIES = 0.01, 0.01, 1e-4
 """Learning rates: in gaps between times, of the logarithm, in scene extents per gap."""
 LR_DECAY = 0.1  # Ratio of the last to the first learning rate
+FIRST_SPAN = 0.6  # Of a Gaussian at a single time, in gaps: at 1.3 of them it is half as opaque
+OTHERS_SPAN = 0.25  # Of Gaussians that may belong to any time, in units of the clip
+MOST_COPIES = 12_000  # Gaussians that copies of what moves in a static model may add up to
+NAMES = "centers", "origins", "log_spans", "velocities"
 
 
 class FreePrimitives(DeformationField):
     """x(t) = x + v (t - o) and logit(t) = logit - (t - c)^2 / (2 d^2) for each of M Gaussians.
 
-    c is the centre of its window, d the span, v the velocity; o, where it is at its canonical place, is not learned: the
-    window of a thing may shift without its path.
+    c is the centre of its window, d the span, v the velocity; o, the time at which it is at its canonical place, is not
+    learned: a window may shift without its path.
     """
 
     rows_rest = True
@@ -39,14 +45,13 @@ class FreePrimitives(DeformationField):
         self.options, self.setup = options, setup
         self.gap = 1 / max(setup.num_times - 1, 1)
         centers = torch.rand((setup.num_moving, 1), generator=generator, device="cpu")
-        self.parameters = self._untrained(centers, torch.full_like(centers, 1.0), torch.zeros(len(centers), 3, device="cpu"))
+        self.parameters = self._untrained(
+            centers, torch.full_like(centers, 1.0), torch.zeros(len(centers), 3, device="cpu")
+        )
 
-    def started(self, centers: Tensor, spans: Tensor, velocities: Tensor) -> FreePrimitives:
-        """Return an untrained field with windows around ``centers`` (M,) of ``spans`` (M,), in units of the clip.
-
-        ``velocities`` (M, 3): world units per clip.
-        """
-        return self.with_parameters(self._untrained(centers[:, None], spans[:, None], velocities))
+    def started(self, start: FreeStart) -> FreePrimitives:
+        """Return an untrained field with the windows and velocities of ``start``."""
+        return self.with_parameters(self._untrained(start.centers[:, None], start.spans[:, None], start.velocities))
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         centers, origins, log_spans, velocities = (chosen(self.parameters[name], rows) for name in NAMES)
@@ -80,15 +85,9 @@ class FreePrimitives(DeformationField):
         return Parameters(tensors, rates, LR_DECAY, Role.PER_MOVING)
 
 
-NAMES = "centers", "origins", "log_spans", "velocities"
-
-
-MOST_COPIES = 12_000  # Gaussians that copies of what a static model has may add up to
-
-
 @dataclass(frozen=True)
 class FreeStart:
-    """Gaussians to add when motion begins, and windows of all M that move: the rows of the static model come first."""
+    """Gaussians to add when motion begins, and windows of all M that move: those of the static model come first."""
 
     added: tuple[Gaussians, ...]
     centers: Tensor  # (M,) in units of the clip
@@ -96,13 +95,22 @@ class FreeStart:
     velocities: Tensor  # (M, 3) world units per clip
 
 
-def copied_over_time(still: Gaussians, num_times: int) -> FreeStart:
-    """Return copies of M Gaussians, so many that each is there for a part of the clip only."""
-    count = min(num_times, max(MOST_COPIES // max(len(still), 1), 1))
-    centers = (torch.arange(count, device="cpu") + 0.5) / count
+def free_start(still: Gaussians, moments: Sequence[Moment], others: Gaussians, num_times: int) -> FreeStart:
+    """Return copies of the M ``still`` Gaussians that move, the Gaussians of ``moments``, and ``others``.
+
+    Of the first there are so many that each is there for a part of the clip only; those of moments are there for about
+    a gap between times, ``others`` for a quarter of the clip, somewhere.
+    """
+    copies = min(num_times, max(MOST_COPIES // max(len(still), 1), 1))
+    parts = [Moment((i + 0.5) / copies, still, torch.zeros(3, device="cpu")) for i in range(copies)]
+    rest = torch.linspace(0, 1, len(others), device="cpu")
+    groups = [*parts, *moments]
+    sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")
+    spans = [1 / copies] * copies + [FIRST_SPAN / max(num_times - 1, 1)] * len(moments)
+    velocities = torch.stack([one.velocity for one in groups]).repeat_interleave(sizes, dim=0)
     return FreeStart(
-        (still,) * (count - 1),
-        centers.repeat_interleave(len(still)),
-        torch.full((count * len(still),), 1 / count, device="cpu"),
-        torch.zeros(count * len(still), 3, device="cpu"),
+        (*(one.gaussians for one in groups[1:]), others),
+        torch.cat([torch.tensor([one.time for one in groups], device="cpu").repeat_interleave(sizes), rest]),
+        torch.cat([torch.tensor(spans, device="cpu").repeat_interleave(sizes), torch.full_like(rest, OTHERS_SPAN)]),
+        torch.cat([velocities, torch.zeros(len(others), 3, device="cpu")]),
     )

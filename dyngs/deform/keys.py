@@ -76,7 +76,8 @@ class FreeField(Section):
 
     kind: Literal["free"] = Field(
         default="free",
-        description="each moving Gaussian has its own moment, span and velocity (after FreeTimeGS); for several cameras",
+        description="each moving Gaussian has a moment, a span and a velocity of its own (after FreeTimeGS); for views "
+        "of several cameras at each time",
     )
 
 

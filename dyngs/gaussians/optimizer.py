@@ -43,7 +43,7 @@ class GaussianOptimizer:
             frozen_rest: (N,) bool, Gaussians of whose harmonics only the base colour is updated; None: none.
             dense: update all Gaussians; otherwise, if ``optim.sparse``, only those that received a gradient: the others
                 keep parameters and moments.
-            resting: (M,) indices of Gaussians that are only updated if they received one, even if ``dense``; None: none.
+            resting: (M,) indices of Gaussians that are only updated if they received one, dense or not; None: none.
         """
         rows = None if dense or not self.options.sparse else self._rows_with_gradient()
         if rows is None and resting is not None:

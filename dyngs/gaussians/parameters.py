@@ -61,7 +61,9 @@ class Parameters:
     def update(self, step: int, factor: float) -> Count:
         """As ``step``, with all rates multiplied by ``factor``."""
         return sum(
-            self._update_one(name, x, self.rates[name] * factor, step) for name, x in self._tensors.items() if x.grad is not None
+            self._update_one(name, x, self.rates[name] * factor, step)
+            for name, x in self._tensors.items()
+            if x.grad is not None
         )
 
     def _update_one(self, name: str, x: Tensor, lr: float, step: int) -> Count:

@@ -44,7 +44,9 @@ def surface_changes(footage: Sequence[Footage], still: Gaussians, options: Rende
             seen.append(torch.where(weights > SHOWS * SH_C0, sums[:, 0] / weights, torch.nan))
         change = torch.stack(seen)
         usual = change.nanmedian(0).values
-        rows = torch.nonzero((usual.abs().amax(1) > CHANGE) & ((~change[..., 0].isnan()).sum(0) >= FEWEST_CAMERAS))[:, 0]
+        rows = torch.nonzero((usual.abs().amax(1) > CHANGE) & ((~change[..., 0].isnan()).sum(0) >= FEWEST_CAMERAS))[
+            :, 0
+        ]
         found.append((time, rows, usual[rows]))
     sizes = torch.cat([usual.abs().amax(1) for _, _, usual in found]).sort(descending=True).values
     least = float(sizes[limit]) if len(sizes) > limit else 0.0
@@ -53,7 +55,7 @@ def surface_changes(footage: Sequence[Footage], still: Gaussians, options: Rende
         kept = usual.abs().amax(1) > least
         if bool(kept.any()):
             copies = _recoloured(still.select(rows[kept]), usual[kept], towards)
-            moments.append(Moment(time, copies, torch.zeros(3).numpy()))
+            moments.append(Moment(time, copies, still.means.new_zeros(3)))
     return moments
 
 
@@ -66,7 +68,7 @@ def _blended(still: Gaussians, one: Footage, options: RenderOptions) -> tuple[Te
 
 
 def _recoloured(gaussians: Gaussians, change: Tensor, towards: Tensor) -> Gaussians:
-    """Return ``gaussians`` with their base colours changed, a little before themselves as seen from ``towards`` (3,)."""
+    """Return ``gaussians`` with other base colours, a little before themselves as seen from ``towards`` (3,)."""
     shortest = torch.nn.functional.one_hot(gaussians.log_scales.argmin(1), 3).to(gaussians.means)
     normals = rotate(gaussians.quats, shortest)
     signs = ((towards - gaussians.means) * normals).sum(1, keepdim=True).sign()
