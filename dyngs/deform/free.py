@@ -21,7 +21,6 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.state import Role
 
 SHORTEST = 0.25  # Least span, in gaps between times: less would flicker between them
-LOWEST = -60.0  # Logarithm of a window where it is closed; an opacity of 0 in float32
 SHIFT = 0.5  # Spans by which a new Gaussian is earlier or later than the one it descends from
 LR_CENTERS, LR_SPANS, LR_VELOCITIES = 0.01, 0.01, 1e-4
 """Learning rates: in gaps between times, of the logarithm, in scene extents per gap."""
@@ -58,7 +57,7 @@ class FreePrimitives(DeformationField):
         shift = velocities * (time - origins.detach())
         spans = log_spans.exp() + SHORTEST * self.gap
         window = -0.5 * ((time - centers) / spans).square()
-        return Offsets(shift, logit_opacities=window.clamp_min(LOWEST)[:, 0])
+        return Offsets(shift, logit_opacities=window[:, 0])
 
     def edited(self, edit: TopologyEdit) -> FreePrimitives:
         """Return the field after an edit; new rows are earlier and later in turn than those they descend from."""

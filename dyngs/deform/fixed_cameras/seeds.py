@@ -54,11 +54,18 @@ def moments_of(track: Track, footage: Sequence[Footage], thinned: float, num_ter
     for time, blob, velocity in zip(track.times, track.blobs, pace, strict=True):
         here = Track((time,), (blob,))
         points, side = usual if track.travels else surface(here)
-        rows = np.linspace(0, len(points) - 1, max(round(len(points) / thinned), 1)).round().astype(int)
-        gaussians = _on_surface(points[rows], side * math.sqrt(len(points) / len(rows)), here, footage, num_terms)
-        if pays(gaussians, time, footage):
+        dense = _on_surface(points, side, here, footage, num_terms)
+        if pays(dense, time, footage):
+            gaussians = _thinned(dense, max(round(len(points) / thinned), 1))
             found.append(Moment(time, gaussians, torch.from_numpy(velocity * track.travels).float()))
     return found
+
+
+def _thinned(gaussians: Gaussians, count: int) -> Gaussians:
+    """Return ``count`` of the Gaussians, evenly chosen, so much larger that they cover as much."""
+    rows = torch.linspace(0, len(gaussians) - 1, count, device="cpu").round().long()
+    kept = gaussians.select(rows)
+    return kept.replace(log_scales=kept.log_scales + 0.5 * math.log(len(gaussians) / count))
 
 
 def pays(gaussians: Gaussians, time: float, footage: Sequence[Footage]) -> bool:
