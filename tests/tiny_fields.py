@@ -26,7 +26,8 @@ from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians
 
-KINDS = ("hexplane", "mlp", "control_nodes", "free")
+KINDS = ("hexplane", "mlp", "control_nodes")  # fields that begin as the identity
+ALL_KINDS = (*KINDS, "free")
 HEADS = ("move_rotations", "move_scales", "move_opacities", "move_colors")
 TIMES = (0.0, 0.37, 1.0)
 

@@ -41,9 +41,6 @@ SURELY_STILL = 0.25
 MIN_MOVING_FRACTION = 0.02  # Fraction of surely moving Gaussians up to which the scene counts as still
 
 
-SEEDS = 12_000
-
-
 @dataclass(frozen=True)
 class DeformSchedule:
     """The steps at which the phases of training begin."""
@@ -184,7 +181,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         """Return what changes before fixed cameras, for a field that can begin there."""
         if not isinstance(self.options.deform, FreeField):
             return FirstMotion()
-        standing, limit = self.capture.standing(), SEEDS
+        standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options)
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:

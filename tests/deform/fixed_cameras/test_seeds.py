@@ -1,4 +1,4 @@
-"""Gaussians at single times: where the ball is then, in the colours that it shows then, with the velocity of its track."""
+"""Gaussians at single times: where the ball is then, in the colours of then, with the velocity of its track."""
 
 from __future__ import annotations
 
