@@ -63,8 +63,8 @@ class DeformationField:
     setup: FieldSetup
     parameters: Parameters
     """All that is optimised."""
-    rows_rest = False
-    """A moving Gaussian, and what the field learns of it, stays as it is in steps that do not show it."""
+    momentary = False
+    """Moving Gaussians are there for a while each, and stay as they are in steps that do not show them."""
 
     @property
     def num_values(self) -> int:

@@ -38,7 +38,7 @@ class FreePrimitives(DeformationField):
     learned: a window may shift without its path.
     """
 
-    rows_rest = True
+    momentary = True
 
     def __init__(self, options: FreeField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup

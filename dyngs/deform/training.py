@@ -116,7 +116,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return scene.field.parameters.step(step - self.schedule.fine, progress)
 
     def resting(self, scene: DynamicScene) -> Tensor | None:
-        return scene.moving if scene.field is not None and scene.field.rows_rest else None
+        return scene.moving if scene.field is not None and scene.field.momentary else None
 
     def learned(self, scene: DynamicScene) -> Parameters | None:
         return None if scene.field is None else scene.field.parameters
