@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dyngs.config import Config, DynamicModel, FreeField
+from dyngs.config import Config, DynamicModel
 from dyngs.deform.training import DeformSchedule
 from dyngs.gaussians.schedule import Rates
 
@@ -21,8 +21,7 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     fine = min(max(1, round(model.motion_from * steps), min(MIN_COARSE_STEPS, steps // 3)), steps)
     opens = max(fine, round(model.time_window_grows_from * steps))
     full = max(opens, round(model.time_window_full_at * steps))
-    grows = model.time_window < 1 and not isinstance(model.deform, FreeField)
-    decays = full if grows else fine
+    decays = full if model.time_window < 1 else fine
     splits = (
         sorted({full + round(fraction * (steps - full)) for fraction in SPLITS}) if model.freeze_below_px > 0 else []
     )
