@@ -7,6 +7,7 @@ than its own size is learned from the views of its times alone, which should be 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,6 +28,8 @@ LR_CENTERS, LR_SPANS, LR_VELOCITIES = 0.01, 0.01, 1e-4
 LR_DECAY = 0.1  # Ratio of the last to the first learning rate
 FIRST_SPAN = 0.6  # Of a Gaussian at a single time, in gaps: at 1.3 of them it is half as opaque
 OTHERS_SPAN = 0.25  # Of Gaussians that may belong to any time, in units of the clip
+FAINT = -2.2
+"""Logit of the opacity, 0.1, at which copies of static Gaussians begin where there are moments: most are ghosts."""
 MOST_COPIES = 12_000  # Gaussians that copies of what moves in a static model may add up to
 NAMES = "centers", "origins", "log_spans", "velocities"
 
@@ -88,6 +91,7 @@ class FreePrimitives(DeformationField):
 class FreeStart:
     """Gaussians to add when motion begins, and windows of all M that move: those of the static model come first."""
 
+    logits: Tensor  # (M0,) opacities of those that the static model has, from now on
     added: tuple[Gaussians, ...]
     centers: Tensor  # (M,) in units of the clip
     spans: Tensor  # (M,)
@@ -101,13 +105,15 @@ def free_start(still: Gaussians, moments: Sequence[Moment], others: Gaussians, n
     a gap between times, ``others`` for a quarter of the clip, somewhere.
     """
     copies = min(num_times, max(MOST_COPIES // max(len(still), 1), 1))
-    parts = [Moment((i + 0.5) / copies, still, torch.zeros(3, device="cpu")) for i in range(copies)]
+    faint = still.replace(logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf))
+    parts = [Moment((i + 0.5) / copies, faint, torch.zeros(3, device="cpu")) for i in range(copies)]
     rest = torch.linspace(0, 1, len(others), device="cpu")
     groups = [*parts, *moments]
     sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")
     spans = [1 / copies] * copies + [FIRST_SPAN / max(num_times - 1, 1)] * len(moments)
     velocities = torch.stack([one.velocity for one in groups]).repeat_interleave(sizes, dim=0)
     return FreeStart(
+        faint.logit_opacities,
         (*(one.gaussians for one in groups[1:]), others),
         torch.cat([torch.tensor([one.time for one in groups], device="cpu").repeat_interleave(sizes), rest]),
         torch.cat([torch.tensor(spans, device="cpu").repeat_interleave(sizes), torch.full_like(rest, OTHERS_SPAN)]),

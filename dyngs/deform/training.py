@@ -146,6 +146,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             return None
         added, start = self._begun(now.detach(), rows, first)
         result = replace(with_gaussians(now.detach(), added), finding=first.finding)
+        if start is not None:
+            result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
         gaussians = Gaussians(**result.changes)
         moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
         center, half_size = box_of(now, self.capture.extent)

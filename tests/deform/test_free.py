@@ -15,7 +15,7 @@ GAP = 1 / 9  # ``tiny_setup`` has ten times
 
 
 def field_of(centers: list[float], spans: list[float], velocities: list[list[float]]) -> FreePrimitives:
-    start = FreeStart((), torch.tensor(centers), torch.tensor(spans), torch.tensor(velocities))
+    start = FreeStart(torch.zeros(0), (), torch.tensor(centers), torch.tensor(spans), torch.tensor(velocities))
     return FreePrimitives(FreeField(), tiny_setup(len(centers)), torch.Generator()).started(start)
 
 
