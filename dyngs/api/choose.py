@@ -162,7 +162,8 @@ FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
-FREE_VIEWS = 3.0  # Views of each time, in the mean, from which free primitives are the first choice for what moves
+FREE_VIEWS = 3.0
+"""Views of each time, in the mean, from which free primitives are the first choice before fixed cameras."""
 EARLY = {"resolution_grows_from": 0.3, "resolution_full_at": 0.5}
 """Fractions of a run with free primitives at which its images grow."""
 MIN_DIFFERING = 0.001
@@ -216,7 +217,9 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
         case DynamicModel() as model:
             _require_times(config, capture.splits["train"])
             moves = _motion_of_fixed_cameras(capture, config) if model.choose else True
-            if model.choose and not model.deform.model_fields_set and _views_at_once(capture) >= FREE_VIEWS:
+            asks = model.choose and moves and not model.deform.model_fields_set
+            if asks and _views_at_once(capture) >= FREE_VIEWS:
+                print("free primitives for what moves, as fixed cameras see each time from several sides", flush=True)
                 settings.insert(0, OpenSetting(f"model.deform.kind={model.deform.kind}", _as_before(plain_config)))
                 plain_config = best = _with_free_primitives(plain_config)
             best = _with(best, "model", choose=False)
