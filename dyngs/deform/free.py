@@ -17,6 +17,7 @@ from torch import Tensor
 from dyngs.config import FreeField
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
 from dyngs.deform.fixed_cameras.seeds import Moment
+from dyngs.deform.keys import COPIES_OF_MOVING
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.state import Role
@@ -30,7 +31,6 @@ FIRST_SPAN = 0.6  # Of a Gaussian at a single time, in gaps: at 1.3 of them it i
 OTHERS_SPAN = 0.25  # Of Gaussians that may belong to any time, in units of the clip
 FAINT = -2.2
 """Logit of the opacity, 0.1, at which copies of static Gaussians begin where there are moments: most are ghosts."""
-MOST_COPIES = 12_000  # Gaussians that copies of what moves in a static model may add up to
 NAMES = "centers", "origins", "log_spans", "velocities"
 
 
@@ -104,7 +104,7 @@ def free_start(still: Gaussians, moments: Sequence[Moment], others: Gaussians, n
     Of the first there are so many that each is there for a part of the clip only; those of moments are there for about
     a gap between times, ``others`` for a quarter of the clip, somewhere.
     """
-    copies = min(num_times, max(MOST_COPIES // max(len(still), 1), 1))
+    copies = min(num_times, max(COPIES_OF_MOVING // max(len(still), 1), 1))
     faint = still.replace(logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf))
     parts = [Moment((i + 0.5) / copies, faint, torch.zeros(3, device="cpu")) for i in range(copies)]
     rest = torch.linspace(0, 1, len(others), device="cpu")

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from moving_scene import Blinking, Sliding, camera, moving_scene, row_of_balls, still_scene
-from tiny_fields import KINDS, busy_config
+from tiny_fields import ALL_KINDS, busy_config
 from torch import Tensor
 
 from dyngs.api.train import train
@@ -81,7 +81,7 @@ def trained(config: Config) -> Trainer:
     return trainer
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(kind: str, moving: Path, tmp_path: Path) -> None:
     """From the checkpoint before the stage, and from one in its middle."""
     config = moving_config(moving, tmp_path / "run", kind)
