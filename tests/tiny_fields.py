@@ -98,7 +98,7 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         "free": {},
     }
     field = tiny_options(kind).model_copy(update=rates[kind])
-    freeze_below_px = 1.5 if kind == "control_nodes" else 0.3
+    freeze_below_px = {"control_nodes": 1.5, "free": 0.05}.get(kind, 0.3)
     phases = {
         "motion_from": 8 / 24,
         "time_window": 0.4,
