@@ -15,7 +15,7 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, explained_pixels, write_choices
+from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
 from dyngs.config.io import load_config, packaged_preset
@@ -186,17 +186,6 @@ def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
     for count in (24, 48, 100, 1000):
         (held_out,) = module._held_out(views(count))
         assert 8 <= len(held_out) <= count / 3
-
-
-def test_half_is_explained_and_neither_image_is_favoured() -> None:
-    truth = torch.zeros(10, 10, 3)
-    one, other = truth.clone(), truth.clone()
-    one[:5], other[5:] = 1.0, 1.0
-    one[0], other[0] = 1.0, 1.0
-    counts = explained_pixels(one, other, truth, None)
-    assert torch.equal(counts, explained_pixels(other, one, truth, None))
-    assert counts[1:].all()
-    assert not torch.equal(counts, torch.ones_like(counts)) or bool(counts[0].all())
 
 
 def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> None:
