@@ -63,6 +63,8 @@ class DeformationField:
     setup: FieldSetup
     parameters: Parameters
     """All that is optimised."""
+    momentary = False
+    """Moving Gaussians are there for a while each, and stay as they are in steps that do not show them."""
 
     @property
     def num_values(self) -> int:

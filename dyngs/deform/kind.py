@@ -75,4 +75,5 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         errors_of,
         cameras_stay=bool(in_place),
         standing=standing,
+        options=options,
     )

@@ -63,6 +63,10 @@ class SceneTraining(Generic[S]):
     def learned(self, scene: S) -> Parameters | None:
         return None
 
+    def resting(self, scene: S) -> Tensor | None:
+        """Return the indices of the Gaussians that stay as they are in steps that do not show them; None: of none."""
+        return None
+
     def after_step(self, scene: S, step: int, edited: bool) -> S:
         """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen."""
         return scene
@@ -195,7 +199,8 @@ class GaussianModel(Model[GaussianScene]):
         before, generator = self._optimizer.parameters, self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
-        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
+        resting = self.training.resting(self._scene)
+        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen, resting=resting)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:
