@@ -163,8 +163,7 @@ FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
-FREE_VIEWS = 3.0
-"""Views of each time, in the mean, from which free primitives are the first choice before fixed cameras."""
+FREE_VIEWS = 3.0  # Mean views of each time from which free primitives are the first choice before fixed cameras
 EARLY = {"resolution_grows_from": 0.3, "resolution_full_at": 0.5}
 """Fractions of a run with free primitives at which its images grow."""
 MIN_DIFFERING = 0.001
@@ -229,9 +228,7 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
                 settings.insert(0, OpenSetting("model.kind=dynamic", lambda _: moving))
             else:
                 base = best = best if moves else as_static(plain_config)
-        case _ if settings:
-            pass
-        case _:
+        case _ if not settings:
             return best, [], with_points(capture, best)
     settings = [x for x in settings if x.applied(best) is not None or x.applied(base) is not None]
     plan = _Plan.of(best, capture, len(settings), FEWEST_STEPS if base == best else STEPS)
@@ -303,9 +300,8 @@ def as_static(config: Config) -> Config:
 def _at_rest(config: Config) -> Config:
     """Return ``config`` without motion, and with the same learning rates as with it."""
     shared = {key: getattr(config.model, key) for key in StaticModel.model_fields if key != "kind"}
-    of_means, _ = rate_factors(config)
-    optim = config.optim.model_copy(update={"rate_factor": of_means})
-    return config.model_copy(update={"model": StaticModel.model_validate(shared), "optim": optim})
+    alike = _with(config, "optim", rate_factor=rate_factors(config)[0])
+    return alike.model_copy(update={"model": StaticModel.model_validate(shared)})
 
 
 def _requested(given: Section, usual: Section) -> Section:
