@@ -56,8 +56,7 @@ FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
-FREE_VIEWS = 3.0
-"""Views of each time, in the mean, from which free primitives are the first choice before fixed cameras."""
+FREE_VIEWS = 3.0  # Mean views of each time from which free primitives are the first choice before fixed cameras
 EARLY = {"resolution_grows_from": 0.3, "resolution_full_at": 0.5}
 """Fractions of a run with free primitives at which its images grow."""
 MIN_DIFFERING = 0.001
