@@ -16,6 +16,8 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import ControlNodesField, DynamicModel
 from dyngs.data.loader import Image
+from dyngs.deform.bodies.shots import Shots
+from dyngs.deform.bodies.start import found_bodies, labels_of
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
@@ -28,7 +30,6 @@ from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
-from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
@@ -64,6 +65,8 @@ class TrainingViews:
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False  # in place, so that images show what is still exactly alike
     standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
+    # what one moving camera shows, against N Gaussians that stand still; None where there is no such camera
+    shots: Callable[[Gaussians], Shots | None] = lambda _: None
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):
@@ -111,10 +114,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if scene.field is None:
             return 0
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
-        return scene.field.parameters.step(step - self.schedule.fine, progress)
+        return scene.field.step(step - self.schedule.fine, progress)
 
-    def learned(self, scene: DynamicScene) -> Parameters | None:
-        return None if scene.field is None else scene.field.parameters
+    def leaves(self, scene: DynamicScene) -> list[Tensor]:
+        return [] if scene.field is None else scene.field.leaves
 
     def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
         if self._update.is_due(step, edited):
@@ -139,7 +142,16 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         first = self._first_motion(now.detach(), rows)
         if not errs and not first.seeds:
             return None
-        if first.seeds:
+        bodies, seeds = None, list[Gaussians]()
+        shots = self.capture.shots(now.detach())
+        if shots is not None and not first.seeds:
+            bodies = found_bodies(shots)
+            if bodies is not None:
+                seeds = bodies.seeds(shots, self.options.num_random_moving, now.sh.shape[1])
+        if bodies is not None:
+            result = replace(with_gaussians(now.detach(), seeds), finding=bodies.finding)
+            self._on_its_way(True)
+        elif first.seeds:
             result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
         else:
             num_added = self.options.num_random_moving
@@ -155,6 +167,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         else:
             field = new_field(self.options.deform, setup, self._generator)
         std = self._update.of(gaussians)
+        if bodies is not None:
+            field = bodies.field(field, labels_of(seeds, len(rows)))
         field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
 

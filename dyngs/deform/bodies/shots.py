@@ -5,10 +5,21 @@ Local letters: T images in order of time, n points or pixels, each in one image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.data.capture import View
+from dyngs.data.loader import Image
+from dyngs.data.times import static_cameras
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.rendering import RenderOptions, render
+
+LONGEST_SIDE = 200  # Pixels; larger images are shrunk
 
 TOLERANCE = 0.12  # Difference of colours, mean over channels, that counts in full
 SHADE = 0.25  # Weight of differences that a shadow would make
@@ -99,7 +110,29 @@ class Shots:
         return rows[seen], columns[seen], ((offset + along) / radius)[seen]
 
 
-def in_order(shots: Shots, order: Sequence[int]) -> Shots:
-    """Return the images ``order`` alone."""
-    parts = (shots.times, shots.images, shots.still, shots.depths, shots.poses, shots.intrinsics)
-    return Shots(*(part[list(order)] for part in parts))
+def one_camera(views: Sequence[View]) -> list[int] | None:
+    """Return the order in time of views that one moving camera may have taken, each at a time of its own; else None."""
+    times = [view.time for view in views]
+    if None in times or len(set(times)) < len(times) or static_cameras(views):
+        return None
+    return sorted(range(len(times)), key=lambda i: times[i] or 0.0)
+
+
+@torch.no_grad()
+def shots_of(images: Iterable[Image], still: Gaussians, options: RenderOptions, background: Tensor) -> Shots:
+    """Return ``images``, in order of time, with what ``still`` shows, at most ``LONGEST_SIDE`` pixels wide or high."""
+    parts: dict[str, list[np.ndarray]] = {}
+    options = replace(options, depth="expected")
+    for image in images:
+        size = max(image.cameras.width, image.cameras.height)
+        small = image.shrunk(math.ceil(size / LONGEST_SIDE))
+        drawn = render(still, small.cameras, options, background=background)
+        assert drawn.depth is not None
+        alpha = drawn.alpha.reshape(small.cameras.height, small.cameras.width)
+        depth = torch.where(alpha > SOLID, drawn.depth.reshape(alpha.shape), NEVER)
+        shown = {"images": small.composite(background), "still": drawn.rgb[0], "depths": depth}
+        camera = {"poses": small.cameras.cam_from_world[0].double(), "intrinsics": small.cameras.intrinsics[0].double()}
+        for name, x in (shown | camera).items():
+            parts.setdefault(name, []).append(x.cpu().numpy())
+        parts.setdefault("times", []).append(np.array(small.time or 0.0))
+    return Shots(**{name: np.stack(x) for name, x in parts.items()})

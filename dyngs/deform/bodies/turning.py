@@ -54,8 +54,8 @@ def found_turning(shots: Shots, path: Path) -> Turning:
     """Return how the body on ``path`` turns."""
     frames = without_light([_frame(shots, path, t) for t in range(len(shots))])
     basis = _basis(shots.times, path)
-    rotations = max_polished = _polished(frames, integrated(_best_numbers(frames, basis), basis)[0])
-    rotations = np.einsum("tij,kj->tik", max_polished, rotations[len(frames) // 2])
+    rotations = _polished(frames, integrated(_best_numbers(frames, basis), basis)[0])
+    rotations = np.einsum("tij,kj->tik", rotations, rotations[len(frames) // 2])
     sums, counts = (sum(x) for x in zip(*(_sums(f, r) for f, r in zip(frames, rotations, strict=True)), strict=True))
     still = np.broadcast_to(np.eye(3), rotations.shape)
     moved, stood = disagreements(frames, np.stack([rotations, still]))

@@ -1,0 +1,125 @@
+"""Rigid bodies that move along splines, within another field: the smallest motion that explains what turns.
+
+Local letters: M moving Gaussians, B bodies, P control points.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dyngs.deform.field import DeformationField, Offsets, chosen
+from dyngs.deform.spline_fit import SPAN, spline_values
+from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.parameters import Parameters
+from dyngs.ops.adam import Count
+from dyngs.ops.quaternions import identity_quat, rotate
+from dyngs.state import Role, State, StateTensor, part_of, prefixed
+from dyngs.tensor_checks import require_tensor
+
+RATES = {"places": 1e-4, "quats": 1e-3}
+"""Learning rates of the bodies' splines; that of places times the scene extent."""
+LR_DECAY = 0.05
+
+
+class BodyField(DeformationField):
+    """The offsets of ``others``, but for the Gaussians of bodies: these move rigidly, and take colours alone from it.
+
+    A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of the place p and of
+    the quaternion of R; the Gaussians turn with it.
+    """
+
+    def __init__(
+        self, others: DeformationField, centers: Tensor, labels: Tensor, splines: Mapping[str, Tensor]
+    ) -> None:
+        """Take bodies with ``centers`` (B, 3) where their Gaussians lie, and the control points of their ``splines``.
+
+        Args:
+            labels: (M,) body of each Gaussian, -1 for none.
+            splines: ``places`` (B, P, 3) and ``quats`` (B, P, 4).
+        """
+        self.setup, self.others, self.centers, self.labels = others.setup, others, centers, labels
+        rates = RATES | {"places": RATES["places"] * self.setup.extent}
+        self.parameters = Parameters(splines, rates, LR_DECAY)
+
+    @property
+    def num_values(self) -> int:
+        return self.parameters.num_values + self.centers.numel() + self.labels.numel() + self.others.num_values
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        return [*self.parameters.leaves, *self.others.leaves]
+
+    def step(self, step: int, progress: float) -> Count:
+        return self.parameters.step(step, progress) + self.others.step(step, progress)
+
+    def poses(self, time: float) -> tuple[Tensor, Tensor]:
+        """Return (B, 3) places of the bodies' centres and (B, 4) quaternions, of any length."""
+        return spline_values(self.parameters["places"], time), spline_values(self.parameters["quats"], time)
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        found = self.others.offsets(means, time, rows)
+        labels, means = chosen(self.labels, rows), chosen(means, rows)
+        own = torch.nonzero(labels >= 0)[:, 0]
+        body = labels[own]
+        places, quats = (x.index_select(0, body) for x in self.poses(time))
+        arms = means[own] - self.centers[body]
+        quats = torch.nn.functional.normalize(quats, dim=1)
+        moved = rotate(quats, arms) + places - means[own]
+        turned = found.quats if found.quats is not None else means.new_zeros(len(means), 4)
+        scales = found.log_scales
+        return Offsets(
+            found.means.index_copy(0, own, moved),
+            turned.index_copy(0, own, quats - identity_quat(quats)),
+            None if scales is None else scales.index_fill(0, own, 0.0),
+            found.logit_opacities,
+            found.colors,
+        )
+
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        return self.others.penalties(time)
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        self.others.extend(seen, soon)
+
+    def regroup(self) -> None:
+        self.others.regroup()
+
+    def edited(self, edit: TopologyEdit) -> BodyField:
+        field = copy.copy(self)
+        field.others, field.labels = self.others.edited(edit), self.labels[edit.source]
+        return field
+
+    def state(self) -> State:
+        own = {
+            "centers": StateTensor(self.centers, Role.SHARED),
+            "labels": StateTensor(self.labels, Role.PER_MOVING),
+        }
+        bodies = prefixed("bodies", own | super().state())
+        return bodies | self.others.state()
+
+    @staticmethod
+    def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
+        """Return the field of a state within the restored ``others``; raises as ``restored``."""
+        centers, labels = tensors["centers"], tensors["labels"]
+        learned, num = part_of(tensors, "learned"), others.setup.num_moving
+        require_tensor("centers", centers, (None, 3))
+        require_tensor("labels", labels, (num,), torch.long)
+        if num and not -1 <= int(labels.min()) <= int(labels.max()) < len(centers):
+            raise ValueError("'labels' names bodies that do not exist")
+        points = learned["places"].shape[1] if learned["places"].ndim == 3 else 0
+        if points < SPAN:
+            raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
+        like = {name: torch.zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
+        field = BodyField(others, centers, labels, {n: x.to(centers.device) for n, x in like.items()})
+        field.parameters = field.parameters.restored(learned)
+        return field
+
+    def to(self, device: torch.device | str) -> BodyField:
+        field = super().to(device)
+        field.others = self.others.to(device)
+        field.centers, field.labels = self.centers.to(device), self.labels.to(device)
+        return field
