@@ -17,7 +17,7 @@ from dyngs.camera import Cameras
 from dyngs.config import ControlNodesField, DynamicModel
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
-from dyngs.deform.bodies.start import found_bodies, labels_of
+from dyngs.deform.bodies.start import Bodies, found_bodies
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import field_on_its_way, new_field
 from dyngs.deform.fixed_cameras.changes import Footage
@@ -142,15 +142,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         first = self._first_motion(now.detach(), rows)
         if not errs and not first.seeds:
             return None
-        bodies, seeds = None, list[Gaussians]()
-        shots = self.capture.shots(now.detach())
-        if shots is not None and not first.seeds:
-            bodies = found_bodies(shots)
-            if bodies is not None:
-                seeds = bodies.seeds(shots, self.options.num_random_moving, now.sh.shape[1])
+        bodies = None if first.seeds else self._first_bodies(now.detach())
         if bodies is not None:
-            result = replace(with_gaussians(now.detach(), seeds), finding=bodies.finding)
-            self._on_its_way(True)
+            result = replace(with_gaussians(now.detach(), bodies.seeds), finding=bodies.finding)
         elif first.seeds:
             result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
         else:
@@ -166,9 +160,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             self._on_its_way(True)
         else:
             field = new_field(self.options.deform, setup, self._generator)
-        std = self._update.of(gaussians)
         if bodies is not None:
-            field = bodies.field(field, labels_of(seeds, len(rows)))
+            field = bodies.within(field)
+            self._on_its_way(False, bodies.explain_all)
+        std = self._update.of(gaussians)
         field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
 
@@ -181,17 +176,24 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
-        self._on_its_way("tracked" in tensors)
+        self._on_its_way("tracked" in tensors, "all_times" in tensors)
         return DynamicScene.restored(self.options, gaussians, tensors)
 
     def state(self) -> State:
-        return with_role({"tracked": torch.ones(1, device="cpu")}, Role.TRAINING) if self._tracked else {}
+        kept = {"tracked": self._tracked, "all_times": self._all_times}
+        return with_role({name: torch.ones(1, device="cpu") for name, held in kept.items() if held}, Role.TRAINING)
 
-    def _on_its_way(self, tracked: bool) -> None:
-        """Train on all times from the first where tracks are known: nothing need be followed outwards."""
-        first, schedule = 1.0 if tracked else self.options.time_window, self.schedule
+    def _on_its_way(self, tracked: bool, all_times: bool = False) -> None:
+        """Train on all times from the first where tracks or bodies are known: nothing need be followed outwards."""
+        first, schedule = 1.0 if tracked or all_times else self.options.time_window, self.schedule
         phases = schedule.fine, schedule.opens, schedule.full
-        self._tracked, self._window = tracked, TimeWindow.around_middle(self.capture.times, first, *phases)
+        self._tracked, self._all_times = tracked, all_times
+        self._window = TimeWindow.around_middle(self.capture.times, first, *phases)
+
+    def _first_bodies(self, still: Gaussians) -> Bodies | None:
+        """Return what moves rigidly before one moving camera."""
+        shots = self.capture.shots(still)
+        return None if shots is None else found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
 
     def _first_motion(self, still: Gaussians, rows: Tensor) -> FirstMotion:
         """Return what travels before fixed cameras, for a field that can begin on its way."""

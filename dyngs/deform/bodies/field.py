@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,12 +18,23 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, rotate
-from dyngs.state import Role, State, StateTensor, part_of, prefixed
-from dyngs.tensor_checks import require_tensor
+from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
+from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
-RATES = {"places": 1e-4, "quats": 1e-3}
+RATES = {"places": 3e-4, "quats": 3e-3}
 """Learning rates of the bodies' splines; that of places times the scene extent."""
 LR_DECAY = 0.05
+SMOOTHNESS = 0.0
+"""Weight of the squared second differences of control points, of places in radii."""
+
+
+@dataclass(frozen=True)
+class BodyRest:
+    """Where bodies lie when they are at rest, and which Gaussians are theirs."""
+
+    centers: Tensor  # (B, 3)
+    radii: Tensor  # (B,)
+    labels: Tensor  # (M,) body of each Gaussian, -1 for none
 
 
 class BodyField(DeformationField):
@@ -32,22 +44,15 @@ class BodyField(DeformationField):
     the quaternion of R; the Gaussians turn with it.
     """
 
-    def __init__(
-        self, others: DeformationField, centers: Tensor, labels: Tensor, splines: Mapping[str, Tensor]
-    ) -> None:
-        """Take bodies with ``centers`` (B, 3) where their Gaussians lie, and the control points of their ``splines``.
-
-        Args:
-            labels: (M,) body of each Gaussian, -1 for none.
-            splines: ``places`` (B, P, 3) and ``quats`` (B, P, 4).
-        """
-        self.setup, self.others, self.centers, self.labels = others.setup, others, centers, labels
+    def __init__(self, others: DeformationField, rest: BodyRest, splines: Mapping[str, Tensor]) -> None:
+        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies' ``splines``."""
+        self.setup, self.others, self.rest = others.setup, others, rest
         rates = RATES | {"places": RATES["places"] * self.setup.extent}
         self.parameters = Parameters(splines, rates, LR_DECAY)
 
     @property
     def num_values(self) -> int:
-        return self.parameters.num_values + self.centers.numel() + self.labels.numel() + self.others.num_values
+        return self.parameters.num_values + sum(x.numel() for x in vars(self.rest).values()) + self.others.num_values
 
     @property
     def leaves(self) -> list[Tensor]:
@@ -62,11 +67,11 @@ class BodyField(DeformationField):
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         found = self.others.offsets(means, time, rows)
-        labels, means = chosen(self.labels, rows), chosen(means, rows)
+        labels, means = chosen(self.rest.labels, rows), chosen(means, rows)
         own = torch.nonzero(labels >= 0)[:, 0]
         body = labels[own]
         places, quats = (x.index_select(0, body) for x in self.poses(time))
-        arms = means[own] - self.centers[body]
+        arms = means[own] - self.rest.centers[body]
         quats = torch.nn.functional.normalize(quats, dim=1)
         moved = rotate(quats, arms) + places - means[own]
         turned = found.quats if found.quats is not None else means.new_zeros(len(means), 4)
@@ -80,7 +85,9 @@ class BodyField(DeformationField):
         )
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        return self.others.penalties(time)
+        places, quats = (self.parameters[name].diff(n=2, dim=1) for name in ("places", "quats"))
+        bend = (places / self.rest.radii[:, None, None]).square().mean() + quats.square().mean()
+        return self.others.penalties(time) | {"body acceleration": SMOOTHNESS * bend}
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         self.others.extend(seen, soon)
@@ -90,36 +97,32 @@ class BodyField(DeformationField):
 
     def edited(self, edit: TopologyEdit) -> BodyField:
         field = copy.copy(self)
-        field.others, field.labels = self.others.edited(edit), self.labels[edit.source]
+        field.others = self.others.edited(edit)
+        field.rest = replace(self.rest, labels=self.rest.labels[edit.source])
         return field
 
     def state(self) -> State:
-        own = {
-            "centers": StateTensor(self.centers, Role.SHARED),
-            "labels": StateTensor(self.labels, Role.PER_MOVING),
-        }
-        bodies = prefixed("bodies", own | super().state())
-        return bodies | self.others.state()
+        rest = {name: StateTensor(x, Role.SHARED) for name, x in vars(self.rest).items()}
+        rest["labels"] = StateTensor(self.rest.labels, Role.PER_MOVING)
+        return self.others.state() | prefixed("bodies", rest | super().state())
 
     @staticmethod
     def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
         """Return the field of a state within the restored ``others``; raises as ``restored``."""
-        centers, labels = tensors["centers"], tensors["labels"]
-        learned, num = part_of(tensors, "learned"), others.setup.num_moving
-        require_tensor("centers", centers, (None, 3))
-        require_tensor("labels", labels, (num,), torch.long)
-        if num and not -1 <= int(labels.min()) <= int(labels.max()) < len(centers):
-            raise ValueError("'labels' names bodies that do not exist")
+        centers = require_tensor("centers", tensors["centers"], (None, 3))
+        radii = require_positive("radii", require_tensor("radii", tensors["radii"], (len(centers),)))
+        labels = require_tensor("labels", tensors["labels"], (others.setup.num_moving,), torch.long)
+        require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
+        learned = part_of(tensors, "learned")
         points = learned["places"].shape[1] if learned["places"].ndim == 3 else 0
         if points < SPAN:
             raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
-        like = {name: torch.zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
-        field = BodyField(others, centers, labels, {n: x.to(centers.device) for n, x in like.items()})
+        like = {name: centers.new_zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
+        field = BodyField(others, BodyRest(centers, radii, labels), like)
         field.parameters = field.parameters.restored(learned)
         return field
 
     def to(self, device: torch.device | str) -> BodyField:
         field = super().to(device)
-        field.others = self.others.to(device)
-        field.centers, field.labels = self.centers.to(device), self.labels.to(device)
+        field.others, field.rest = self.others.to(device), fields_moved_to(self.rest, device)
         return field

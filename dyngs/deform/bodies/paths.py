@@ -90,10 +90,15 @@ def found_paths(shots: Shots) -> list[Path]:
         if not followed or max(path.support for path in followed) < LEAST_SUPPORT:
             break
         paths.append(max(followed, key=lambda path: path.support))
-        for i in range(len(shots)):
-            rows, columns, _ = shots.on_ball(i, paths[-1].centers[i], 1.2 * paths[-1].radius, 1.0)
-            maps[i, rows, columns] = 0
+        clear_(maps, shots, paths[-1])
     return paths
+
+
+def clear_(maps: np.ndarray, shots: Shots, path: Path) -> None:
+    """Set ``maps`` (T, H, W) to 0 where the thing on ``path`` is seen, and a little around it."""
+    for i, center in enumerate(path.centers):
+        rows, columns, _ = shots.on_ball(i, center, 1.2 * path.radius, 1.0)
+        maps[i, rows, columns] = 0
 
 
 def _contrast(shots: Shots, discs: Discs, centers: np.ndarray, radius: float) -> np.ndarray:
@@ -177,7 +182,7 @@ def _followed(shots: Shots, discs: Discs, middle: int, center: np.ndarray, step:
         low, high = max(low - 1, 0), min(high + 1, count - 1)
         centers = _smooth(shots, ways, weights)
     for turn in range(8):
-        for t in which:
+        for t in range(count):
             look(t, centers[t], 0.5)
         centers = _smooth(shots, ways, weights)
         if turn % 2:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dyngs.conventions import SH_C0
-from dyngs.deform.bodies.field import BodyField
-from dyngs.deform.bodies.paths import Path, found_paths
+from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.bodies.paths import Path, clear_, found_paths
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.turning import FINE, Turning, angles_deg, cells, found_turning
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField
@@ -22,6 +20,9 @@ from dyngs.gaussians import Gaussians
 AGREES = 0.85  # Disagreement of colours as a fraction of that of a body that does not turn, from which it turns
 INNER, LOGIT, SCALE = 0.7, 0.0, 0.6
 """Of the Gaussians that begin on a body: least distance from its centre in radii, opacity, and size in distances."""
+MARKED, LEFT = 0.35, 0.3
+"""Mean difference of 5x5 pixels that shows motion for sure, and the part of all such that bodies need not explain."""
+PIECES_PER_TIME = 0.5
 PX_PER_SEED = 2.0  # Area of the surface in pixels
 STIFFNESS = 1e-3
 
@@ -36,40 +37,64 @@ class Body:
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies that were found, and the times of the images."""
+    """Bodies that were found, and how they were seen."""
 
-    times: np.ndarray
+    shots: Shots
     bodies: tuple[Body, ...]
-    finding: str
+    seeds: tuple[Gaussians, ...]  # of each, where it is in the middle of the clip
 
-    def seeds(self, shots: Shots, limit: int, num_terms: int) -> list[Gaussians]:
-        """Return the Gaussians to begin with, at most ``limit``, where each body is in the middle of the clip."""
-        return [_seeds(body, shots, limit // len(self.bodies), num_terms) for body in self.bodies]
+    @property
+    def finding(self) -> str:
+        """A line about them."""
+        turns = [angles_deg(_steps(body.turning.rotations)).sum() for body in self.bodies]
+        things = "1 body turns" if len(turns) == 1 else f"{len(turns)} bodies turn"
+        clip = "followed at all times at once" if self.explain_all else "other things move, too"
+        return f"{things} by {', '.join(f'{turn:.0f}' for turn in turns)} degrees; {clip}"
 
-    def field(self, others: DeformationField, labels: Tensor) -> BodyField:
-        """Return ``others`` with the bodies' motion for the Gaussians with ``labels`` (M,), -1 for none."""
-        pieces = min(max(len(self.times) // 2, 1), MAX_KEY_TIMES)
-        basis = spline_basis(torch.from_numpy(self.times), pieces).numpy()
+    @property
+    def explain_all(self) -> bool:
+        """Whether hardly anything else moves."""
+        from scipy.ndimage import uniform_filter
+
+        maps = self.shots.differences()
+        marked = maps * (uniform_filter(maps, 5, axes=(1, 2)) > MARKED)
+        whole = float(marked.sum())
+        for body in self.bodies:
+            clear_(marked, self.shots, body.path)
+        return float(marked.sum()) < LEFT * whole
+
+    def within(self, others: DeformationField) -> BodyField:
+        """Return the field of ``others`` in which the last of the moving Gaussians, the seeds, are the bodies'."""
+        num_pieces = min(max(round(PIECES_PER_TIME * len(self.shots)), 1), MAX_KEY_TIMES)
+        basis = spline_basis(torch.from_numpy(self.shots.times), num_pieces).numpy()
         splines = {
-            "places": np.stack([_fitted(basis, body.path.centers) for body in self.bodies]),
-            "quats": np.stack([_fitted(basis, _quats(body.turning.rotations)) for body in self.bodies]),
+            "places": [_fitted(basis, body.path.centers) for body in self.bodies],
+            "quats": [_fitted(basis, _quats(body.turning.rotations)) for body in self.bodies],
         }
-        centers = np.stack([body.path.centers[len(self.times) // 2] for body in self.bodies])
-        device = labels.device
-        points = {name: torch.from_numpy(x).float().to(device) for name, x in splines.items()}
-        return BodyField(others, torch.from_numpy(centers).float().to(device), labels, points)
+        centers = np.stack([body.path.centers[len(self.shots) // 2] for body in self.bodies])
+        counts = [len(seeds) for seeds in self.seeds]
+        labels = torch.repeat_interleave(torch.tensor([others.setup.num_moving - sum(counts), *counts]))
+        device = others.setup.center.device
+        points = {name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()}
+        radii = torch.tensor([body.path.radius for body in self.bodies], device=device)
+        rest = BodyRest(torch.from_numpy(centers).float().to(device), radii, (labels - 1).to(device))
+        return BodyField(others, rest, points)
 
 
-def found_bodies(shots: Shots) -> Bodies | None:
-    """Return what moves rigidly; None where nothing does."""
+def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
+    """Return what moves rigidly, with at most ``limit`` Gaussians of ``num_terms`` harmonics; None where nothing does.
+
+    A body is taken if the colours of its surface, as it turns, disagree clearly less than if it did not.
+    """
     found = [Body(path, found_turning(shots, path)) for path in found_paths(shots)]
     bodies = tuple(body for body in found if body.turning.disagreement < AGREES * body.turning.standing)
-    if not bodies:
+    if not bodies or limit < len(bodies):
         return None
-    turns = [angles_deg(np.einsum("tij,tkj->tik", b.turning.rotations[1:], b.turning.rotations[:-1])) for b in bodies]
-    said = ", ".join(f"by {turn.sum():.0f} degrees" for turn in turns)
-    things = "1 body moves rigidly and turns" if len(bodies) == 1 else f"{len(bodies)} bodies move rigidly and turn"
-    return Bodies(shots.times, bodies, f"{things} {said}: taken")
+    return Bodies(shots, bodies, tuple(_seeds(body, shots, limit // len(bodies), num_terms) for body in bodies))
+
+
+def _steps(rotations: np.ndarray) -> np.ndarray:
+    return np.einsum("tij,tkj->tik", rotations[1:], rotations[:-1])
 
 
 def _seeds(body: Body, shots: Shots, limit: int, num_terms: int) -> Gaussians:
@@ -109,8 +134,3 @@ def _fitted(basis: np.ndarray, values: np.ndarray) -> np.ndarray:
     bends = STIFFNESS**0.5 * np.diff(np.eye(basis.shape[1]), n=2, axis=0)
     right = np.concatenate([values, np.zeros((len(bends), values.shape[1]))])
     return np.linalg.lstsq(np.concatenate([basis, bends]), right, rcond=None)[0]
-
-
-def labels_of(seeds: Sequence[Gaussians], others: int) -> Tensor:
-    """Return the (M,) labels of ``others`` Gaussians of no body, followed by ``seeds``."""
-    return torch.cat([torch.full((count,), i) for i, count in ((-1, others), *enumerate(map(len, seeds)))])

@@ -19,6 +19,7 @@ from dyngs.deform.bodies.paths import Path
 from dyngs.deform.bodies.shots import Shots
 
 COARSE, FINE = 6, 8  # Cells along an edge of the cube that the sphere is divided by
+MOST_PIXELS = 250  # Of a body in an image that are looked at
 LEAST_PIXELS = 2  # In a cell, for its mean colour to count
 CUT, UNKNOWN = 0.37, 0.13  # Squared colour differences: the greatest that counts, and that of cells never seen
 FREE_DEG, GIVEN_DEG, STEP_DEG = 220.0, 110.0, 55.0
@@ -56,7 +57,7 @@ def found_turning(shots: Shots, path: Path) -> Turning:
     basis = _basis(shots.times, path)
     rotations = _polished(frames, integrated(_best_numbers(frames, basis), basis)[0])
     rotations = np.einsum("tij,kj->tik", rotations, rotations[len(frames) // 2])
-    sums, counts = (sum(x) for x in zip(*(_sums(f, r) for f, r in zip(frames, rotations, strict=True)), strict=True))
+    sums, counts = _total([_sums(frame, rotation) for frame, rotation in zip(frames, rotations, strict=True)])
     still = np.broadcast_to(np.eye(3), rotations.shape)
     moved, stood = disagreements(frames, np.stack([rotations, still]))
     return Turning(rotations, float(moved), float(stood), sums / np.maximum(counts, 1)[:, None], counts)
@@ -64,7 +65,8 @@ def found_turning(shots: Shots, path: Path) -> Turning:
 
 def _frame(shots: Shots, path: Path, index: int) -> tuple[np.ndarray, np.ndarray]:
     rows, columns, normals = shots.on_ball(index, path.centers[index], path.radius)
-    return normals, shots.images[index, rows, columns]
+    step = max(len(rows) // MOST_PIXELS, 1)
+    return normals[::step], shots.images[index, rows[::step], columns[::step]]
 
 
 def without_light(frames: Frames) -> Frames:
@@ -81,7 +83,7 @@ def without_light(frames: Frames) -> Frames:
 
 
 def cells(normals: np.ndarray, size: int) -> np.ndarray:
-    """Return (...) indices below 6 ``size``^2 of the cells that unit vectors (..., 3) fall on: equal angles on a cube."""
+    """Return (...) indices below 6 ``size``^2 of the cells of a cube, of equal angles, that vectors (..., 3) point at."""
     axis = np.abs(normals).argmax(-1)
     along, first, second = (np.take_along_axis(normals, ((axis + k) % 3)[..., None], -1)[..., 0] for k in range(3))
     face = 2 * axis + (along < 0)
@@ -194,7 +196,7 @@ def _polished(frames: Frames, rotations: np.ndarray) -> np.ndarray:
     for reach, step, pull in ROUNDS_DEG:
         steps = rotations_by(np.radians(_ball_of(reach, step)))
         own = [_sums(frame, rotation) for frame, rotation in zip(frames, found, strict=True)]
-        sums, counts = (sum(x) for x in zip(*own, strict=True))
+        sums, counts = _total(own)
         for t, (normals, colors) in enumerate(frames):
             between = found[t]
             if 0 < t < len(frames) - 1:
@@ -222,6 +224,10 @@ def _sums(frame: tuple[np.ndarray, np.ndarray], rotation: np.ndarray) -> tuple[n
     place, count = cells(np.einsum("pi,ij->pj", normals, rotation), FINE), 6 * FINE**2
     sums = np.stack([np.bincount(place, c, count) for c in colors.T], axis=1)
     return sums, np.bincount(place, minlength=count)
+
+
+def _total(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    return np.sum([sums for sums, _ in parts], axis=0), np.sum([counts for _, counts in parts], axis=0)
 
 
 def _ball_of(reach: float, step: float) -> np.ndarray:
