@@ -116,8 +116,9 @@ def _straight_paths(
         near = [t for t in range(middle - HALF, middle + HALF + 1) if len(peaks[t])]
         if len(near) < 3:
             continue
-        which = np.stack([random.permutation(near)[:3] for _ in range(TRIPLES)])
-        picked = np.array([[peaks[t][random.integers(len(peaks[t]))] for t in row] for row in which])
+        which = random.permuted(np.tile(near, (TRIPLES, 1)), axis=1)[:, :3]
+        ranks = random.integers(0, np.array([len(one) for one in peaks])[which])
+        picked = np.array([[peaks[t][k] for t, k in zip(*row, strict=True)] for row in zip(which, ranks, strict=True)])
         centers, steps, radii = _through(shots, which, middle, picked)
         which = np.arange(middle - HALF, middle + HALF + 1)
         values = []

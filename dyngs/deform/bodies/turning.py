@@ -19,12 +19,12 @@ from dyngs.deform.bodies.paths import Path
 from dyngs.deform.bodies.shots import Shots
 
 COARSE, FINE = 6, 8  # Cells along an edge of the cube that the sphere is divided by
-MOST_PIXELS = 250  # Of a body in an image that are looked at
+MOST_PIXELS, FEWER_PIXELS = 250, 80  # Of a body in an image that are looked at, and that the first search looks at
 LEAST_PIXELS = 2  # In a cell, for its mean colour to count
 CUT, UNKNOWN = 0.37, 0.13  # Squared colour differences: the greatest that counts, and that of cells never seen
 FREE_DEG, GIVEN_DEG, STEP_DEG = 220.0, 110.0, 55.0
 """Constant turns over the clip that are tried: without another motion, and added to one."""
-REFINED, ROUNDS, SAMPLES = 8, 6, 64
+REFINED, ROUNDS, SAMPLES = 6, 6, 48
 ROUNDS_DEG = ((10.0, 5.0, 1e-4), (5.0, 2.5, 2e-4), (3.0, 1.5, 2e-4))
 """Reach and step of the search around each image's rotation, and the weight of squared degrees from the neighbours'."""
 
@@ -83,7 +83,7 @@ def without_light(frames: Frames) -> Frames:
 
 
 def cells(normals: np.ndarray, size: int) -> np.ndarray:
-    """Return (...) indices below 6 ``size``^2 of the cells of a cube, of equal angles, that vectors (..., 3) point at."""
+    """Return (...) indices below 6 ``size``^2 of the cells of a cube that vectors (..., 3) point at."""
     axis = np.abs(normals).argmax(-1)
     along, first, second = (np.take_along_axis(normals, ((axis + k) % 3)[..., None], -1)[..., 0] for k in range(3))
     face = 2 * axis + (along < 0)
@@ -161,7 +161,8 @@ def _basis(times: np.ndarray, path: Path) -> np.ndarray:
 
 def _best_numbers(frames: Frames, basis: np.ndarray) -> np.ndarray:
     """Return the (1, 5) numbers with which colours agree best: a grid, then random steps around the best of it."""
-    thin = [(n[t % 2 :: 2], c[t % 2 :: 2]) for t, (n, c) in enumerate(frames)]
+    steps = [max(len(normals) // FEWER_PIXELS, 1) for normals, _ in frames]
+    thin = [(n[t % k :: k], c[t % k :: k]) for t, ((n, c), k) in enumerate(zip(frames, steps, strict=True))]
 
     def score(numbers: np.ndarray) -> np.ndarray:
         parts = np.split(numbers, range(64, len(numbers), 64))

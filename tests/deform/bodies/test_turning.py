@@ -1,0 +1,40 @@
+"""How things turn, from the colours of their surfaces alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rolling_ball import rolling
+from scipy.spatial.transform import Rotation
+
+from dyngs.deform.bodies.paths import Path
+from dyngs.deform.bodies.turning import angles_deg, cells, disagreements, found_turning, rotations_by, without_light
+
+RADIUS = 0.28
+
+
+def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(T,) angles between rotations, the body's own axes chosen as the best that fit all."""
+    own, _ = Rotation.align_vectors(*np.einsum("ntij,jk->ntik", np.stack([truth, found]), np.eye(3)).reshape(2, -1, 3))
+    del own
+    u, _, v = np.linalg.svd(np.einsum("tji,tjk->ik", found, truth))
+    axes = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    return angles_deg(np.einsum("tij,jk,tlk->til", found, axes, truth))
+
+
+def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
+    """It turns by more than a full turn; of its turn from image to image nothing is known beforehand."""
+    shots, centers, truth = rolling()
+    turning = found_turning(shots, Path(centers, RADIUS, 1.0))
+    errors = errors_deg(turning.rotations, truth)
+    print(errors.round(1), turning.disagreement, turning.standing)
+    assert np.median(errors) < 4
+    assert errors.max() < 12
+    assert turning.disagreement < 0.4 * turning.standing
+
+
+def test_what_slides_does_not_turn() -> None:
+    shots, centers, _ = rolling(turns=False)
+    turning = found_turning(shots, Path(centers, RADIUS, 1.0))
+    print(angles_deg(turning.rotations).round(1), turning.disagreement, turning.standing)
+    assert turning.disagreement > 0.85 * turning.standing
