@@ -19,13 +19,11 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
-from dyngs.tensor_checks import require_indices, require_positive, require_tensor
+from dyngs.tensor_checks import require_indices, require_tensor
 
 RATES = {"places": 3e-4, "quats": 3e-3}
 """Learning rates of the bodies' splines; that of places times the scene extent."""
 LR_DECAY = 0.05
-SMOOTHNESS = 0.0
-"""Weight of the squared second differences of control points, of places in radii."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,6 @@ class BodyRest:
     """Where bodies lie when they are at rest, and which Gaussians are theirs."""
 
     centers: Tensor  # (B, 3)
-    radii: Tensor  # (B,)
     labels: Tensor  # (M,) body of each Gaussian, -1 for none
 
 
@@ -85,9 +82,7 @@ class BodyField(DeformationField):
         )
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        places, quats = (self.parameters[name].diff(n=2, dim=1) for name in ("places", "quats"))
-        bend = (places / self.rest.radii[:, None, None]).square().mean() + quats.square().mean()
-        return self.others.penalties(time) | {"body acceleration": SMOOTHNESS * bend}
+        return self.others.penalties(time)
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         self.others.extend(seen, soon)
@@ -110,7 +105,6 @@ class BodyField(DeformationField):
     def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
         """Return the field of a state within the restored ``others``; raises as ``restored``."""
         centers = require_tensor("centers", tensors["centers"], (None, 3))
-        radii = require_positive("radii", require_tensor("radii", tensors["radii"], (len(centers),)))
         labels = require_tensor("labels", tensors["labels"], (others.setup.num_moving,), torch.long)
         require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
         learned = part_of(tensors, "learned")
@@ -118,7 +112,7 @@ class BodyField(DeformationField):
         if points < SPAN:
             raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
         like = {name: centers.new_zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
-        field = BodyField(others, BodyRest(centers, radii, labels), like)
+        field = BodyField(others, BodyRest(centers, labels), like)
         field.parameters = field.parameters.restored(learned)
         return field
 

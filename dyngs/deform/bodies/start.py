@@ -17,14 +17,15 @@ from dyngs.deform.field import MAX_KEY_TIMES, DeformationField
 from dyngs.deform.spline_fit import spline_basis
 from dyngs.gaussians import Gaussians
 
-AGREES = 0.85  # Disagreement of colours as a fraction of that of a body that does not turn, from which it turns
+AGREES, BY_CHANCE = 0.85, 0.55
+"""Disagreement of a body's colours, as a fraction of that if it did not turn, and of that of any of its colours."""
 INNER, LOGIT, SCALE = 0.7, 0.0, 0.6
 """Of the Gaussians that begin on a body: least distance from its centre in radii, opacity, and size in distances."""
 MARKED, LEFT = 0.35, 0.3
 """Mean difference of 5x5 pixels that shows motion for sure, and the part of all such that bodies need not explain."""
-PIECES_PER_TIME = 0.5
+PIECES_PER_TIME = 0.35
 PX_PER_SEED = 2.0  # Area of the surface in pixels
-STIFFNESS = 1e-3
+STIFFNESS = 0.1
 
 
 @dataclass(frozen=True)
@@ -76,21 +77,25 @@ class Bodies:
         labels = torch.repeat_interleave(torch.tensor([others.setup.num_moving - sum(counts), *counts]))
         device = others.setup.center.device
         points = {name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()}
-        radii = torch.tensor([body.path.radius for body in self.bodies], device=device)
-        rest = BodyRest(torch.from_numpy(centers).float().to(device), radii, (labels - 1).to(device))
+        rest = BodyRest(torch.from_numpy(centers).float().to(device), (labels - 1).to(device))
         return BodyField(others, rest, points)
 
 
 def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
     """Return what moves rigidly, with at most ``limit`` Gaussians of ``num_terms`` harmonics; None where nothing does.
 
-    A body is taken if the colours of its surface, as it turns, disagree clearly less than if it did not.
+    A body is taken if the colours of its surface, each compared with other images, agree clearly better than if it did
+    not turn, and than by chance: what bends shows other colours in the same direction.
     """
     found = [Body(path, found_turning(shots, path)) for path in found_paths(shots)]
-    bodies = tuple(body for body in found if body.turning.disagreement < AGREES * body.turning.standing)
+    bodies = tuple(body for body in found if _is_rigid(body.turning))
     if not bodies or limit < len(bodies):
         return None
     return Bodies(shots, bodies, tuple(_seeds(body, shots, limit // len(bodies), num_terms) for body in bodies))
+
+
+def _is_rigid(turning: Turning) -> bool:
+    return turning.disagreement < min(AGREES * turning.standing, BY_CHANCE * turning.by_chance)
 
 
 def _steps(rotations: np.ndarray) -> np.ndarray:

@@ -40,6 +40,7 @@ class Turning:
         rotations: (T, 3, 3) body to world; the identity in the middle.
         disagreement: mean squared difference of colours on the same cell, of another image's.
         standing: the same if the body did not turn.
+        by_chance: the same of any two of its colours.
         colors: (C, 3) mean colour of each of the ``FINE`` cells, light divided out.
         counts: (C,) pixels that fell on it.
     """
@@ -47,6 +48,7 @@ class Turning:
     rotations: np.ndarray
     disagreement: float
     standing: float
+    by_chance: float
     colors: np.ndarray
     counts: np.ndarray
 
@@ -60,7 +62,9 @@ def found_turning(shots: Shots, path: Path) -> Turning:
     sums, counts = _total([_sums(frame, rotation) for frame, rotation in zip(frames, rotations, strict=True)])
     still = np.broadcast_to(np.eye(3), rotations.shape)
     moved, stood = disagreements(frames, np.stack([rotations, still]))
-    return Turning(rotations, float(moved), float(stood), sums / np.maximum(counts, 1)[:, None], counts)
+    every = np.concatenate([colors for _, colors in frames])
+    by_chance = 2 * float(every.var(axis=0).sum()) if len(every) else 0.0
+    return Turning(rotations, float(moved), float(stood), by_chance, sums / np.maximum(counts, 1)[:, None], counts)
 
 
 def _frame(shots: Shots, path: Path, index: int) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ def field_of(kind: str = "control_nodes", points: int = 7) -> BodyField:
     generator = torch.Generator().manual_seed(0)
     places = CENTERS[:, None] + 0.3 * torch.randn(2, points, 3, generator=generator)
     quats = torch.tensor([1.0, 0, 0, 0]) + 0.5 * torch.randn(2, points, 4, generator=generator)
-    rest = BodyRest(CENTERS, torch.tensor([0.3, 0.2]), LABELS)
+    rest = BodyRest(CENTERS, LABELS)
     return BodyField(stirred_field(kind), rest, {"places": places, "quats": quats})
 
 
@@ -102,8 +102,6 @@ def test_a_stored_field_is_the_same_field() -> None:
         ("bodies.labels", lambda x: x + 1),
         ("bodies.labels", lambda x: x[1:]),
         ("bodies.centers", lambda x: x[:1]),
-        ("bodies.radii", lambda x: -x),
-        ("bodies.radii", lambda x: x[:1]),
         ("bodies.learned.places", lambda x: x[:, :3]),
         ("bodies.learned.quats", lambda x: x[:, 1:]),
         ("bodies.learned.quats", lambda x: x * float("nan")),
