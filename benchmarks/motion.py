@@ -1,6 +1,7 @@
 """Gap between what is learned and what could be, if the motion were known, on the synthetic scenes that move.
 
-    python benchmarks/motion.py FOLDER [--scenes spin,wave,merge,room] [--size 200] [--views 48] [key=value ...]
+    python benchmarks/motion.py FOLDER [--scenes spin,wave,merge,room] [--size 200] [--views 48] [--style moving]
+        [key=value ...]
 
 For each scene two models are trained for the same number of steps and measured on the test split: the preset
 (configs/dynamic.yaml with the overrides), and an oracle. The oracle's Gaussians begin on the true surfaces, with labels
@@ -30,7 +31,7 @@ from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import DynamicOptions, is_in_image, write_dynamic_capture
+from dyngs.data.synthetic.captures import CaptureStyle, DynamicOptions, is_in_image, write_dynamic_capture
 from dyngs.data.synthetic.raytrace import Primitive, Sheet, is_seen
 from dyngs.data.synthetic.raytrace import Scene as TrueScene
 from dyngs.data.synthetic.scenes import SceneName, scene_at
@@ -52,6 +53,7 @@ from dyngs.gaussians.schedule import Rates
 from dyngs.kinds import GaussianTrainer, assemble
 from dyngs.metrics import Lpips
 from dyngs.models.views import training_cameras, training_times
+from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.state import Role
@@ -163,7 +165,7 @@ class OracleTraining(StaticTraining):
         super().__init__(FilterUpdate())
         self._rates = Rates(steps)
 
-    def optimize(self, scene: GaussianScene, step: int) -> int:
+    def optimize(self, scene: GaussianScene, step: int) -> Count:
         assert isinstance(scene, DynamicScene)
         assert scene.field is not None
         return scene.field.parameters.step(step, self._rates.progress(step))
@@ -294,6 +296,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--scenes", default=",".join(get_args(SceneName)))
     parser.add_argument("--size", type=int, default=200)
     parser.add_argument("--views", type=int, default=48)
+    parser.add_argument("--style", choices=get_args(CaptureStyle), help="as dyngs data synth; one per FOLDER")
     given = parser.parse_intermixed_args(words)
     print("| scene | model | PSNR | foreground | moves | stands | tracks, px | Gaussians |")
     print("|---|---|---|---|---|---|---|---|")
@@ -302,7 +305,8 @@ def main(words: Sequence[str] | None = None) -> None:
             continue
         root, run = given.folder / name, given.folder / f"{name}_run"
         if not root.is_dir():
-            write_dynamic_capture(name, root, DynamicOptions(size=given.size, num_times=given.views))
+            options = DynamicOptions(size=given.size, num_times=given.views, style=given.style)
+            write_dynamic_capture(name, root, options)
         config = load_config(PRESET, [*given.overrides, f"data.root={root}", f"run.dir={run}"])
         learned, known = preset_row(config, run), oracle_row(name, config)
         for row, model in ((learned, "preset"), (known, "oracle"), (known.minus(learned), "gap")):

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from moving_scene import camera
-from tiny_fields import KINDS, cloud, stirred_field, tiny_options
+from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
@@ -25,7 +25,7 @@ from dyngs.storage.tensors import Coding, TensorKind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]
-CONTENTS = ("static", "network", "masked", *KINDS)
+CONTENTS = ("static", "network", "masked", *ALL_KINDS)
 _ROWS = (0, 2, 3, 6)
 
 _VALUES = (torch.nan, torch.inf, -torch.inf, 3e38, -3e38, 1e20, 1e-45, -1.0, 0.0, 1e9, 255.0)

@@ -88,8 +88,9 @@ def sliding_nodes() -> ControlNodes:
     points = torch.zeros(2, 4, 3)
     points[..., 0] = torch.arange(4) - 1.5  # the spline of these is t - 0.5
     moved = row_of_balls().means[list(MOVING_ROWS)]
-    field = ControlNodes(SLIDING, SETUP, torch.Generator()).started(moved, {"means": points})
+    field = ControlNodes(SLIDING, SETUP, torch.Generator())
     field.nodes_for(moved)
+    field.parameters["means"].data.copy_(points)
     return field
 
 

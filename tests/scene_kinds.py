@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from scenes import look_around
-from tiny_fields import KINDS as FIELDS
+from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.camera import Cameras

@@ -18,6 +18,7 @@ from dyngs.config import (
     DynamicModel,
     FixedStrategy,
     McmcStrategy,
+    OptimConfig,
     PointsInit,
     RandomInit,
     StaticModel,
@@ -129,6 +130,7 @@ def _dynamic(capture: Path, **changes: object) -> Config:
         model=DynamicModel(sh_degree=1),
         init=RandomInit(num_random=50),
         strategy=DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6),
+        optim=OptimConfig(rate_factor=1),  # whether it moves or not
         train=TrainConfig(steps=12),
     )
     return config.model_copy(update=changes)

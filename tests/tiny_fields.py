@@ -14,6 +14,7 @@ from dyngs.config import (
     DefaultStrategy,
     DeformField,
     DynamicModel,
+    FreeField,
     HexplaneField,
     MlpField,
     RandomInit,
@@ -25,7 +26,8 @@ from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians
 
-KINDS = ("hexplane", "mlp", "control_nodes")
+KINDS = ("hexplane", "mlp", "control_nodes")  # fields that begin as the identity
+ALL_KINDS = (*KINDS, "free")
 HEADS = ("move_rotations", "move_scales", "move_opacities", "move_colors")
 TIMES = (0.0, 0.37, 1.0)
 
@@ -37,6 +39,8 @@ def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
         return HexplaneField(channels=3, resolution=5, levels=(1, 2), width=8, **heads)
     if kind == "control_nodes":
         return ControlNodesField(nodes=5, pieces=3, **heads)
+    if kind == "free":
+        return FreeField()
     return MlpField(depth=2, width=8, **heads)
 
 
@@ -91,9 +95,10 @@ def busy_config(capture: Path, run_dir: Path, kind: str, **model: object) -> Con
         "hexplane": {"lr_planes": 1e-1, "lr_decoder": 5e-2},
         "mlp": {"lr": 1e-2},
         "control_nodes": {"lr_means": 1e-2},
+        "free": {},
     }
     field = tiny_options(kind).model_copy(update=rates[kind])
-    freeze_below_px = 1.5 if kind == "control_nodes" else 0.3
+    freeze_below_px = {"control_nodes": 1.5, "free": 0.05}.get(kind, 0.3)
     phases = {
         "motion_from": 8 / 24,
         "time_window": 0.4,

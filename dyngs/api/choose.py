@@ -23,6 +23,8 @@ from dyngs.config import (
     Config,
     DefaultStrategy,
     DynamicModel,
+    FieldSection,
+    FreeField,
     NetworkColour,
     OptimConfig,
     PointsInit,
@@ -39,6 +41,7 @@ from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.errors import DyngsError, counted
 from dyngs.files.write import write_text
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
+from dyngs.gaussians.schedule import rate_factors
 from dyngs.kinds import GaussianTrainer, assemble, with_points
 from dyngs.metrics import psnr
 from dyngs.models.renderable import Rendering
@@ -160,6 +163,10 @@ FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 """With fewer views nothing is compared; with fewer than the second, small runs are made twice, each without a fourth of
 the views; otherwise about so many are held out."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
+FREE_VIEWS = 3.0
+"""Views of each time, in the mean, from which free primitives are the first choice before fixed cameras."""
+EARLY = {"resolution_grows_from": 0.3, "resolution_full_at": 0.5}
+"""Fractions of a run with free primitives at which its images grow."""
 MIN_DIFFERING = 0.001
 """Fraction of the pixels of fixed cameras that differ from their median from which something moves."""
 LOOK_SIDE, LOOK_CAMERAS, LOOK_TIMES = 96, 8, 24
@@ -211,6 +218,11 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
         case DynamicModel() as model:
             _require_times(config, capture.splits["train"])
             moves = _motion_of_fixed_cameras(capture, config) if model.choose else True
+            asks = model.choose and moves and not model.deform.model_fields_set
+            if asks and _views_at_once(capture) >= FREE_VIEWS:
+                print("free primitives for what moves, as fixed cameras see each time from several sides", flush=True)
+                settings.insert(0, OpenSetting(f"model.deform.kind={model.deform.kind}", _as_before(plain_config)))
+                plain_config = best = _with_free_primitives(plain_config)
             best = _with(best, "model", choose=False)
             if moves is None:
                 base, moving = _at_rest(plain_config), best
@@ -289,8 +301,11 @@ def as_static(config: Config) -> Config:
 
 
 def _at_rest(config: Config) -> Config:
+    """Return ``config`` without motion, and with the same learning rates as with it."""
     shared = {key: getattr(config.model, key) for key in StaticModel.model_fields if key != "kind"}
-    return config.model_copy(update={"model": StaticModel.model_validate(shared)})
+    of_means, _ = rate_factors(config)
+    optim = config.optim.model_copy(update={"rate_factor": of_means})
+    return config.model_copy(update={"model": StaticModel.model_validate(shared), "optim": optim})
 
 
 def _requested(given: Section, usual: Section) -> Section:
@@ -419,15 +434,41 @@ def _robust(config: Config) -> Config | None:
     return _with(config, "train", robust="always") if isinstance(config.model, StaticModel) else None
 
 
+def _views_at_once(capture: Capture) -> float:
+    """Return the mean number of training views of a time."""
+    views = capture.splits["train"]
+    return len(views) / len({view.time for view in views})
+
+
+def _with_free_primitives(config: Config) -> Config:
+    """Return ``config`` with free primitives, and full images early where nothing else was requested.
+
+    Nothing is followed through a clip, so that small images save less than they lose.
+    """
+    early = {name: x for name, x in EARLY.items() if name not in config.train.model_fields_set}
+    return _with(_with(config, "model", deform=FreeField()), "train", **early)
+
+
+def _as_before(given: Config) -> Callable[[Config], Config | None]:
+    """Return what gives a configuration with free primitives the field and the images of ``given``."""
+    sizes = {name: getattr(given.train, name) for name in EARLY}
+
+    def applied(config: Config) -> Config | None:
+        if not isinstance(config.model, DynamicModel) or not isinstance(given.model, DynamicModel):
+            return None
+        return _with(_with(config, "model", deform=given.model.deform), "train", **sizes)
+
+    return applied
+
+
 def _network(config: Config) -> Config | None:
     return config.model_copy(update={"colour": NetworkColour()}) if isinstance(config.model, DynamicModel) else None
 
 
 def _moving_opacities(config: Config) -> Config | None:
     match config.model:
-        case DynamicModel() as model:
-            deform = model.deform.model_copy(update={"move_opacities": True})
-            return _with(config, "model", deform=deform)
+        case DynamicModel(deform=FieldSection() as field):
+            return _with(config, "model", deform=field.model_copy(update={"move_opacities": True}))
         case _:
             return None
 

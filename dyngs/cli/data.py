@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -126,7 +127,8 @@ def _add_synth(verbs: args.Commands) -> None:
         "still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that appear, merge "
         "and vanish. room: videos of a static room with one hopping ball, from fixed cameras. roll: a striped ball "
         "rolls alone. collide: two balls bounce off each other. chain: a finger of five links bends. enter: a die "
-        "slides into a room and out again. human: a walking person from all around, with exact body parameters.",
+        "slides into a room and out again. human: a walking person from all around, with exact body parameters; with "
+        "--style teleport one image per time, as in D-NeRF, without them.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
@@ -296,28 +298,32 @@ def run_synth(arguments: argparse.Namespace) -> int:
     from dyngs.files.outputs import require_new_folder
 
     out, scene, size, seed = arguments.out, arguments.scene, arguments.size, arguments.seed
-    views = (12 if scene == "human" else 48) if arguments.views is None else arguments.views
+    by_poses = scene == "human" and arguments.style is None
+    views = (12 if by_poses else 48) if arguments.views is None else arguments.views
     cameras = 8 if arguments.cameras is None else arguments.cameras
     if size < 1 or views < 1 or seed < 0:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
     style = arguments.style or ("fixed" if arguments.cameras is not None else None)
     if arguments.cameras is not None and (cameras < 1 or scene == "still" or style != "fixed"):
         raise DyngsError("--cameras must be at least 1, and is for scenes that move, with fixed cameras")
-    if arguments.style is not None and scene in ("still", "human"):
-        raise DyngsError("--style is for scenes that move, but not for human")
-    if (arguments.varied or arguments.usual_clothes) and scene != "human":
-        raise DyngsError("--varied and --usual-clothes are for the scene human only")
+    if arguments.style is not None and (scene == "still" or (scene == "human" and style != "teleport")):
+        raise DyngsError("--style is for scenes that move; for human only teleport")
+    if (arguments.varied and not by_poses) or (arguments.usual_clothes and scene != "human"):
+        raise DyngsError("--varied and --usual-clothes are for the scene human only, --varied without --style")
     require_new_folder(out)
     if scene == "human":
-        from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
+        from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture, write_walking_capture
 
         options = HumanOptions(size, views, num_cameras=cameras, seed=seed, usual_clothes=arguments.usual_clothes)
-        write_human_capture(out, varied(options, seed) if arguments.varied else options)
+        if by_poses:
+            write_human_capture(out, varied(options, seed) if arguments.varied else options)
+        else:
+            write_walking_capture(out, replace(options, num_test=min(12, views - 1)))
     elif scene == "still":
         synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
     else:
         moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed, style=style)
         synthetic.write_dynamic_capture(scene, out, moving)
-    preset = {"still": "static", "human": "human"}.get(scene, "dynamic")
+    preset = "human" if by_poses else "static" if scene == "still" else "dynamic"
     print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")
     return 0

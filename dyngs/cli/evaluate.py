@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
 """Of the tested images, and on them."""
+MOST_THINGS = 5
 
 
 def add_parser(commands: args.Commands) -> None:
@@ -120,6 +121,9 @@ def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
         elif report.psnr_per_time:
             rows.append((label, report.reasons.get(name, "not measured")))
+    if len(report.psnr_things) > 1:
+        things = sorted(report.psnr_things.items(), key=lambda item: item[1])[:MOST_THINGS]
+        rows.append(("on the worst things", ", ".join(f"{label}: {value:.2f} dB" for label, value in things)))
     return rows
 
 

@@ -11,6 +11,7 @@ from dyngs.deform.keys import (
     DeformField,
     DynamicModel,
     FieldSection,
+    FreeField,
     HexplaneField,
     MlpField,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "FieldSection",
     "FixedStrategy",
     "Fraction",
+    "FreeField",
     "HexplaneField",
     "HumanModel",
     "HumanPredictorModel",

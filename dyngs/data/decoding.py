@@ -22,6 +22,7 @@ class Decoded:
     pixels: Tensor
     mask: Tensor | None
     moves: Tensor | None = None
+    labels: Tensor | None = None
     depth: Tensor | None = None
     flow: Tensor | None = None
 

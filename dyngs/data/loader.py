@@ -53,6 +53,7 @@ class Image:
         time: in [0, 1].
         frame: the view's frame number.
         moves: (H, W) float32, the fraction of each pixel that moves, by the motion mask.
+        labels: (H, W) int64, which thing moves there, 0 for none; of a motion mask that tells them apart.
         depth: (H, W) float32 depth in the unit of its map, 0 where unknown.
         flow: (H, W, 2) float32 displacement in pixels of this image up to the view ``flow_to``, NaN where unknown.
     """
@@ -65,6 +66,7 @@ class Image:
     time: float | None
     frame: int | None = None
     moves: Tensor | None = None
+    labels: Tensor | None = None
     depth: Tensor | None = None
     flow: Tensor | None = None
 
@@ -104,9 +106,14 @@ class Image:
             alpha=alpha,
             mask=None if mask is None else (mask > FULLY_KEPT).float(),
             moves=moves,
-            depth=None if self.depth is None else _nearest(self.depth, image_maps.nearest_positions(width, height)),
+            depth=self._nearest(self.depth, width, height),
+            labels=self._nearest(self.labels, width, height),
             flow=None if self.flow is None else image_maps.resized(self.flow, width, height),
         )
+
+    @staticmethod
+    def _nearest(values: Tensor | None, width: int, height: int) -> Tensor | None:
+        return None if values is None else _nearest(values, image_maps.nearest_positions(width, height))
 
 
 class ImageLoader:
@@ -205,6 +212,7 @@ class ImageLoader:
             time=view.time,
             frame=view.frame,
             moves=decoded.moves,
+            labels=decoded.labels,
             depth=decoded.depth,
             flow=decoded.flow,
         )
@@ -381,8 +389,12 @@ class ImageLoader:
         lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
         if view.motion_mask_path is not None:
             read = image_maps.read_labels if view.motion_mask_labels else read_mask
-            moves = read(view.motion_mask_path).float()
-            _require_size(view, view.motion_mask_path, moves.shape, "motion mask")
+            found = read(view.motion_mask_path)
+            _require_size(view, view.motion_mask_path, found.shape, "motion mask")
+            if view.motion_mask_labels:
+                positions = image_maps.nearest_positions(*size, None if lens_map is None else lens_map.grid)
+                maps["labels"] = _nearest(found, positions)
+            moves = (found != 0).float()
             if lens_map is not None:
                 moves = undistort(moves[..., None], lens_map)[..., 0]
             maps["moves"] = area_downscale(moves[..., None], *size)[..., 0]

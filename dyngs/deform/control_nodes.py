@@ -56,9 +56,6 @@ class ControlNodes(DeformationField):
         require_tensor("positions", buffers["positions"], (count, 3))
         learned = part_of(tensors, "learned")
         field = copy.copy(self)
-        if not self.options.pieces:  # as many as the motion needed, see ``started``
-            num_points = learned["means"].shape[1] if learned["means"].ndim == 3 else 0
-            field.num_pieces = min(max(1, num_points - SPAN + 1), MAX_KEY_TIMES)
         field.parameters = field._untrained(0).restored(learned, dict.fromkeys(head_sizes(self.options), count))
         if count and ("radii" in buffers or "followed" in buffers):  # both are found where nodes are first needed
             require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
@@ -68,20 +65,6 @@ class ControlNodes(DeformationField):
         if "followed" in buffers and not 1 <= buffers["followed"].shape[1] <= FOLLOWED:
             raise ValueError(f"'followed' names {buffers['followed'].shape[1]} nodes for each Gaussian")
         field.buffers = buffers
-        return field
-
-    def started(self, positions: Tensor, splines: Mapping[str, Tensor]) -> ControlNodes:
-        """Return an untrained field whose nodes lie at ``positions`` and already move along ``splines``.
-
-        Nodes are still placed where Gaussians are far from any, and begin with the motion of those around them: where
-        nothing should move at first, nodes that stand still must be among the given ones.
-        """
-        field, count = copy.copy(self), len(positions)
-        field.num_pieces = splines["means"].shape[1] - SPAN + 1
-        field.parameters = field._untrained(count)
-        for name, points in splines.items():
-            field.parameters[name].data.copy_(points)
-        field.buffers = {"positions": positions.detach().clone()}
         return field
 
     def state(self) -> State:

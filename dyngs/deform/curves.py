@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, Offsets
+from dyngs.deform.free import FreePrimitives
 from dyngs.deform.nodes import FOLLOWED
 from dyngs.deform.spline_fit import SPAN, spline_basis
 
@@ -32,6 +33,7 @@ class Curves:
         pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own, about itself.
         followed: (M, B) drivers of each Gaussian, B = 4; None as above.
         shares: (M, B) of theirs, rows sum to 1; None as above.
+        is_steep: control points lie far outside what is drawn, and are to be kept as they are.
         error: of a driver's place: the quantile ``CHECKED``, in world units.
     """
 
@@ -39,6 +41,7 @@ class Curves:
     pivots: Tensor | None = None
     followed: Tensor | None = None
     fractions: Tensor | None = None
+    is_steep: bool = False
     error: float = 0.0
 
 
@@ -48,6 +51,8 @@ def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance:
     match field:
         case ControlNodes():
             return _curves_of_nodes(field, means)
+        case FreePrimitives():  # straight lines and parabolas
+            return Curves(_fit(lambda time: field.offsets(means, time), 1), is_steep=True)
         case _:
             heads, error = fitted_curves(lambda time: field.offsets(means, time), num_times, tolerance)
             return Curves(heads, error=error)

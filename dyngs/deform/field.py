@@ -8,16 +8,16 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, quat_product
-from dyngs.ops.registration import has_kernel
 from dyngs.ops.skinning import add_offsets_
 from dyngs.state import State, moved_to, part_of, prefixed
 
@@ -64,6 +64,8 @@ class DeformationField:
     setup: FieldSetup
     parameters: Parameters
     """All that is optimised."""
+    momentary = False
+    """Moving Gaussians are there for a while each, and stay as they are in steps that do not show them."""
 
     @property
     def num_values(self) -> int:
@@ -131,31 +133,58 @@ def key_times(num_times: int) -> int:
 def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
     """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order); differentiable.
 
-    No row may occur twice. Without gradients it is done in one pass.
+    No row may occur twice.
     """
-    if not torch.is_grad_enabled() and has_kernel("add_offsets_", gaussians.means.device):
-        return _deformed_in_one_pass(gaussians, offsets, rows)
-    changes = {"means": _added(gaussians.means, offsets.means, rows)}
-    if offsets.quats is not None:
-        own = gaussians.quats if rows is None else gaussians.quats.index_select(0, rows)
-        turned = turned_quats(own, offsets.quats)
-        changes["quats"] = turned if rows is None else gaussians.quats.index_copy(0, rows, turned)
-    if offsets.log_scales is not None:
-        changes["log_scales"] = _added(gaussians.log_scales, offsets.log_scales, rows)
-    if offsets.logit_opacities is not None:
-        changes["logit_opacities"] = _added(gaussians.logit_opacities, offsets.logit_opacities, rows)
-    if offsets.colors is not None:
-        base = _added(gaussians.sh[:, 0], offsets.colors, rows)
-        changes["sh"] = torch.cat([base[:, None], gaussians.sh[:, 1:]], dim=1)
-    return gaussians.replace(**changes)
+    tensors, dtype = gaussians.tensors(), gaussians.means.dtype
+    changes = [None if x is None else x.to(dtype) for x in vars(offsets).values()]
+    moved = _AddOffsets.apply(rows, *tensors.values(), *changes)
+    return Gaussians(**{n: x if m is None else m for (n, x), m in zip(tensors.items(), moved, strict=True)})
 
 
-def _deformed_in_one_pass(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None) -> Gaussians:
-    given = {name: x for name, x in vars(offsets).items() if x is not None}
-    changed = {"sh" if name == "colors" else name for name in given}
-    copies = {n: x.contiguous().clone() if n in changed else x for n, x in gaussians.detach().tensors().items()}
-    add_offsets_(tuple(copies.values()), rows, tuple(vars(offsets).values()))
-    return Gaussians(**copies)
+class _AddOffsets(torch.autograd.Function):
+    """Gaussians with offsets, None for what stays as it is; the gradient fills and copies no arrays of all of them."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rows: Tensor | None,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        logit_opacities: Tensor,
+        sh: Tensor,
+        *offsets: Tensor | None,
+    ) -> tuple[Tensor | None, ...]:
+        own = means, quats, log_scales, logit_opacities, sh
+        copies = [x if by is None else x.contiguous().clone() for x, by in zip(own, offsets, strict=True)]
+        add_offsets_(copies, rows, offsets)
+        turned = () if offsets[1] is None else (chosen(quats, rows), offsets[1])
+        ctx.save_for_backward(*([] if rows is None else [rows]), *turned)
+        ctx.has_rows = rows is not None
+        return tuple(None if by is None else x for x, by in zip(copies, offsets, strict=True))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        saved = list(ctx.saved_tensors)
+        rows = saved.pop(0) if ctx.has_rows else None
+        means, quats, log_scales, logit_opacities, sh = grads
+        by_means, by_log_scales, by_logits = (
+            None if x is None else chosen(x, rows) for x in (means, log_scales, logit_opacities)
+        )
+        by_quats, by_colors = None, None if sh is None else chosen(sh[:, 0], rows)
+        if quats is not None:
+            own, offset = saved
+            here = chosen(quats, rows)
+            by_quats = quat_product(here, _conjugate(own))
+            by_own = quat_product(_conjugate(offset + identity_quat(offset)), here)
+            quats = by_own if rows is None else quats.index_copy(0, rows, by_own)
+        own_grads = (means, quats, log_scales, logit_opacities, sh)
+        return None, *own_grads, by_means, by_quats, by_log_scales, by_logits, by_colors
+
+
+def _conjugate(quats: Tensor) -> Tensor:
+    return torch.cat([quats[:, :1], -quats[:, 1:]], dim=1)
 
 
 def chosen(x: Tensor, rows: Tensor | None) -> Tensor:
@@ -166,7 +195,3 @@ def chosen(x: Tensor, rows: Tensor | None) -> Tensor:
 def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
     """Return (M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
     return quat_product(offsets + identity_quat(offsets), quats)
-
-
-def _added(x: Tensor, offset: Tensor, rows: Tensor | None) -> Tensor:
-    return x + offset if rows is None else x.index_add(0, rows, offset)

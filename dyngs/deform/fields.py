@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
-from dyngs.config import ControlNodesField, DeformField, HexplaneField, MlpField
+from dyngs.config import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup
-from dyngs.deform.fixed_cameras.start import FirstMotion
+from dyngs.deform.field import DeformationField, FieldSetup
+from dyngs.deform.free import FreePrimitives
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
 from dyngs.state import Role, State, part_of, with_role
@@ -28,16 +28,10 @@ def new_field(options: DeformField, setup: FieldSetup, generator: torch.Generato
             return Mlp(options, setup, generator)
         case ControlNodesField():
             return ControlNodes(options, setup, generator)
+        case FreeField():
+            return FreePrimitives(options, setup, generator)
         case _:
             assert_never(options)
-
-
-def field_on_its_way(options: ControlNodesField, setup: FieldSetup, first: FirstMotion, others: Tensor) -> ControlNodes:
-    """Return an untrained field in which things already follow the paths found for them."""
-    field = ControlNodes(options, setup, torch.Generator())
-    most = options.pieces or max(field.num_pieces, min(setup.num_times - 1, MAX_KEY_TIMES))
-    positions, paths = first.nodes(others, options.nodes, range(field.num_pieces, most + 1))
-    return field.started(positions, {"means": paths})
 
 
 def field_state(field: DeformationField) -> State:

@@ -8,6 +8,9 @@ from pydantic import Field
 
 from dyngs.section import Fraction, Positive, SceneModel, Section
 
+COPIES_OF_MOVING = 12_000
+"""Copies over time of what moves in a static model, at most, that free primitives begin with."""
+
 
 class FieldSection(Section):
     """Keys that all deformation fields share: which attributes change over time besides positions."""
@@ -71,7 +74,17 @@ class ControlNodesField(FieldSection):
     )
 
 
-DeformField = HexplaneField | MlpField | ControlNodesField
+class FreeField(Section):
+    """Gaussians that each have a moment, a span and a velocity of their own (after FreeTimeGS, Wang et al. 2025)."""
+
+    kind: Literal["free"] = Field(
+        default="free",
+        description="each moving Gaussian has a moment, a span and a velocity of its own (after FreeTimeGS); for views "
+        "of several cameras at each time",
+    )
+
+
+DeformField = HexplaneField | MlpField | ControlNodesField | FreeField
 
 
 class DynamicModel(SceneModel):
@@ -102,7 +115,10 @@ class DynamicModel(SceneModel):
         description="colour error (0 to 1) of the static model from which Gaussians are taken to move",
     )
     num_random_moving: int = Field(
-        default=4000, ge=0, description="random Gaussians that are added among the moving ones when motion begins"
+        default=4000,
+        ge=0,
+        description="Gaussians that are added among the moving ones when motion begins: random ones, or, for free "
+        "primitives before fixed cameras, at most so many on things and as many on surfaces",
     )
     time_window: Fraction = Field(
         default=1.0,
@@ -126,4 +142,6 @@ class DynamicModel(SceneModel):
 
     @property
     def added_for_motion(self) -> int:
-        return self.num_random_moving
+        if not isinstance(self.deform, FreeField):
+            return self.num_random_moving
+        return 2 * self.num_random_moving + COPIES_OF_MOVING

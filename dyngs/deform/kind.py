@@ -81,4 +81,5 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         cameras_stay=bool(in_place),
         standing=standing,
         shots=shots,
+        options=options,
     )

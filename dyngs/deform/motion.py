@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyngs.deform.field import DeformationField, Offsets, turned_quats
+from dyngs.deform.field import DeformationField, Offsets, deformed
 from dyngs.gaussians import Gaussians
 
 PX_PER_OPACITY = 6.0
@@ -62,15 +62,9 @@ def measure_motion(
 @torch.no_grad()
 def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
     """Apply ``offsets`` to ``rows`` (R,) of ``gaussians`` for good, in place."""
-    gaussians.means.data[rows] += offsets.means
-    if offsets.quats is not None:
-        gaussians.quats.data[rows] = turned_quats(gaussians.quats.data[rows], offsets.quats)
-    if offsets.log_scales is not None:
-        gaussians.log_scales.data[rows] += offsets.log_scales
-    if offsets.logit_opacities is not None:
-        gaussians.logit_opacities.data[rows] += offsets.logit_opacities
-    if offsets.colors is not None:
-        gaussians.sh.data[rows, 0] += offsets.colors
+    moved = deformed(gaussians.detach(), offsets, rows).tensors()
+    for name, x in gaussians.tensors().items():
+        x.data.copy_(moved[name])
 
 
 def _mean(samples: Sequence[Offsets]) -> Offsets:

@@ -16,20 +16,19 @@ LOGIT = -2.2  # Opacity 0.1, as all Gaussians begin
 SOLID = 0.05  # Opacity from which a Gaussian counts for the bounding box
 
 
-def with_random_gaussians(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> EditResult:
-    """Return the edit that adds ``count`` faint grey Gaussians at random points of the box of ``gaussians``."""
+def random_gaussians(gaussians: Gaussians, count: int, extent: float, generator: torch.Generator) -> Gaussians:
+    """Return ``count`` faint grey Gaussians at random points of the box of ``gaussians``."""
     center, half_size = box_of(gaussians, extent)
     unit = torch.rand((count, 3), generator=generator, device="cpu").to(center.device)
     places = center + half_size * (2 * unit - 1)
     spacing = float((2 * half_size).prod() / max(count, 1)) ** (1 / 3)
-    added = Gaussians(
+    return Gaussians(
         means=places,
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=gaussians.means.device).expand(count, 4),
         log_scales=torch.full((count, 3), math.log(SCALE * spacing), device=gaussians.means.device),
         logit_opacities=torch.full((count,), LOGIT, device=gaussians.means.device),
         sh=torch.zeros(count, *gaussians.sh.shape[1:], device=gaussians.means.device),
     )
-    return with_gaussians(gaussians, [added])
 
 
 def with_gaussians(gaussians: Gaussians, added: Sequence[Gaussians]) -> EditResult:

@@ -8,32 +8,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import ControlNodesField, DynamicModel
+from dyngs.config import DynamicModel, FreeField
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
 from dyngs.deform.field import FieldSetup, Offsets, deformed
-from dyngs.deform.fields import field_on_its_way, new_field
+from dyngs.deform.fields import new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
+from dyngs.deform.free import FreePrimitives, FreeStart, free_start
 from dyngs.deform.motion import bake_, measure_motion
-from dyngs.deform.random_gaussians import box_of, with_gaussians, with_random_gaussians
+from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
-from dyngs.state import Role, State, fields_moved_to, with_role
+from dyngs.state import Role, State, with_role
 
 SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25
@@ -67,6 +69,7 @@ class TrainingViews:
     standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
     # what one moving camera shows, against N Gaussians that stand still; None where there is no such camera
     shots: Callable[[Gaussians], Shots | None] = lambda _: None
+    options: RenderOptions = field(default_factory=RenderOptions)  # how training images are drawn
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):
@@ -84,7 +87,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
         self.times = tuple(sorted(set(capture.times)))
-        self._on_its_way(False)
+        self._see_all(False)
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
@@ -106,8 +109,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         time = image.time or 0.0
         gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
         penalties = scene.field.penalties(time) | self._sparsity(offsets)
-        if self._tracked:  # it would pull what was found on a bent path back to a straight one, and out of the images
-            penalties.pop("node acceleration", None)
         return GaussianTimeStep(gaussians, image.time, None, penalties)
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
@@ -115,6 +116,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             return 0
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
         return scene.field.step(step - self.schedule.fine, progress)
+
+    def resting(self, scene: DynamicScene) -> Tensor | None:
+        return scene.moving if scene.field is not None and scene.field.momentary else None
 
     def leaves(self, scene: DynamicScene) -> list[Tensor]:
         return [] if scene.field is None else scene.field.leaves
@@ -139,30 +143,25 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         errs = bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION)
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
-        first = self._first_motion(now.detach(), rows)
-        if not errs and not first.seeds:
+        first = self._first_motion(now.detach())
+        if not errs and not first.moments:
             return None
-        bodies = None if first.seeds else self._first_bodies(now.detach())
-        if bodies is not None:
-            result = replace(with_gaussians(now.detach(), bodies.seeds), finding=bodies.finding)
-        elif first.seeds:
-            result = replace(with_gaussians(now.detach(), first.gaussians), finding=first.finding)
-        else:
-            num_added = self.options.num_random_moving
-            result = with_random_gaussians(now.detach(), num_added, self.capture.extent, self._generator)
+        bodies = self._first_bodies(now.detach())
+        added, start = self._begun(now.detach(), rows, first, bodies)
+        finding = first.finding if bodies is None else bodies.finding
+        result = replace(with_gaussians(now.detach(), added), finding=finding)
+        if start is not None:
+            result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
         gaussians = Gaussians(**result.changes)
         moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
-        if first.seeds and isinstance(self.options.deform, ControlNodesField):
-            others = now.means.detach()[rows].cpu()  # tracks and seeds are found on the CPU
-            field = field_on_its_way(self.options.deform, fields_moved_to(setup, "cpu"), first, others)
-            self._on_its_way(True)
-        else:
-            field = new_field(self.options.deform, setup, self._generator)
+        field = new_field(self.options.deform, setup, self._generator)
+        if isinstance(field, FreePrimitives) and start is not None:
+            field = field.started(start)
         if bodies is not None:
             field = bodies.within(field)
-            self._on_its_way(False, bodies.explain_all)
+            self._see_all(bodies.explain_all)
         std = self._update.of(gaussians)
         field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
@@ -176,31 +175,40 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
-        self._on_its_way("tracked" in tensors, "all_times" in tensors)
+        self._see_all("all_times" in tensors)
         return DynamicScene.restored(self.options, gaussians, tensors)
 
     def state(self) -> State:
-        kept = {"tracked": self._tracked, "all_times": self._all_times}
-        return with_role({name: torch.ones(1, device="cpu") for name, held in kept.items() if held}, Role.TRAINING)
+        return with_role({"all_times": torch.ones(1, device="cpu")}, Role.TRAINING) if self._sees_all else {}
 
-    def _on_its_way(self, tracked: bool, all_times: bool = False) -> None:
-        """Train on all times from the first where tracks or bodies are known: nothing need be followed outwards."""
-        first, schedule = 1.0 if tracked or all_times else self.options.time_window, self.schedule
-        phases = schedule.fine, schedule.opens, schedule.full
-        self._tracked, self._all_times = tracked, all_times
-        self._window = TimeWindow.around_middle(self.capture.times, first, *phases)
+    def _see_all(self, at_once: bool) -> None:
+        """Train on all times from the first if ``at_once``: nothing need be followed outwards."""
+        first = 1.0 if at_once or isinstance(self.options.deform, FreeField) else self.options.time_window
+        phases = self.schedule.fine, self.schedule.opens, self.schedule.full
+        self._sees_all, self._window = at_once, TimeWindow.around_middle(self.capture.times, first, *phases)
 
     def _first_bodies(self, still: Gaussians) -> Bodies | None:
         """Return what moves rigidly before one moving camera."""
-        shots = self.capture.shots(still)
+        shots = None if isinstance(self.options.deform, FreeField) else self.capture.shots(still)
         return None if shots is None else found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
 
-    def _first_motion(self, still: Gaussians, rows: Tensor) -> FirstMotion:
-        """Return what travels before fixed cameras, for a field that can begin on its way."""
-        if not isinstance(self.options.deform, ControlNodesField):
+    def _begun(
+        self, now: Gaussians, rows: Tensor, first: FirstMotion, bodies: Bodies | None
+    ) -> tuple[Sequence[Gaussians], FreeStart | None]:
+        """Return the Gaussians to add when motion begins, and the windows of all that move where these have some."""
+        count = 0 if first.moments or (bodies and bodies.explain_all) else self.options.num_random_moving
+        added = random_gaussians(now, count, self.capture.extent, self._generator)
+        if not isinstance(self.options.deform, FreeField):
+            return [added, *(bodies.seeds if bodies else ())], None
+        start = free_start(now.select(rows).to(device="cpu"), first.moments, added.to(device="cpu"), len(self.times))
+        return start.added, start
+
+    def _first_motion(self, still: Gaussians) -> FirstMotion:
+        """Return what changes before fixed cameras, for a field that can begin there."""
+        if not isinstance(self.options.deform, FreeField):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
-        return first_motion(standing, still, rows, self.capture.extent, limit)
+        return first_motion(standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options)
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
         """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""
@@ -217,8 +225,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return _with_frozen(scene, motion.mean, ~moves)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
-        """Return the mean motion as a penalty: what need not move should not. What was found to travel must."""
-        if self.options.motion_sparsity == 0 or self._tracked or not len(offsets.means):
+        """Return the mean motion as a penalty: what need not move should not. Windows are short instead."""
+        if self.options.motion_sparsity == 0 or isinstance(self.options.deform, FreeField) or not len(offsets.means):
             return {}
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()

@@ -65,6 +65,15 @@ class Regions:
         }
         return {metric: _psnr_inside(part, image, rendered, truth) for metric, part in parts.items()}
 
+    def scores_of_things(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
+        """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it shows, by label."""
+        if image.labels is None:
+            return {}
+        labels = image.labels if image.alpha is None else image.labels * (image.alpha > 0)
+        found = labels[labels != 0].unique().cpu().tolist()
+        scores = {label: _psnr_inside(labels == label, image, rendered, truth) for label in found}
+        return {label: score for label, score in scores.items() if score is not None}
+
     def moving(self, image: Image) -> Tensor | None:
         """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
         if image.moves is not None:

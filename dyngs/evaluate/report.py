@@ -134,6 +134,7 @@ class EvalReport:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
+    psnr_things: dict[int, float] = field(default_factory=dict)  # means over the views that show a thing, by its label
     moving_from: str | None = None  # how it was found what moves, None where it was not
     # ``track_error_px, track_within_5px, track_motion_px``: see ``TrackScores``
     track_error_px: float | None = None
@@ -255,7 +256,9 @@ def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
     for metric in REGION_METRICS:
         known = [value for value in (getattr(score, metric) for score in scores) if value is not None]
         means[metric] = fmean(known) if known else None
-    return means
+    labels = sorted({label for score in scores for label in score.psnr_things})
+    shown = {i: [score.psnr_things[i] for score in scores if i in score.psnr_things] for i in labels}
+    return means | {"psnr_things": {label: fmean(known) for label, known in shown.items()}}
 
 
 def _reasons(report: EvalReport, regions: Regions, tracks: TrackScores) -> dict[str, str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from dyngs.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.times import SAME_TIME
 from dyngs.data.tracks import TRACKS_FILE, TrueTracks
+from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.scene import GaussianScene
 
 CARRIERS = 4  # K, nearest Gaussians that carry a point, weighted by opacity
@@ -44,8 +46,8 @@ def track_scores(
     """Return the errors of a scene's motion in the images of a split, of which each view has its camera.
 
     Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any of
-    ``views``, of all splits, shows it; from there their mean displacement carries it. Distances are at most the
-    diagonal of the image.
+    ``views``, of all splits, shows it; from there their mean displacement carries it. Where Gaussians are there for a
+    while only, others take over at each time. Distances are at most the diagonal of the image.
     """
     if tracks is None:
         return TrackScores(reason=NO_TRACKS)
@@ -54,7 +56,7 @@ def track_scores(
         return TrackScores(reason=NONE_OPAQUE)
     bound = _bind(scene, tracks, _times_of(tracks, views))
     rows = {name: row for row, name in enumerate(tracks.views.tolist())}
-    moved: dict[float, np.ndarray] = {}
+    moved = _handed_on(scene, bound, sorted({view.time for view, _ in split if view.time is not None}))
     errors, motions = [], []
     for view, cameras in split:
         if view.time is None or view.name not in rows:
@@ -92,6 +94,41 @@ class _Bound:
         return self.points + (self.weights[..., None] * (means[self.carriers] - self.positions)).sum(axis=1)
 
 
+def _handed_on(scene: GaussianScene, bound: _Bound, times: Sequence[float]) -> dict[float, np.ndarray]:
+    """Return where points are at ``times``, each carried from one time to the next by the Gaussians that are opaque.
+
+    Empty where the same Gaussians are there at all times.
+    """
+    moved = field_scene_of(scene)
+    if moved is None or moved.field is None or not moved.field.momentary:
+        return {}
+    steps = sorted({*scene.times, *times, *bound.times[np.isfinite(bound.times)].tolist()})
+    means = {time: scene.at(time).means.detach().cpu().double().numpy() for time in steps}
+    found = {time: np.where((bound.times == time)[:, None], bound.points, np.nan) for time in steps}
+    for order in (steps, steps[::-1]):
+        for now, then in pairwise(order):
+            rows = np.flatnonzero(np.isfinite(found[now]).all(1) & ~np.isfinite(found[then]).all(1))
+            if len(rows):
+                carriers, weights = _nearest(scene, now, means[now], found[now][rows], bound.weights.shape[1])
+                apart = means[then][carriers] - means[now][carriers]
+                found[then][rows] = found[now][rows] + (weights[..., None] * apart).sum(axis=1)
+    return found
+
+
+def _nearest(
+    scene: GaussianScene, time: float, means: np.ndarray, points: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (P, K) rows of the ``count`` Gaussians nearest to ``points`` (P, 3), and their weights, by opacity."""
+    from scipy.spatial import KDTree
+
+    opacities = _opacities(scene, time)
+    # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
+    opaque = np.argsort(-opacities, kind="stable")[: max(count, int((opacities > MIN_OPACITY).sum()))]
+    _, nearest = KDTree(means[opaque]).query(points, k=count)
+    chosen = opaque[np.reshape(nearest, (len(points), count))]
+    return chosen, opacities[chosen] / opacities[chosen].sum(axis=1, keepdims=True)
+
+
 def _times_of(tracks: TrueTracks, views: Sequence[View]) -> np.ndarray:
     """Return the (T,) times of the tracks as the capture has them, by its views; NaN of those that no view shows."""
     times = np.full(len(tracks.points), np.nan)
@@ -103,8 +140,6 @@ def _times_of(tracks: TrueTracks, views: Sequence[View]) -> np.ndarray:
 
 def _bind(scene: GaussianScene, tracks: TrueTracks, times: np.ndarray) -> _Bound:
     """Return the points bound to the nearest Gaussians, each at its own one of the (T,) times."""
-    from scipy.spatial import KDTree
-
     count = tracks.points.shape[1]
     carriers_each = min(CARRIERS, int((_opacities(scene, None) > MIN_OPACITY).sum()))
     bound = _Bound(
@@ -117,15 +152,11 @@ def _bind(scene: GaussianScene, tracks: TrueTracks, times: np.ndarray) -> _Bound
     for row, members in _binding_rows(tracks, times).items():
         time = float(times[row])
         means = scene.at(time).means.detach().cpu().double().numpy()
-        opacities = _opacities(scene, time)
-        # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
-        opaque = np.argsort(-opacities, kind="stable")[: max(carriers_each, int((opacities > MIN_OPACITY).sum()))]
         points = tracks.points[row, members].astype(np.float64)
-        _, nearest = KDTree(means[opaque]).query(points, k=carriers_each)
-        chosen = opaque[np.reshape(nearest, (len(points), carriers_each))]
+        chosen, weights = _nearest(scene, time, means, points, carriers_each)
         bound.points[members], bound.times[members] = points, time
         bound.carriers[members], bound.positions[members] = chosen, means[chosen]
-        bound.weights[members] = opacities[chosen] / opacities[chosen].sum(axis=1, keepdims=True)
+        bound.weights[members] = weights
     return bound
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any
 
@@ -92,6 +92,7 @@ class ViewScore:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
+    psnr_things: dict[int, float] = field(default_factory=dict)
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
     psnr_black: float | None = None
@@ -156,6 +157,7 @@ def score_views(
             render_seconds=seconds,
             deform_seconds=deform_seconds,
             time=image.time,
+            psnr_things={} if regions is None else regions.scores_of_things(image, rendered, truth),
             **parts,
             **people,
         )

@@ -21,7 +21,7 @@ from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.order import morton_order
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
-from dyngs.gaussians.schedule import active_sh_degree, means_rate, rates_of
+from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rates_of
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
@@ -62,6 +62,10 @@ class SceneTraining(Generic[S]):
     def leaves(self, scene: S) -> Sequence[Tensor]:
         """Return what the scene learns next to the Gaussians and their colours."""
         return ()
+
+    def resting(self, scene: S) -> Tensor | None:
+        """Return the indices of the Gaussians that stay as they are in steps that do not show them; None: of none."""
+        return None
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
         """Return the scene for the next step: filters brought up to date, motion extended, static Gaussians frozen."""
@@ -110,13 +114,14 @@ class GaussianModel(Model[GaussianScene]):
         config = run.config
         self._config, self.densifier, self.colours = config, densifier, colours
         self._run, self._generator = run, run.generator
+        self._rates, self._course = learning_rates(config), rates_of(config)
         self.options = training_options(config)
         self.begin_with(scene, training)
 
     def begin_with(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
         """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned yet."""
         config = self._config
-        self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, config.optim)
+        self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, self._rates)
         behind = evaluation_background(config.data.background, self._run.capture.has_alpha)[1]
         self._scene = replace(
             scene.with_gaussians(self._optimizer.parameters),
@@ -191,9 +196,10 @@ class GaussianModel(Model[GaussianScene]):
 
     def update(self, step: int) -> Updated:
         before, generator = self._optimizer.parameters, self._generator
-        lr_means = means_rate(self._config.optim, rates_of(self._config).progress(step), self._run.extent)
+        lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
-        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen)
+        resting = self.training.resting(self._scene)
+        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen, resting=resting)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:

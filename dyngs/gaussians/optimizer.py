@@ -28,15 +28,27 @@ class GaussianOptimizer:
         self.parameters = _as_leaves(gaussians.tensors())
         self._adam = AdamState.zero(gaussians.tensors())
 
-    def step(self, step: int, lr_means: float, *, dense: bool, frozen_rest: Tensor | None = None) -> Count:
+    def step(
+        self,
+        step: int,
+        lr_means: float,
+        *,
+        dense: bool,
+        frozen_rest: Tensor | None = None,
+        resting: Tensor | None = None,
+    ) -> Count:
         """Update the parameters, drop the gradients, and return the number of rows left out for bad gradients.
 
         Args:
             frozen_rest: (N,) bool, Gaussians of whose harmonics only the base colour is updated; None: none.
             dense: update all Gaussians; otherwise, if ``optim.sparse``, only those that received a gradient: the others
                 keep parameters and moments.
+            resting: (M,) indices of Gaussians that are only updated if they received one, dense or not; None: none.
         """
         rows = None if dense or not self.options.sparse else self._rows_with_gradient()
+        if rows is None and resting is not None:
+            rows = torch.ones(len(self.parameters), dtype=torch.bool, device=resting.device)
+            rows[resting] = self._rows_with_gradient()[resting]
         rates: dict[str, float | Tensor] = {
             "means": lr_means,
             "quats": self.options.lr_quats,

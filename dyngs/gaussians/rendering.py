@@ -17,7 +17,7 @@ from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.ops.checks import check_choice, check_count, check_finite, finite_rows
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
-from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
+from dyngs.ops.rasterization import Blended, BlendOptions, Tally, blend_and_tally, rasterize, tally
 
 FOCAL_LENGTHS = (1e-6, 1e12)  # Smallest and largest allowed, px; beyond them gradients leave the range of float32
 ROTATION_TOLERANCE = 0.01
@@ -184,9 +184,17 @@ def contributions(gaussians: Gaussians, cameras: Cameras, options: RenderOptions
         )
         seen = dyngs.contributions(scene.gaussians, cameras).sum(0) > 0
     """
+    return depths_and_contributions(gaussians, cameras, options)[1]
+
+
+def depths_and_contributions(
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()
+) -> tuple[Blended, Tensor]:
+    """Return images (V, H, W, 1) of the depth, summed times the weight, and the (V, N) ``contributions``."""
     gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
     projection, opacities = _project(gaussians, cameras, options)
-    return tally(projection, opacities, (cameras.width, cameras.height), Tally.WEIGHTS, options.blending)
+    size, depths = (cameras.width, cameras.height), projection.depths[..., None]
+    return blend_and_tally(projection, opacities, depths, size, Tally.WEIGHTS, options.blending)
 
 
 def sensitivities(

@@ -7,13 +7,18 @@ from dataclasses import dataclass
 
 from typing_extensions import assert_never
 
-from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
+from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, StaticModel, Strategy, TrainConfig
 from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 
 MIN_START = 100  # Densification never starts earlier: the first gradients say little
 MIN_RESET_GAP = 400  # Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)
 RESET_FRACTION = 0.2  # Fraction of a short run between opacity resets
+MOST_BETWEEN_CHANGES, CHANGE_FRACTION = 100, 0.05
+"""Steps between changes of the set, at most and as a fraction of the run: a short run has ten of them, too."""
+MEANS_POWER, POWER, SHORTEST = 1 / 2, 1 / 3, 500
+"""Powers of 30,000 / steps that learning rates of positions, and all others, are multiplied by (docs/benchmarks.md);
+those of runs shorter than the last are its own."""
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
 FILTER_EVERY = 100
@@ -42,6 +47,26 @@ def rates_of(config: Config) -> Rates:
     return Rates(config.train.steps, config.prune.steps)
 
 
+def rate_factors(config: Config) -> tuple[float, float]:
+    """Return the factors on the learning rates of positions and of all else, where the published ones have 1.
+
+    In fewer steps what is learned has to come as far. ``optim.rate_factor`` decides; else the length of the run does,
+    for static scenes: in a moving one, Gaussians that learn as fast repaint each image instead of following it.
+    """
+    asked, short = config.optim.rate_factor, PUBLISHED_STEPS / max(SHORTEST, min(config.train.steps, PUBLISHED_STEPS))
+    if asked is not None:
+        return asked, asked
+    return (short**MEANS_POWER, short**POWER) if isinstance(config.model, StaticModel) else (1.0, 1.0)
+
+
+def learning_rates(config: Config) -> OptimConfig:
+    """Return ``config.optim`` with the rates of this run: those given, times their factors."""
+    given, (of_means, of_others) = config.optim, rate_factors(config)
+    rates = {name: getattr(given, name) for name in OptimConfig.model_fields if name.startswith("lr_")}
+    changed = {k: rate * (of_means if k.startswith("lr_means") else of_others) for k, rate in rates.items()}
+    return given.model_copy(update=changed | {"rate_factor": 1.0})
+
+
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
     """Return the learning rate of the means, world units: log-linear in ``progress`` in [0, 1], times the extent."""
     return extent * math.exp((1 - progress) * math.log(options.lr_means) + progress * math.log(options.lr_means_final))
@@ -61,29 +86,34 @@ def densify_schedule(strategy: DefaultStrategy | McmcStrategy, steps: int, white
     start, which clears white floaters; in shorter runs it costs more than it brings.
     """
     start = max(scaled(strategy.start, steps), min(strategy.start, MIN_START))
-    stop = scaled(strategy.stop, steps)
+    stop, every = scaled(strategy.stop, steps), steps_between_changes(strategy, steps)
     match strategy:
         case McmcStrategy():
-            return DensifySchedule(start, stop, strategy.every)
+            return DensifySchedule(start, stop, every)
         case DefaultStrategy():
-            every = strategy.reset_every
-            if every is None:
-                return DensifySchedule(start, stop, strategy.every, prune_scale_after=steps)
+            reset_every = strategy.reset_every
+            if reset_every is None:
+                return DensifySchedule(start, stop, every, prune_scale_after=steps)
             recovery = max(MIN_RESET_GAP, round(RESET_FRACTION * steps))
-            period = max(scaled(every, steps), min(every, recovery))
+            period = max(scaled(reset_every, steps), min(reset_every, recovery))
             resets = tuple(range(period, stop - period + 1, period))
             if white_background and steps >= PUBLISHED_STEPS and start < period:
                 resets = (start, *resets)
-            return DensifySchedule(start, stop, strategy.every, resets, prune_scale_after=period)
+            return DensifySchedule(start, stop, every, resets, prune_scale_after=period)
         case _:
             assert_never(strategy)
+
+
+def steps_between_changes(strategy: DefaultStrategy | McmcStrategy, steps: int) -> int:
+    """Return the steps between changes of the set of Gaussians in a run of ``steps``."""
+    return strategy.every or max(1, min(MOST_BETWEEN_CHANGES, round(CHANGE_FRACTION * steps)))
 
 
 def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
     """Return the gradient norm from which Gaussians are cloned or split in a run of ``steps``.
 
-    Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; a lower
-    threshold makes up for it. The fourth root was measured on lego: +0.5 dB at 2,000 steps, +0.3 dB at 7,000.
+    A short run has fewer changes; a lower threshold makes up for it. The fourth root was measured on lego: +0.5 dB at
+    2,000 steps, +0.3 dB at 7,000.
     """
     return strategy.grad_threshold * min(1.0, steps / PUBLISHED_STEPS) ** 0.25
 
@@ -91,8 +121,7 @@ def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
 def growth_per_change(steps: int) -> float:
     """Return the fraction of Gaussians that MCMC adds per change.
 
-    Changes come every ``every`` steps whatever the run's length, so that a short run has fewer of them; each then adds
-    more, up to a quarter, and the count follows the same curve over the run.
+    A short run has fewer changes; each then adds more, up to a quarter, and the count follows the same curve.
     """
     rate = math.log1p(GROWTH) * max(PUBLISHED_STEPS / steps, 1.0)
     return max(GROWTH, math.expm1(min(rate, math.log1p(MAX_GROWTH))))

@@ -238,13 +238,13 @@ def _tally(
     size: list[int],
     thresholds: list[float],
     kind: int,
-) -> Tensor:
+) -> tuple[Tensor, Tensor, Tensor]:
     sums = empty_like(splats[2])
     image = *_image(colors, size), sums
     with _refusals("tally"):
         settings = _settings(size, thresholds)
         launch(colors, "rasterize_forward", _arrays(*splats), colors, background, tuple(entries), settings, image, kind)
-    return sums
+    return sums, image[0], image[1]
 
 
 tally_op = register("tally", _tally)
@@ -333,8 +333,25 @@ def tally(
 
     Other arguments as for ``rasterize``; colours and background matter to ``SQUARED_SLOPES`` only.
     """
-    entries = bin_tiles(projection, opacities, size, options)
     colors = torch.zeros_like(opacities)[..., None] if colors is None else colors
+    return blend_and_tally(projection, opacities, colors, size, kind, options, background=background)[1]
+
+
+def blend_and_tally(
+    projection: Projection,
+    opacities: Tensor,
+    colors: Tensor,
+    size: tuple[int, int],
+    kind: Tally,
+    options: BlendOptions = BlendOptions(),
+    *,
+    background: Tensor | None = None,
+) -> tuple[Blended, Tensor]:
+    """Return what ``rasterize`` and ``tally`` do, of one pass; not differentiable."""
+    entries = bin_tiles(projection, opacities, size, options)
     splats = [projection.means2d, projection.factors, opacities, projection.radii]
     with torch.no_grad():
-        return tally_op(splats, colors, background, entries.tensors(), list(size), options.thresholds, int(kind))
+        sums, color, transmittance = tally_op(
+            splats, colors, background, entries.tensors(), list(size), options.thresholds, int(kind)
+        )
+    return Blended(color, transmittance), sums

@@ -8,16 +8,14 @@ them, and it is much nearer to that camera than the scene usually is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from dyngs.config import StaticModel
 from dyngs.errors import counted
-from dyngs.gaussians.rendering import contributions
+from dyngs.gaussians.rendering import depths_and_contributions
 from dyngs.kinds import GaussianTrainer
-from dyngs.models.views import background_colour
 from dyngs.training.events import Event, Message, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
 
@@ -63,16 +61,15 @@ class FloaterRemoval:
 @torch.no_grad()
 def floaters(trainer: GaussianTrainer) -> Tensor:
     """Return (N,) bool which Gaussians of a static scene are floaters, by all of its training views."""
-    scene, background = trainer.model.scene, background_colour(trainer.background)
-    gaussians, options = scene.gaussians.detach(), replace(trainer.model.options, depth="expected", absgrad=False)
+    gaussians = trainer.model.scene.gaussians.detach()
     total, most = torch.zeros_like(gaussians.logit_opacities), torch.zeros_like(gaussians.logit_opacities)
     nearness = torch.full_like(total, torch.inf)
     for camera in trainer.images.cameras():
         small = camera.scaled(min(1.0, LONGEST_SIDE / max(camera.width, camera.height)))
-        drawn = scene.render(small, None, options=options, background=background)
-        assert drawn.depth is not None
-        depths = drawn.depth[0][drawn.alpha[0] > SOLID]
-        weight = contributions(gaussians, small, trainer.model.options)[0]
+        drawn, weights = depths_and_contributions(gaussians, small, trainer.model.options)
+        weight, alpha = weights[0], 1 - drawn.transmittance[0]
+        is_solid = alpha > SOLID
+        depths = drawn.color[0, ..., 0][is_solid] / alpha[is_solid]
         pose = small.cam_from_world[0]
         depth = depths.median() if depths.numel() else depths.new_zeros(())
         is_main = weight > most

@@ -9,8 +9,10 @@ with the same bytes as one that had the stage in its configuration.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from statistics import fmean
 
 import torch
@@ -20,6 +22,7 @@ from dyngs.camera import Cameras
 from dyngs.config import PruneConfig
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
+from dyngs.deform.scene import field_scene_of
 from dyngs.errors import counted
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
@@ -251,4 +254,20 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> Visi
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
     fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
-    return VisibilityMasks.pack(tuple(times), fractions[:, kept] > MASKED_BELOW)
+    seen = fractions > MASKED_BELOW
+    moved = field_scene_of(scene)
+    if moved is not None and moved.field is not None and moved.field.momentary:
+        seen |= there_after(scene, times, trainer.model.options.alpha_min).to(seen.device)
+    return VisibilityMasks.pack(tuple(times), seen[:, kept])
+
+
+def there_after(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
+    """Return (K, N) bool: which Gaussians are more opaque than ``alpha_min`` between one of K key times and the next.
+
+    At the training times and in the middle between any two: what is there for a while only may miss all key times.
+    """
+    looked_at = sorted({*scene.times, *((a + b) / 2 for a, b in pairwise(scene.times))})
+    found = torch.zeros(len(times), len(scene), dtype=torch.bool, device=scene.device)
+    for time in looked_at:
+        found[max(bisect_right(times, time) - 1, 0)] |= scene.at(time).opacities > alpha_min
+    return found

@@ -34,7 +34,7 @@ from dyngs.tradeoff.measure import with_render_settings
 from dyngs.tradeoff.variants import RunSettings, Variant
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width"}
-"""The key that sets the size of a field, by its kind."""
+"""The key that sets the size of a field, by its kind; free primitives have none."""
 
 NO_BUDGET = tuple(f"budget.{name}=null" for name in BudgetConfig.model_fields)
 """Limits of the run would change its variants again."""
@@ -179,14 +179,15 @@ def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
     field = config.model.deform
     kind = wanted.field or field.kind
     if kind != field.kind:
-        moves = FieldSection.model_fields
-        field = section_class(DynamicModel.model_fields["deform"], kind)(
-            **{name: getattr(field, name) for name in moves}
-        )
+        given = field if isinstance(field, FieldSection) else FieldSection()
+        section = section_class(DynamicModel.model_fields["deform"], kind)
+        moves = {name: getattr(given, name) for name in FieldSection.model_fields if name in section.model_fields}
+        field = section(**moves)
         yield f"model.deform.kind={kind}"
-        yield from (f"model.deform.{name}={str(getattr(field, name)).lower()}" for name in moves)
-    size = round(wanted.field_size * getattr(field, FIELD_SIZE[kind]))
-    yield f"model.deform.{FIELD_SIZE[kind]}={max(1, size)}"
+        yield from (f"model.deform.{name}={str(value).lower()}" for name, value in moves.items())
+    if kind in FIELD_SIZE:
+        size = round(wanted.field_size * getattr(field, FIELD_SIZE[kind]))
+        yield f"model.deform.{FIELD_SIZE[kind]}={max(1, size)}"
 
 
 def _with_degree(source: Path, degree: int) -> tuple[Checkpoint, Config]:

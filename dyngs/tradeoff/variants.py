@@ -170,6 +170,8 @@ class RunSettings:
             return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
         if setting.name in ("mask_times", "field", "field_size", "field_step") and self.field is None:
             return False
+        if setting.name == "field_size" and self.field == "free":  # it grows with the Gaussians
+            return False
         own = asdict(self) | {"scale": 1.0, "field_size": 1.0, "field_step": 1.0}
         return own.get(setting.name) != value
 

@@ -12,7 +12,7 @@ from dyngs.config import Config, DynamicModel, HumanModel, TrainConfig
 from dyngs.deform.schedule import deform_schedule, motion_begins_after
 from dyngs.deform.training import DeformSchedule
 from dyngs.errors import DyngsError, counted
-from dyngs.gaussians.schedule import Rates, means_rate, rates_of
+from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 from dyngs.training.corrections.exposure import WARM_UP
 
@@ -78,7 +78,7 @@ def told(before: Config, after: Config, done: int) -> str:
     line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {counted(steps, 'step')}"
     if not after.model.made_of_gaussians:
         return line
-    then, now = (means_rate(c.optim, rates_of(c).progress(done), 1.0) for c in (before, after))
+    then, now = (means_rate(learning_rates(c), rates_of(c).progress(done), 1.0) for c in (before, after))
     stop = scaled(after.strategy.stop, steps)
     grows = after.strategy.growth_limit > 0 and stop > done + 1
     line += f": the learning rate of positions is {now / then:.3g} times what it was, "

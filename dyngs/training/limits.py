@@ -101,7 +101,8 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     fixed, moves_by = 0.0, config.model.deform if isinstance(config.model, DynamicModel) else None
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
     if moves_by is not None and num_times > 1:
-        fixed = FIELD_BYTES * num_field_values(moves_by, num_times)
+        fixed, whole = (FIELD_BYTES * num_field_values(moves_by, num_times, moving) for moving in (0, 1))
+        each += whole - fixed  # if all move
     found = int((1e6 * megabytes - fixed) / each)
     if found < FEWEST:
         field = f", of which the field takes {1e-6 * fixed:.2g}" if fixed else ""
@@ -112,7 +113,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
     return found
 
 
-def num_field_values(options: DeformField, num_times: int) -> int:
-    """Return the number of values that a field learns."""
-    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, 0, 1.0)
+def num_field_values(options: DeformField, num_times: int, num_moving: int = 0) -> int:
+    """Return the number of values that a field learns for so many Gaussians that move."""
+    setup = FieldSetup(torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0)
     return new_field(options, setup, torch.Generator()).parameters.num_values

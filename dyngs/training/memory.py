@@ -17,6 +17,7 @@ from dyngs.config import (
     DeformField,
     DynamicModel,
     FixedStrategy,
+    FreeField,
     HexplaneField,
     HumanModel,
     McmcStrategy,
@@ -265,7 +266,7 @@ def gaussian_bytes(config: Config) -> int:
             return each + 4 * LOOKUP_COPIES * field.channels * len(field.levels)
         case MlpField():
             return each + 4 * ACTIVATION_COPIES * field.depth * field.width
-        case ControlNodesField():
+        case ControlNodesField() | FreeField():
             return each + MOVING_BYTES
         case _:
             assert_never(field)

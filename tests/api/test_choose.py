@@ -21,9 +21,10 @@ from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import DynamicOptions, StillOptions, write_dynamic_capture, write_still_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import render
+from dyngs.gaussians.schedule import rate_factors
 from dyngs.kinds import with_points
 from dyngs.runs.folder import CHOICES_NAME
 
@@ -87,6 +88,33 @@ def test_what_was_requested_is_not_questioned(moving: Path, monkeypatch: pytest.
     _, found = decided(preset(moving, LONG, *keys))
     assert [choice.setting for choice in found] == ["model.kind=dynamic"]
     assert decided(preset(moving, "model.choose=false"))[1] == []
+
+
+def test_free_primitives_are_used_before_fixed_cameras_unless_nodes_win(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With images that grow early, also where nothing can be asked; what was requested is used, whatever it is."""
+    root = write_dynamic_capture(
+        "room", tmp_path / "room", DynamicOptions(size=24, num_times=8, num_cameras=3, samples=1)
+    )
+    for nodes_win in (True, False):
+        tried = scored(
+            monkeypatch, lambda c, sign=2 * nodes_win - 1: 20.0 + sign * (c.model.deform.kind == "control_nodes")
+        )
+        best, found = decided(preset(root, LONG))
+        assert isinstance(best.model, DynamicModel)
+        assert found[0].setting == "model.deform.kind=control_nodes"
+        assert best.model.deform.kind == ("control_nodes" if nodes_win else "free")
+        assert best.train.resolution_grows_from == (0.6 if nodes_win else 0.3)
+        assert tried[0].model.deform.kind == "free"  # type: ignore[union-attr]
+        assert best.model.deform.model_dump() == preset(root).model.deform.model_dump() or not nodes_win  # type: ignore[union-attr]
+    short, _ = decided(preset(root, "train.steps=400", "train.resolution_grows_from=0.2"))
+    assert isinstance(short.model, DynamicModel)
+    assert (short.model.deform.kind, short.train.resolution_grows_from) == ("free", 0.2)
+    for key in ("model.deform.kind=hexplane", "model.deform.rigidity=0.3"):
+        requested, _ = decided(preset(root, "train.steps=400", key))
+        assert isinstance(requested.model, DynamicModel)
+        assert requested.model.deform.kind == ("hexplane" if "hex" in key else "control_nodes")
 
 
 def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
@@ -185,6 +213,13 @@ def test_as_static_has_the_static_preset_and_what_was_requested(moving: Path) ->
     assert found.model == StaticModel(sh_degree=2)
     assert (found.train.ssim_weight, found.optim.lr_means) == (0.5, 1e-3)
     assert (found.strategy.kind, found.strategy.growth_limit) == ("mcmc", 77)
+
+
+def test_small_runs_with_and_without_motion_learn_equally_fast(moving: Path) -> None:
+    """Else a static scene would win by its faster learning, which a full run hardly has."""
+    config = preset(moving, "train.steps=1000")
+    assert rate_factors(module._at_rest(config)) == rate_factors(config) == (1, 1)
+    assert rate_factors(as_static(config)) > (1, 1)
 
 
 def test_choices_are_a_table_in_the_run_folder(tmp_path: Path) -> None:

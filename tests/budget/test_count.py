@@ -29,7 +29,7 @@ from dyngs.runs.checkpoint import checkpoint_paths, load_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-KINDS = ("default", "mcmc", "control_nodes", "human")
+ALL_KINDS = ("default", "mcmc", "control_nodes", "human")
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def config_of(kind: str, captures: dict[str, Path], run_dir: Path, budget: Budge
     return config.model_copy(update={"data": DataConfig(root=captures["person"]), "model": model})
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_no_run_ends_with_more_and_a_resumed_one_knows(
     kind: str, captures: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

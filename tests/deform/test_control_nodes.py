@@ -126,15 +126,6 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(nodes: int, 
         assert all(len(x) == len(positions) for x in tensors_of(field.parameters.state()).values())
 
 
-def test_a_field_on_its_way_is_restored_before_it_is_first_used() -> None:
-    """As a checkpoint of the very step with which motion begins needs it."""
-    field, means = control_nodes(), cloud(9).means.detach()
-    paths = means[:5, None] * torch.linspace(0, 1, field.num_points, device="cpu")[:, None]
-    begun = field.started(means[:5], {"means": paths})
-    again = control_nodes().restored(tensors_of(begun.state()))
-    assert torch.equal(again.offsets(means, 0.3).means, begun.offsets(means, 0.3).means)
-
-
 def test_an_edited_field_leaves_the_other_as_it_was() -> None:
     """Also when nodes are placed anew: a scene and its parts may be drawn in turns."""
     means, rows = cloud().means, torch.tensor([2, 5, 5, 7])

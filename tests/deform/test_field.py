@@ -102,20 +102,40 @@ def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: se
     st.sets(st.sampled_from(ATTRIBUTES)),
     st.sampled_from([torch.float32, torch.float64]),
 )
-def test_one_pass_without_gradients_does_the_same(
+def test_values_and_gradients_are_those_of_plain_torch(
     chosen: set[int] | None, absent: set[str], dtype: torch.dtype
 ) -> None:
-    gaussians = Gaussians(**{name: x.to(dtype) for name, x in cloud().tensors().items()})
-    before = {name: x.clone() for name, x in gaussians.tensors().items()}
     rows = None if chosen is None else torch.tensor(sorted(chosen), dtype=torch.long)
     given = vars(some_offsets(9 if rows is None else len(rows), dtype)).items()
-    offsets = Offsets(**{name: None if name in absent else x for name, x in given})
-    expected = deformed(gaussians, offsets, rows)
-    with torch.no_grad():
-        found = deformed(gaussians, offsets, rows)
-    for name, x in expected.tensors().items():
-        torch.testing.assert_close(getattr(found, name), x)
-        assert torch.equal(getattr(gaussians, name), before[name]), "what is given stays as it is"
+    found: list[list[Tensor]] = []
+    for move in (deformed, slowly_deformed):
+        leaves = {name: x.to(dtype).clone().requires_grad_() for name, x in cloud().tensors().items()}
+        offsets = {name: None if name in absent else x.clone().requires_grad_() for name, x in given}
+        moved = move(Gaussians(**leaves), Offsets(**offsets), rows).tensors().values()
+        weighted = torch.stack([(x * weights(x)).sum() for x in moved]).sum()
+        weighted.backward()
+        inputs = [*leaves.values(), *(x for x in offsets.values() if x is not None)]
+        found.append([*moved, *(x.grad for x in inputs if x.grad is not None)])
+        assert len(found[-1]) == 5 + len(inputs)
+        for name, x in cloud().tensors().items():
+            assert torch.equal(leaves[name].detach(), x.to(dtype)), "what is given stays as it is"
+    for fast, slow in zip(*found, strict=True):
+        torch.testing.assert_close(fast, slow)
+
+
+def slowly_deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None) -> Gaussians:
+    """``deformed`` by torch's own operators."""
+    rows = torch.arange(len(gaussians)) if rows is None else rows
+    sh, quats, changes = gaussians.sh, gaussians.quats, dict[str, Tensor]()
+    for name in ("means", "log_scales", "logit_opacities"):
+        offset = getattr(offsets, name)
+        if offset is not None:
+            changes[name] = getattr(gaussians, name).index_add(0, rows, offset)
+    if offsets.quats is not None:
+        changes["quats"] = quats.index_copy(0, rows, turned_quats(quats[rows], offsets.quats))
+    if offsets.colors is not None:
+        changes["sh"] = torch.cat([sh[:, 0].index_add(0, rows, offsets.colors)[:, None], sh[:, 1:]], dim=1)
+    return gaussians.replace(**changes)
 
 
 @pytest.mark.parametrize("row", [-1, 9])

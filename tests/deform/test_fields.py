@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
+from tiny_fields import ALL_KINDS, KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_options, tiny_setup
 
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.fields import field_state, new_field, restored_field
+from dyngs.deform.free import FreePrimitives
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
 from dyngs.state import tensors_of
 
 
 def test_options_decide_the_kind() -> None:
-    kinds = {"hexplane": Hexplane, "mlp": Mlp, "control_nodes": ControlNodes}
+    kinds = {"hexplane": Hexplane, "mlp": Mlp, "control_nodes": ControlNodes, "free": FreePrimitives}
     for kind, expected in kinds.items():
         assert type(tiny_field(kind)) is expected
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_a_restored_field_moves_everything_alike(kind: str) -> None:
     """Bitwise, also in the next steps of training; the setup comes back, too."""
     field, setup, means = stirred_field(kind), tiny_setup(), cloud().means
@@ -43,7 +44,7 @@ def test_a_restored_field_moves_everything_alike(kind: str) -> None:
             assert x is None or torch.equal(getattr(found, name), x), name
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_what_is_missing_is_named(kind: str) -> None:
     state = tensors_of(field_state(tiny_field(kind)))
     for name in ("box", "numbers", next(name for name in state if name.startswith("learned."))):
@@ -52,7 +53,7 @@ def test_what_is_missing_is_named(kind: str) -> None:
 
 
 def test_the_generator_decides_everything() -> None:
-    for kind in KINDS:
+    for kind in ALL_KINDS:
         fields = [new_field(tiny_options(kind), tiny_setup(), torch.Generator().manual_seed(s)) for s in (1, 1, 2)]
         first, second, other = (f.parameters.values() for f in fields)
         assert all(torch.equal(x, second[name]) for name, x in first.items())

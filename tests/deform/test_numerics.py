@@ -11,7 +11,17 @@ import pytest
 import torch
 from moving_scene import write_timed_capture
 from scenes import look_around, weights
-from tiny_fields import KINDS, busy_config, cloud, stir, stirred_field, tiny_field, tiny_options, write_tiny_capture
+from tiny_fields import (
+    ALL_KINDS,
+    KINDS,
+    busy_config,
+    cloud,
+    stir,
+    stirred_field,
+    tiny_field,
+    tiny_options,
+    write_tiny_capture,
+)
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -92,21 +102,21 @@ def test_the_ends_of_the_clip_are_ordinary_times(kind: str, time: float) -> None
     assert all(x is not None and x.isfinite().all() and x.any() for x in grads)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_times_outside_the_clip_are_clamped(kind: str) -> None:
     scene = scene_of(torch.arange(9), stirred_field(kind))
     for outside, inside in ((-1e-9, 0.0), (-1e30, 0.0), (1 + 1e-9, 1.0), (float("inf"), 1.0)):
         assert torch.equal(scene.at(outside).means, scene.at(inside).means)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_a_single_training_time_is_a_static_scene(tmp_path: Path, kind: str) -> None:
     trainer = assemble(busy_config(timed(tmp_path / "capture", [0.5] * 5), tmp_path, kind))
     assert isinstance(trainer.model.scene, StaticScene)
     assert trainer.step().loss > 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_two_training_times(tmp_path: Path, kind: str) -> None:
     """Trained on together from the first step on; planes and keys have the least that there can be, two."""
     config = busy_config(timed(tmp_path / "capture", [0.0, 1.0, 0.0, 1.0, 1.0]), tmp_path, kind)
@@ -171,7 +181,7 @@ def test_no_moving_gaussians(kind: str) -> None:
     assert scene.at(0.4) is gaussians
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: str) -> None:
     """The run goes on with what is left, and its checkpoint can be loaded."""
     trainer = fine_trainer(capture, kind)
@@ -195,7 +205,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     assert other.step().loss == trainer.step().loss
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_one_gaussian(kind: str) -> None:
     field, gaussian = stirred_field(kind, 1), cloud(1)
     moved = deformed(gaussian, field.offsets(gaussian.means, 0.8))
@@ -304,7 +314,7 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> None:
     """The next step stops before anything changes, and names step, view, attributes and time."""
     trainer = fine_trainer(capture, kind)

@@ -8,9 +8,14 @@ from hypothesis import strategies as st
 from tiny_fields import cloud
 
 from dyngs.config import OptimConfig
-from dyngs.deform.random_gaussians import box_of, with_random_gaussians
+from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
+from dyngs.gaussians import Gaussians
 from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.state import tensors_of
+
+
+def drawn(gaussians: Gaussians, count: int, extent: float, seed: int) -> Gaussians:
+    return random_gaussians(gaussians, count, extent, torch.Generator().manual_seed(seed))
 
 
 @settings(max_examples=60, deadline=None)
@@ -18,7 +23,7 @@ from dyngs.state import tensors_of
 def test_they_are_faint_and_lie_in_the_box(count: int, num_added: int, degree: int, seed: int) -> None:
     """So many, after all others, which stay as they are; new rows without moments."""
     gaussians = cloud(count).replace(sh=torch.randn(count, (degree + 1) ** 2, 3))
-    result = with_random_gaussians(gaussians, num_added, 2.0, torch.Generator().manual_seed(seed))
+    result = with_gaussians(gaussians, [drawn(gaussians, num_added, 2.0, seed)])
     assert result.edit is not None
     assert torch.equal(result.edit.is_new, torch.arange(count + num_added) >= count)
     assert torch.equal(result.edit.source[:count], torch.arange(count))
@@ -27,7 +32,7 @@ def test_they_are_faint_and_lie_in_the_box(count: int, num_added: int, degree: i
         x.grad = torch.ones_like(x)
     optimizer.step(1, 0.1, dense=True)
     before, moments = optimizer.parameters.detach(), tensors_of(optimizer.state())
-    optimizer.apply(with_random_gaussians(before, num_added, 2.0, torch.Generator().manual_seed(seed)))
+    optimizer.apply(with_gaussians(before, [drawn(before, num_added, 2.0, seed)]))
     after = optimizer.parameters.detach()
     added = after.select(torch.arange(count, count + num_added))
     assert len(after) == count + num_added
@@ -47,10 +52,7 @@ def test_they_are_faint_and_lie_in_the_box(count: int, num_added: int, degree: i
 def test_they_fill_the_box() -> None:
     """Each octant has its share; another draw gives other places, the same generator the same."""
     gaussians = cloud(200)
-    draws = [
-        with_random_gaussians(gaussians, 4000, 1.0, torch.Generator().manual_seed(i)).changes["means"][200:]
-        for i in (0, 0, 1)
-    ]
+    draws = [drawn(gaussians, 4000, 1.0, i).means for i in (0, 0, 1)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
     octants = (draws[0] > box_of(gaussians, 1.0)[0]).float() @ torch.tensor([1.0, 2, 4])

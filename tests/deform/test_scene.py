@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_fields import KINDS, cloud, stirred_field, tiny_field, tiny_options
+from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_field, tiny_options
 from torch import Tensor
 
 from dyngs.config import DynamicModel
@@ -38,7 +38,7 @@ def same(a: Gaussians, b: Gaussians) -> bool:
     return all(torch.equal(x, b.tensors()[name]) for name, x in a.tensors().items())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_only_the_rows_move(kind: str) -> None:
     scene = some_scene(kind)
     early, late = scene.at(0.1), scene.at(0.9)
@@ -62,7 +62,7 @@ def test_times_after_the_clip_are_its_end(time: float) -> None:
     assert not same(scene.at(time), scene.at(0.0))
 
 
-@pytest.mark.parametrize("kind", [*KINDS, None])
+@pytest.mark.parametrize("kind", [*ALL_KINDS, None])
 def test_a_time_that_is_no_number_is_refused(kind: str | None) -> None:
     """Also where nothing moves."""
     scene = some_scene(kind) if kind else scene_of(NOTHING)
@@ -70,7 +70,7 @@ def test_a_time_that_is_no_number_is_refused(kind: str | None) -> None:
         scene.at(float("nan"))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("filtered", [False, True])
 def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) -> None:
     """Together, in their order, at each time."""
@@ -114,7 +114,7 @@ def test_the_filter_acts_on_what_is_drawn() -> None:
     assert same(scene.at(0.6), fuse_filter(plain.at(0.6), std))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("rows", [ROWS, None, NOTHING], ids=["some", "all", "none"])
 def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     """As the model stored it; without rows all Gaussians move."""
@@ -134,7 +134,7 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     assert same(scene.at(0.3), fuse_filter(moved, torch.ones(9)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("filtered", [False, True])
 def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
     """Before, between and after key times, in any order of times; parts and sizes are those of all Gaussians."""

@@ -73,7 +73,7 @@ def test_report_of_a_run(tmp_path) -> None:
     keys = "split num_views width height background psnr ssim flip lpips lpips_net num_gaussians model_mb fps"
     over_time = "num_moving moving_fraction field_mb deform_fraction flicker flicker_error psnr_per_time psnr_person"
     parts = "ssim_person psnr_foreground psnr_moving psnr_static moving_from track_error_px track_within_5px"
-    parts += " track_motion_px psnr_right psnr_right_fitted psnr_own_poses own_poses"
+    parts += " psnr_things track_motion_px psnr_right psnr_right_fitted psnr_own_poses own_poses"
     parts += " silhouette_poses psnr_black ssim_black lpips_black"
     rest = {*parts.split(), "seconds_train", "step", "reasons", "notes", "per_view", "colour_floats", "stored_mb"}
     assert set(keys.split()) | set(over_time.split()) | rest == set(stored)
@@ -177,15 +177,15 @@ def test_report_of_a_moving_run(tmp_path) -> None:
 
 
 def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
-    """With a mask for each test image, and true tracks that the model follows exactly."""
+    """With labels for each test image, and true tracks that the model follows exactly."""
     run_dir = write_moving_run(tmp_path)
     root = tmp_path / "capture"
     document = json.loads((root / "transforms_test.json").read_text())
     moves = np.zeros((16, 16), np.uint8)
-    moves[4:12] = 255
+    moves[4:12], moves[4:12, 8:] = 1, 2
     write_image(root / "moves.png", moves)
     for frame in document["frames"]:
-        frame["motion_mask_path"] = "moves.png"
+        frame["instance_mask_path"] = "moves.png"
     (root / "transforms_test.json").write_text(json.dumps(document))
     start = row_of_balls().means[[1, 3]].numpy()
     points = np.stack([start + np.array([t - 0.5, 0, 0]) for t in TEST_TIMES])
@@ -197,6 +197,8 @@ def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
     assert report.moving_from == "motion masks"
     assert report.psnr_moving is not None
     assert report.psnr_static is not None
+    assert set(report.psnr_things) == {1, 2}
+    assert min(report.psnr_things.values()) < report.psnr_moving < max(report.psnr_things.values())
     assert report.track_error_px is not None
     assert report.track_motion_px is not None
     assert 0 < report.track_error_px < report.track_motion_px

@@ -15,12 +15,16 @@ import torch
 from moving_scene import Sliding, camera, moving_scene, row_of_balls, still_scene
 
 from dyngs.camera import Cameras
+from dyngs.config import FreeField
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.scenes import SceneName
 from dyngs.data.tracks import TrueTracks, read_true_tracks
+from dyngs.deform.field import FieldSetup
+from dyngs.deform.free import FreePrimitives, FreeStart
+from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
@@ -99,6 +103,32 @@ def test_masked_gaussians_carry_points_too() -> None:
     masks = VisibilityMasks.pack((0.0, 1.0), torch.tensor([[True, False], [True, False]]))
     masked = track_scores(replace(scene, masks=masks), sliding_truth(), split(), views())
     assert masked == track_scores(scene, sliding_truth(), split(), views())
+
+
+def turning_back(scale: float) -> tuple[GaussianScene, TrueTracks]:
+    """A ball that goes along x to the middle of the clip and back, of one Gaussian per time; and where it truly is."""
+    ways = [min(time, 1 - time) for time in TIMES]
+    means = torch.tensor([[way - 1.0, 0.0, 0.0] for way in ways])
+    velocities = scale * torch.tensor([[1.0, 0.0, 0.0]] * 2 + [[0.0] * 3] + [[-1.0, 0.0, 0.0]] * 2)
+    start = FreeStart(torch.zeros(0), (), torch.tensor(TIMES), torch.full((5,), 0.06), velocities)
+    setup = FieldSetup(torch.zeros(3), torch.ones(3), len(TIMES), len(TIMES), 1.0)
+    field = FreePrimitives(FreeField(), setup, torch.Generator()).started(start)
+    scene = DynamicScene(
+        gaussians=row_of_balls().replace(means=means), seen_at=TIMES, field=field, moving=torch.arange(5)
+    )
+    rows = np.arange(len(TIMES))
+    names = np.array([f"v{k}" for k in rows])
+    return scene, TrueTracks(means[:, None].numpy(), 7 * np.array(TIMES), names, rows, np.ones((5, 1), bool))
+
+
+def test_gaussians_that_are_there_for_a_while_hand_points_on() -> None:
+    """None of them goes both ways; what is missing is that the middle one, which stands, hands on nothing at first."""
+    scene, truth = turning_back(1.0)
+    found = track_scores(scene, truth, split(), views())
+    assert found.motion_px == pytest.approx(PX_PER_UNIT * (0.5 + 0.25 + 0.25 + 0.5) / 4, rel=1e-4)
+    assert found.error_px == pytest.approx(PX_PER_UNIT * 0.25, rel=0.05), "a quarter is lost in the first gap each way"
+    still = track_scores(turning_back(0.0)[0], truth, split(), views())
+    assert still.error_px == pytest.approx(still.motion_px, rel=1e-4)
 
 
 def test_reasons_say_why_there_is_no_error() -> None:

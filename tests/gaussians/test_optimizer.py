@@ -63,6 +63,20 @@ def test_equals_torch_adam_with_a_rate_per_group() -> None:
         assert x.grad is None
 
 
+def test_gaussians_that_rest_are_left_alone_where_they_are_not_seen() -> None:
+    """Of two that are not seen only the one that rests; one that is seen moves, be it at rest else or not."""
+    optimizer = GaussianOptimizer(_gaussians(5), OptimConfig())
+    resting = torch.tensor([0, 3])
+    for step in (1, 2):
+        before = _stored(optimizer)
+        _set_gradients(optimizer, step, unseen=[1, 3] if step == 2 else [])
+        optimizer.step(step, 0.1, dense=True, resting=resting)
+    for name, x in _stored(optimizer).items():
+        if "." in name and name.startswith(("gaussians", "exp_avg.")):
+            changed = (x != before[name]).flatten(1).any(1) if x.ndim > 1 else x != before[name]
+            assert changed.tolist() == [True, True, True, False, True], name
+
+
 def test_unseen_gaussians_are_left_alone_unless_dense() -> None:
     start = _gaussians(5)
     for sparse, dense, moves in ((True, False, False), (True, True, True), (False, False, True)):

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.config import DefaultStrategy, DynamicModel, McmcStrategy, OptimConfig, TrainConfig
+from dyngs.config import (
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    DynamicModel,
+    HumanModel,
+    McmcStrategy,
+    OptimConfig,
+    SceneModel,
+    StaticModel,
+    TrainConfig,
+)
 from dyngs.deform.schedule import deform_schedule
 from dyngs.gaussians.schedule import (
     GROWTH,
@@ -20,7 +32,9 @@ from dyngs.gaussians.schedule import (
     filter_steps,
     grad_threshold,
     growth_per_change,
+    learning_rates,
     means_rate,
+    rate_factors,
 )
 from dyngs.models.schedule import image_divisor
 
@@ -64,12 +78,50 @@ def test_short_runs() -> None:
     assert densify_schedule(DefaultStrategy(), 10, white_background=True).resets == ()
 
 
+@pytest.mark.parametrize(("steps", "every"), [(1, 1), (500, 25), (1000, 50), (2000, 100), (30_000, 100)])
+def test_short_runs_change_as_often(steps: int, every: int) -> None:
+    for strategy in (DefaultStrategy(), McmcStrategy()):
+        assert densify_schedule(strategy, steps, white_background=False).every == every
+        asked = strategy.model_copy(update={"every": 7})
+        assert densify_schedule(asked, steps, white_background=False).every == 7
+
+
 def test_short_runs_densify_from_a_lower_gradient_on() -> None:
     strategy = DefaultStrategy()
     assert grad_threshold(strategy, 30_000) == grad_threshold(strategy, 60_000) == strategy.grad_threshold
     thresholds = [grad_threshold(strategy, steps) for steps in (500, 2000, 7000, 29_999)]
     assert thresholds == sorted(thresholds)
     assert thresholds[0] > 0.25 * strategy.grad_threshold
+
+
+def _config(steps: int, optim: OptimConfig | None = None, model: SceneModel | None = None) -> Config:
+    train, optim = TrainConfig(steps=steps), optim or OptimConfig()
+    return Config(data=DataConfig(root=Path("capture")), model=model or StaticModel(), optim=optim, train=train)
+
+
+def test_rates_of_a_static_scene_fit_the_length() -> None:
+    """Those published at their length and beyond, higher ones in a shorter run, positions most."""
+    factors = [rate_factors(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)]
+    assert factors == sorted(factors, reverse=True)
+    assert factors[0] == factors[1] == pytest.approx((60 ** (1 / 2), 60 ** (1 / 3)))
+    assert factors[-2:] == [(1, 1), (1, 1)]
+    assert all(of_means > of_others for of_means, of_others in factors[:-2])
+    assert rate_factors(_config(500, OptimConfig(rate_factor=1.5))) == (1.5, 1.5)
+
+
+@pytest.mark.parametrize("model", [HumanModel(), DynamicModel()])
+def test_rates_of_what_moves_are_the_published_ones_at_any_length(model: SceneModel) -> None:
+    assert rate_factors(_config(500, model=model)) == (1, 1)
+    assert rate_factors(_config(500, OptimConfig(rate_factor=2), model)) == (2, 2)
+
+
+def test_given_rates_are_multiplied_too() -> None:
+    given = OptimConfig(lr_means=1.0, lr_quats=0.5, rate_factor=3)
+    assert learning_rates(_config(30_000)) == OptimConfig(rate_factor=1)
+    short = learning_rates(_config(700, given))
+    assert (short.lr_means, short.lr_quats, short.lr_opacities) == (3, 1.5, 3 * OptimConfig().lr_opacities)
+    as_published = given.model_copy(update={"rate_factor": 1.0})
+    assert learning_rates(_config(700, as_published)) == as_published
 
 
 def test_means_rate_is_log_linear_times_the_extent() -> None:
@@ -87,7 +139,7 @@ def test_sh_degree_rises_at_the_scaled_steps(steps: int, every: int) -> None:
     assert active_sh_degree(options, steps, 0) == 0
 
 
-@pytest.mark.parametrize("steps", [2000, 7000, 15_000, 30_000])
+@pytest.mark.parametrize("steps", [1000, 2000, 7000, 15_000, 30_000])
 def test_mcmc_can_reach_its_cap_at_any_length(steps: int) -> None:
     schedule = densify_schedule(McmcStrategy(), steps, white_background=False)
     changes = sum(schedule.densifies_at(step) for step in range(steps))

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from moving_scene import Blinking, Sliding, camera, moving_scene, row_of_balls, still_scene
-from tiny_fields import KINDS, busy_config
+from tiny_fields import ALL_KINDS, busy_config, cloud, tiny_setup
 from torch import Tensor
 
 from dyngs.api.train import train
@@ -18,6 +18,7 @@ from dyngs.camera import Cameras
 from dyngs.config import (
     Config,
     DataConfig,
+    FreeField,
     McmcStrategy,
     PruneConfig,
     RandomInit,
@@ -28,10 +29,12 @@ from dyngs.config import (
 from dyngs.config.io import load_resolved
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.field import Offsets
+from dyngs.deform.free import FreePrimitives, FreeStart
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.kinds import assemble
 from dyngs.prune.stage import (
     Importance,
@@ -42,6 +45,7 @@ from dyngs.prune.stage import (
     highest,
     importance,
     prune_,
+    there_after,
 )
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
 from dyngs.static.scene import StaticScene
@@ -81,7 +85,7 @@ def trained(config: Config) -> Trainer:
     return trainer
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_a_moving_run_goes_on_with_half_of_it_and_resumes_exactly(kind: str, moving: Path, tmp_path: Path) -> None:
     """From the checkpoint before the stage, and from one in its middle."""
     config = moving_config(moving, tmp_path / "run", kind)
@@ -308,3 +312,18 @@ def test_no_more_go_than_asked_and_none_above_one_that_stays(values: list[float]
     assert (~kept).sum() <= fraction * len(scores) + 1e-6
     if not bool(kept.all()):
         assert scores[~kept].max() <= scores[kept].min()
+
+
+def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
+    """Between key times, too: three of ten training times are key times, and none of the Gaussians is there at them."""
+    centers = torch.tensor([2, 3, 6, 7]) / 9
+    start = FreeStart(torch.zeros(0), (), centers, torch.full((4,), 0.03), torch.zeros(4, 3))
+    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
+    times = tuple(k / 9 for k in range(10))
+    scene = DynamicScene(gaussians=cloud(5), seen_at=times, field=field, moving=torch.arange(4))
+    keys = (times[0], times[5], times[9])
+    masks = VisibilityMasks.pack(keys, there_after(scene, keys, 1 / 255))
+    assert masks.seen.sum(0).tolist() == [1, 1, 1, 1, 3]
+    for time in times:
+        drawn = set(masks.active(masks.interval(time)).tolist())
+        assert set(torch.nonzero(scene.at(time).opacities > 1 / 255)[:, 0].tolist()) <= drawn

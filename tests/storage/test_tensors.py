@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 from moving_scene import camera
 from scipy.spatial.transform import Rotation
-from tiny_fields import KINDS, cloud, stirred_field, tiny_options
+from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 
 from dyngs.config import DynamicModel
 from dyngs.deform.scene import DynamicScene
@@ -257,7 +257,7 @@ def read(tensors: dict[str, torch.Tensor], model: DynamicModel) -> DynamicScene:
     return DynamicScene.restored(model, Gaussians(**part_of(full, "gaussians")), part_of(full, "model"))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_the_stored_form_looks_the_same(kind: str) -> None:
     scene, model = moving(kind)
     kept = stored(scene)
@@ -280,7 +280,7 @@ def test_what_moves_is_in_front_and_followed() -> None:
     assert torch.equal(kept[name], scene.state()[name].tensor[came_from])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_training_state_is_left_out(kind: str) -> None:
     scene, _ = moving(kind)
     for_training = {name for name, x in scene.state().items() if x.role is Role.TRAINING}

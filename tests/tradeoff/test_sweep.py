@@ -166,6 +166,17 @@ def test_another_field_moves_the_same(
     assert changed.deform.move_rotations
 
 
+def test_free_primitives_are_tried_and_left(run_dir: Path, tmp_path: Path) -> None:
+    """They have no size and always the same attributes; other fields then have their defaults."""
+    before = load_resolved(run_dir)
+    save_config(before, tmp_path / "config.yaml")
+    free = load_resolved(tmp_path, field_changes(before, Variant(field="free")))
+    assert isinstance(free.model, DynamicModel)
+    assert free.model.deform.kind == "free"
+    assert list(field_changes(free, Variant(field_size=0.5))) == []
+    assert "model.deform.kind=hexplane" in list(field_changes(free, Variant(field="hexplane")))
+
+
 def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns, tmp_path: Path) -> None:
     masked = VariantRuns(runs.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
     assert run_settings(masked.run_dir).mask_times == 3

@@ -35,7 +35,7 @@ from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.extend import told, with_length
 from dyngs.training.trainer import StepReport, Trainer
 
-KINDS = ("default", "mcmc", "control_nodes", "human")
+ALL_KINDS = ("default", "mcmc", "control_nodes", "human")
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def _stop_after(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Trainer, "step", stepping)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALL_KINDS)
 def test_a_finished_run_goes_on_to_the_same_bytes_also_when_it_is_stopped(
     captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:

@@ -21,7 +21,7 @@ class PointsInit(Section):
         description="images of one time step to triangulate points from where the capture has none; 0: do not",
     )
     num_random: int = Field(
-        default=100_000, ge=1, description="number of random points; auto: where there are no others"
+        default=20_000, ge=1, description="number of random points; auto: where there are no others"
     )
     half_extent: Positive = Field(
         default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
@@ -33,7 +33,7 @@ class RandomInit(Section):
 
     kind: Literal["random"] = Field(default="random", description="points drawn uniformly in a cube around the origin")
     num_random: int = Field(
-        default=100_000, ge=1, description="number of random points; auto: where there are no others"
+        default=20_000, ge=1, description="number of random points; auto: where there are no others"
     )
     half_extent: Positive = Field(
         default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"

@@ -9,6 +9,7 @@ from pydantic import Field
 from dyngs.section import Fraction, Positive, Section
 
 _OF_30000 = "of a 30,000-step run, scaled with train.steps"
+_EVERY = "steps between these changes; null: a twentieth of the run, 100 at most"
 
 
 class DefaultStrategy(Section):
@@ -27,7 +28,7 @@ class DefaultStrategy(Section):
     )
     start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
     stop: int = Field(default=15_000, description=f"step {_OF_30000}, from which their number is fixed")
-    every: int = Field(default=100, ge=1, description="steps between these changes; not scaled")
+    every: int | None = Field(default=None, ge=1, description=_EVERY)
     prune_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are removed")
     reset_every: int | None = Field(
         default=3000,
@@ -58,7 +59,7 @@ class McmcStrategy(Section):
     max_gaussians: int = Field(default=300_000, ge=1, description="cap that the number of Gaussians grows to")
     start: int = Field(default=500, description=f"step {_OF_30000}, after which Gaussians are added and removed")
     stop: int = Field(default=25_000, description=f"step {_OF_30000}, from which their number is fixed")
-    every: int = Field(default=100, ge=1, description="steps between these changes; not scaled")
+    every: int | None = Field(default=None, ge=1, description=_EVERY)
     min_opacity: Fraction = Field(default=0.005, description="Gaussians with a lower opacity are relocated")
     noise: float = Field(
         default=5e5, ge=0, description="strength of the noise on positions, times their learning rate; 0: none"
@@ -101,6 +102,12 @@ Strategy = DefaultStrategy | McmcStrategy | FixedStrategy
 class OptimConfig(Section):
     """Adam and the learning rates of Gaussians; defaults of 3DGS."""
 
+    rate_factor: float | None = Field(
+        default=None,
+        gt=0,
+        description="multiplies all rates below, also given ones; 1: exactly these; null: in static scenes those of "
+        "positions by the square root of 30000 / train.steps, all others by its cube root; from 500 to 30000 steps",
+    )
     lr_means: Positive = Field(default=1.6e-4, description="learning rate of positions, times the scene extent")
     lr_means_final: Positive = Field(
         default=1.6e-6, description="the same at the end of the run, reached exponentially"

@@ -43,8 +43,10 @@ def read_depth(path: Path) -> Tensor:
 
 
 def read_labels(path: Path) -> Tensor:
-    """Read a label image as (h, w) bool, true where the label is not 0."""
-    return torch.as_tensor((read_raw(path)[0] != 0).any(-1), device="cpu")
+    """Read a label image as (h, w) int64, 0 = none: the number of a grey image, or one per colour; alpha is ignored."""
+    values = np.nan_to_num(read_raw(path)[0]).clip(0, 65535).astype(np.int64)
+    colours = values[..., : 1 if values.shape[-1] < 3 else 3]
+    return torch.as_tensor(colours @ (1 << 16 * np.arange(colours.shape[-1])), device="cpu")
 
 
 _MAGIC = 202021.25

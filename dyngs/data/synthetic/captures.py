@@ -107,10 +107,10 @@ def write_dynamic_capture(name: SceneName, out: Path, options: DynamicOptions = 
     which a fixed camera in its middle tests. Fixed cameras each take all times: ``camAA/frame_BBBB.png``, frames with
     ``camera``; test and val have one camera each, never trained on.
 
-    ``motion/`` holds a mask for each image, white where something that moves is seen, ``things/`` the same as labels
-    (``render_things``), and ``true_tracks.npz`` the tracks of points on it (``TrueTracks``). Frames of val and test
-    name their mask (``motion_mask_path``), those of train do not: training would take it as a prior. Raises DyngsError:
-    no such scene, no images requested, ``out`` holds something already, or cannot be written.
+    ``things/`` holds labels of what moves for each image (``render_things``), and ``true_tracks.npz`` the tracks of
+    points on it (``TrueTracks``). Frames of val and test name their labels (``instance_mask_path``), those of train do
+    not: training would take them as a prior. Raises DyngsError: no such scene, no images requested, ``out`` holds
+    something already, or cannot be written.
     """
     scene_at(name, 0.0)
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
@@ -147,9 +147,8 @@ def _write_split(
             frame["time"] = shot.time
             things = render_things(scene, shot.world_from_cam, options.size, options.samples)
             write_image(out / "things" / f"{shot.name}.png", things)
-            write_image(out / "motion" / f"{shot.name}.png", (things > 0).astype(np.uint8) * 255)
             if split != "train":
-                frame["motion_mask_path"] = f"./motion/{shot.name}.png"
+                frame["instance_mask_path"] = f"./things/{shot.name}.png"
         frames.append(frame | {"transform_matrix": shot.world_from_cam.tolist()})
     transforms = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")

@@ -144,7 +144,10 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
     for name, points in curves.heads.items():
         has_nodes = curves.pivots is not None  # few, each of which moves many
         own = points if has_nodes else points[order]
-        lists.quantised(f"curve_{name}", _numpy(own.flatten(1)), 16 if has_nodes and name in FINE else 8)
+        if curves.is_steep:
+            lists.exact(f"curve_{name}", _numpy(own.flatten(1)))
+        else:
+            lists.quantised(f"curve_{name}", _numpy(own.flatten(1)), 16 if has_nodes and name in FINE else 8)
     if curves.pivots is not None and curves.followed is not None and curves.fractions is not None:
         lists.exact("pivots", _numpy(curves.pivots))
         lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))

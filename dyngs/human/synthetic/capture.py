@@ -7,7 +7,7 @@ texels per side.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
+from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import new_folder
 from dyngs.files.write import write_image, write_text
@@ -35,6 +36,10 @@ from dyngs.human.template.mesh import Fragments, interpolate, normalized, raster
 
 _RADIUS = 3.5  # radius of the ring of cameras, m
 _TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
+
+POINTS = 600  # on the surface of a person, whose tracks are known
+_SKIN, _SEEN_SIZE = 0.02, 400
+"""A point is seen if the surface in its pixel, of an image of that size, is as near to the camera, up to this, m."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,65 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     return out
 
 
+def write_walking_capture(out: Path, options: HumanOptions = HumanOptions(num_frames=48, num_test=12)) -> Path:
+    """Write images of a walking person in the layout of D-NeRF, each time seen by one camera elsewhere on the ring.
+
+    Files: ``SPLIT/r_III.png`` as of ``write_human_capture``, ``transforms_SPLIT.json`` with ``time`` in [0, 1], and
+    ``true_tracks.npz``. Test images lie midway between training times. Raises DyngsError: options out of range.
+    """
+    if min(options.size, options.samples) < 1 or not 0 < options.num_test < options.num_frames:
+        raise DyngsError("a walking person needs size and samples of at least 1, and more times than test images")
+    body, outfit = default_template(), random_outfit(options.seed, options.usual_clothes)
+    times = np.linspace(0.0, 1.0, 2 * options.num_frames - 1)
+    motion = walk(body, len(times))
+    motion = replace(motion, trans=outfit.size * motion.trans, scale=outfit.size * motion.scale)
+    meshes = list(_posed_meshes(dress_body(body, outfit), motion, paint_texture(body, outfit)))
+    order = np.random.default_rng(options.seed).permutation(options.num_frames)
+    between = 2 * (np.arange(options.num_test) * (options.num_frames - 1) // options.num_test) + 1
+    shots = {
+        "train": [*zip(range(0, len(times), 2), _ring(options.num_frames)[order], strict=True)],
+        "test": [*zip(between.tolist(), _ring_between(options.num_test, options.num_frames), strict=True)],
+    }
+    taken: list[tuple[str, int, np.ndarray]] = []
+    with new_folder(out) as started:
+        for split, own in shots.items():
+            names = [f"{split}/r_{i:03d}" for i in range(len(own))]
+            frames = [
+                _Frame(f"{name}.png", meshes[row], pose, {"time": float(times[row])})
+                for name, (row, pose) in zip(names, own, strict=True)
+            ]
+            _write_frames(started, split, frames, options)
+            taken += [(name, row, pose) for name, (row, pose) in zip(names, own, strict=True)]
+        write_true_tracks(started, _tracks(meshes, times, taken, options))
+    return out
+
+
+def _tracks(
+    meshes: Sequence[PosedMesh], times: np.ndarray, taken: Sequence[tuple[str, int, np.ndarray]], options: HumanOptions
+) -> TrueTracks:
+    """Return the tracks of points of the surface; ``taken``: name, row of ``times`` and (4, 4) pose of each view."""
+    make, first = np.random.default_rng(options.seed), meshes[0].vertices[meshes[0].faces]
+    areas = np.linalg.norm(np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0]), axis=1)
+    faces = meshes[0].faces[make.choice(len(areas), POINTS, p=areas / areas.sum())]
+    corners = make.dirichlet(np.ones(3), POINTS)
+    points = np.stack([interpolate(corners, mesh.vertices[faces]) for mesh in meshes])
+    visible = [_seen(meshes[row], points[row], pose) for _, row, pose in taken]
+    names, rows = np.array([name for name, *_ in taken]), np.array([row for _, row, _ in taken], np.int64)
+    return TrueTracks(points.astype(np.float32), times, names, rows, np.stack(visible))
+
+
+def _seen(mesh: PosedMesh, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
+    """Return (P,) bool: points (P, 3) in the image to which nothing of the mesh is nearer than ``_SKIN``."""
+    image, size = _image_of(mesh.vertices, world_from_cam, _SEEN_SIZE), _SEEN_SIZE
+    surface, near = rasterize(image[mesh.faces], size, size), np.full(size * size, -np.inf)
+    corners = 1.0 / image[mesh.faces[surface.faces], 2:]
+    near[surface.index] = interpolate(surface.barycentric, corners)[:, 0]
+    x, y, inverse = _image_of(points, world_from_cam, size).T
+    inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
+    index = np.where(inside, y.astype(int) * size + x.astype(int), 0)
+    return inside & (1.0 / inverse < near[index] + _SKIN)
+
+
 def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
     """Return the template in a random shape, and its shape parameters (B,)."""
     body = default_template()
@@ -150,12 +214,7 @@ def render_mesh(
     (4, 4) is an OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X`` across. Raises ValueError: the mesh reaches
     behind it.
     """
-    rotation, center = world_from_cam[:3, :3], world_from_cam[:3, 3]
-    x, up, back = ((mesh.vertices - center) @ rotation).T
-    if not (back < 0).all():
-        raise ValueError("all vertices must be in front of the camera")
-    focal = _focal(size)
-    image = np.stack([0.5 * size - focal * x / back, 0.5 * size + focal * up / back, -1.0 / back], axis=-1)
+    image = _image_of(mesh.vertices, world_from_cam, size)
     normals = vertex_normals(mesh.vertices, mesh.faces)
     sums = np.zeros((size * size, 4))
     for k in range(samples * samples):
@@ -167,21 +226,51 @@ def render_mesh(
     return np.concatenate([rgb, sums[:, 3:] / samples**2], axis=1).reshape(size, size, 4)
 
 
+def _image_of(points: np.ndarray, world_from_cam: np.ndarray, size: int) -> np.ndarray:
+    """Return column, row and inverse depth (P, 3) of ``points`` (P, 3). Raises ValueError: one lies behind."""
+    x, up, back = ((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
+    if not (back < 0).all():
+        raise ValueError("all vertices must be in front of the camera")
+    focal = _focal(size)
+    return np.stack([0.5 * size - focal * x / back, 0.5 * size + focal * up / back, -1.0 / back], axis=-1)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """An image to render: its path below the root, what it shows, the OpenGL pose, and further keys of its entry."""
+
+    name: str
+    mesh: PosedMesh
+    world_from_cam: np.ndarray
+    keys: dict[str, object]
+
+
 def _write_split(
     out: Path, split: str, meshes: list[PosedMesh], cameras: dict[int, np.ndarray], options: HumanOptions
 ) -> None:
-    if not cameras:
-        return
-    frames, light = [], random_light(options.light_seed)
-    for i, mesh in enumerate(meshes):
-        for camera, pose in cameras.items():
-            name = f"images/{split}/f{i:03d}_c{camera:02d}.png"
-            write_image(out / name, render_mesh(mesh, pose, options.size, options.samples, light))
-            entry: dict[str, object] = {"file_path": name, "frame": i, "camera": camera}
-            frames.append(entry | {"time": i / max(len(meshes) - 1, 1), "transform_matrix": pose.tolist()})
+    frames = [
+        _Frame(
+            f"images/{split}/f{i:03d}_c{camera:02d}.png",
+            mesh,
+            pose,
+            {"frame": i, "camera": camera, "time": i / max(len(meshes) - 1, 1)},
+        )
+        for i, mesh in enumerate(meshes)
+        for camera, pose in cameras.items()
+    ]
+    if frames:
+        _write_frames(out, split, frames, options)
+
+
+def _write_frames(out: Path, split: str, frames: Sequence[_Frame], options: HumanOptions) -> None:
+    entries, light = [], random_light(options.light_seed)
+    for frame in frames:
+        image = render_mesh(frame.mesh, frame.world_from_cam, options.size, options.samples, light)
+        write_image(out / frame.name, image)
+        entries.append({"file_path": frame.name, **frame.keys, "transform_matrix": frame.world_from_cam.tolist()})
     size, focal = options.size, _focal(options.size)
     lens = {"w": size, "h": size, "fl_x": focal, "fl_y": focal, "cx": 0.5 * size, "cy": 0.5 * size}
-    write_text(out / f"transforms_{split}.json", json.dumps(lens | {"frames": frames}, indent=1) + "\n")
+    write_text(out / f"transforms_{split}.json", json.dumps(lens | {"frames": entries}, indent=1) + "\n")
 
 
 def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:

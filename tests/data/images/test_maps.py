@@ -47,7 +47,17 @@ def test_floats_are_taken_as_they_are(tmp_path: Path, ending: str) -> None:
 
 def test_labels_of_sixteen_bits_are_not_rounded_away(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", np.array([[[0], [1], [300]]], np.uint16))
-    assert read_labels(tmp_path / "a.png").tolist() == [[False, True, True]]
+    assert read_labels(tmp_path / "a.png").tolist() == [[0, 1, 300]]
+
+
+def test_each_colour_of_a_label_image_is_a_label_and_alpha_is_none(tmp_path: Path) -> None:
+    colours = np.array([[[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 0, 0]]], np.uint8)
+    for image in (colours, np.pad(colours, ((0, 0), (0, 0), (0, 1)), constant_values=255)):
+        write_image(tmp_path / "a.png", image)
+        (labels,) = read_labels(tmp_path / "a.png").tolist()
+        assert labels[0] == 0
+        assert labels[1] == labels[4]
+        assert len(set(labels)) == 4
 
 
 @pytest.mark.parametrize("shape", [(4,), (0, 3), (2, 2, 2, 2)])

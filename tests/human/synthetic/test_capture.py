@@ -22,16 +22,19 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import cam_from_opengl
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
+from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.human.motion.motion import Motion
 from dyngs.human.motion.retarget import read_motion
 from dyngs.human.synthetic.capture import (
+    POINTS,
     HumanOptions,
     PosedMesh,
     random_light,
     render_mesh,
     varied,
     write_human_capture,
+    write_walking_capture,
 )
 from dyngs.human.synthetic.clips import squat, walk
 from dyngs.human.synthetic.clothes import dress_body, paint_texture, random_outfit
@@ -367,3 +370,30 @@ def test_a_used_folder_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="exists already"):
         write_human_capture(tmp_path, TINY)
     assert list(files(tmp_path)) == ["mine.txt"]
+
+
+# --- a walk in the layout of D-NeRF ---------------------------------------------------------------------------------
+
+
+def test_a_walk_is_seen_once_per_time_and_its_true_tracks_lie_on_the_person(tmp_path: Path) -> None:
+    options = HumanOptions(size=48, num_frames=5, num_test=2, samples=1)
+    capture = captured(write_walking_capture(tmp_path / "out", options))
+    train, test = capture.splits["train"], capture.splits["test"]
+    assert [view.time for view in train] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert [view.time for view in test] == [0.125, 0.625]
+    assert len({view.cam_from_world.tobytes() for view in (*train, *test)}) == 7
+    tracks = read_true_tracks(capture.root, np.zeros(3))
+    assert tracks is not None
+    assert tracks.points.shape == (9, POINTS, 3)
+    for view in (*train, *test):
+        row = tracks.views.tolist().index(view.name)
+        seen = tracks.visible[row]
+        assert 0.2 < seen.mean() < 0.7, "one side of the person is seen"
+        columns, rows = seen_at(view, tracks.points[tracks.moments[row]][seen]).T.astype(int)
+        covered = np.pad(pixels(view.image_path)[..., 3], 1)
+        around = np.max([covered[rows + i, columns + j] for i in range(3) for j in range(3)], axis=0)
+        assert (around > 0).mean() > 0.97, "fingers are thinner than pixels, whose centres are sampled"
+    moved = np.linalg.norm(np.diff(tracks.points, axis=0), axis=-1)
+    assert moved.max() > 0.05
+    with pytest.raises(DyngsError, match="more times than test images"):
+        write_walking_capture(tmp_path / "none", replace(options, num_frames=2))
