@@ -74,7 +74,7 @@ class Bodies:
         }
         centers = np.stack([body.path.centers[len(self.shots) // 2] for body in self.bodies])
         counts = [len(seeds) for seeds in self.seeds]
-        labels = torch.repeat_interleave(torch.tensor([others.setup.num_moving - sum(counts), *counts]))
+        labels = torch.repeat_interleave(torch.tensor([others.setup.num_moving - sum(counts), *counts], device="cpu"))
         device = others.setup.center.device
         points = {name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()}
         rest = BodyRest(torch.from_numpy(centers).float().to(device), (labels - 1).to(device))

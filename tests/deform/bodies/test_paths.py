@@ -29,7 +29,7 @@ def test_nothing_is_found_where_nothing_moves() -> None:
 
 def test_a_disc_stands_out_most_at_its_own_size() -> None:
     rows, columns = np.mgrid[:60, :60] + 0.5
-    discs = Discs(np.float32(np.hypot(rows - 30, columns - 24) < 8)[None])
+    discs = Discs((np.hypot(rows - 30, columns - 24) < 8).astype(np.float32)[None])
     x, y, radius = discs.peaks(0)[0]
     assert (x, y) == pytest.approx((24, 30), abs=1)
     assert radius == pytest.approx(8, rel=0.25)
