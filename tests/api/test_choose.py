@@ -15,7 +15,7 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, explained_pixels, write_choices
+from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
 from dyngs.camera import Cameras
 from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
 from dyngs.config.io import load_config, packaged_preset
@@ -90,24 +90,33 @@ def test_what_was_requested_is_not_questioned(moving: Path, monkeypatch: pytest.
     assert decided(preset(moving, "model.choose=false"))[1] == []
 
 
-def test_free_primitives_are_used_before_fixed_cameras_unless_nodes_win(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("cameras", "first"), [(3, "control_nodes"), (6, "free")])
+def test_before_fixed_cameras_free_primitives_and_nodes_are_compared(
+    cameras: int, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With images that grow early, also where nothing can be asked; what was requested is used, whatever it is."""
-    root = write_dynamic_capture(
-        "room", tmp_path / "room", DynamicOptions(size=24, num_times=8, num_cameras=3, samples=1)
-    )
-    for nodes_win in (True, False):
-        tried = scored(
-            monkeypatch, lambda c, sign=2 * nodes_win - 1: 20.0 + sign * (c.model.deform.kind == "control_nodes")
-        )
+    """Before many the former come first; their images grow early, also where nothing can be asked."""
+    options = DynamicOptions(size=24, num_times=8, num_cameras=cameras, samples=1)
+    root = write_dynamic_capture("room", tmp_path / "room", options)
+
+    def kind_of(config: Config) -> str:
+        assert isinstance(config.model, DynamicModel)
+        kind = config.model.deform.kind
+        assert config.train.resolution_grows_from == (0.3 if kind == "free" else 0.6)
+        assert kind == "free" or config.model.deform == preset(root).model.deform  # type: ignore[union-attr]
+        return kind
+
+    for winner in ("control_nodes", "free"):
+        tried = scored(monkeypatch, lambda c, winner=winner: 20.0 + 2 * (c.model.deform.kind == winner))
         best, found = decided(preset(root, LONG))
-        assert isinstance(best.model, DynamicModel)
-        assert found[0].setting == "model.deform.kind=control_nodes"
-        assert best.model.deform.kind == ("control_nodes" if nodes_win else "free")
-        assert best.train.resolution_grows_from == (0.6 if nodes_win else 0.3)
-        assert tried[0].model.deform.kind == "free"  # type: ignore[union-attr]
-        assert best.model.deform.model_dump() == preset(root).model.deform.model_dump() or not nodes_win  # type: ignore[union-attr]
+        assert kind_of(tried[0]) == first
+        assert found[0].setting == f"model.deform.kind={({'control_nodes', 'free'} - {first}).pop()}"
+        assert found[0].taken == (winner != first)
+        assert kind_of(best) == winner
+    assert kind_of(decided(preset(root, "train.steps=400"))[0]) == first
+
+
+def test_what_is_requested_for_what_moves_is_used(tmp_path: Path) -> None:
+    root = write_dynamic_capture("room", tmp_path / "room", DynamicOptions(size=24, num_times=8, samples=1))
     short, _ = decided(preset(root, "train.steps=400", "train.resolution_grows_from=0.2"))
     assert isinstance(short.model, DynamicModel)
     assert (short.model.deform.kind, short.train.resolution_grows_from) == ("free", 0.2)
@@ -186,17 +195,6 @@ def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
     for count in (24, 48, 100, 1000):
         (held_out,) = module._held_out(views(count))
         assert 8 <= len(held_out) <= count / 3
-
-
-def test_half_is_explained_and_neither_image_is_favoured() -> None:
-    truth = torch.zeros(10, 10, 3)
-    one, other = truth.clone(), truth.clone()
-    one[:5], other[5:] = 1.0, 1.0
-    one[0], other[0] = 1.0, 1.0
-    counts = explained_pixels(one, other, truth, None)
-    assert torch.equal(counts, explained_pixels(other, one, truth, None))
-    assert counts[1:].all()
-    assert not torch.equal(counts, torch.ones_like(counts)) or bool(counts[0].all())
 
 
 def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> None:

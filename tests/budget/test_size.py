@@ -10,7 +10,7 @@ import torch
 
 from dyngs.api.train import train
 from dyngs.budget.size import write_within
-from dyngs.config import BudgetConfig, Config, DataConfig, RandomInit, RunConfig, StaticModel, TrainConfig
+from dyngs.config import BudgetConfig, Config, DataConfig, OptimConfig, RandomInit, RunConfig, StaticModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.errors import DyngsError
@@ -35,6 +35,7 @@ def config_of(capture: Path, run_dir: Path, budget: BudgetConfig) -> Config:
         data=DataConfig(root=capture),
         model=StaticModel(sh_degree=1),
         init=RandomInit(num_random=500),
+        optim=OptimConfig(rate_factor=1),
         train=TrainConfig(steps=12, log_every=4),
         budget=budget,
         run=RunConfig(dir=run_dir, threads=1),
