@@ -19,6 +19,7 @@ from dyngs.gaussians import Gaussians
 
 AGREES, BY_CHANCE = 0.85, 0.55
 """Disagreement of a body's colours, as a fraction of that if it did not turn, and of that of any of its colours."""
+LEAST_MARKS = 0.04  # Disagreement of any of its colours below which these say nothing about how it turns
 INNER, LOGIT, SCALE = 0.7, 0.0, 0.6
 """Of the Gaussians that begin on a body: least distance from its centre in radii, opacity, and size in distances."""
 MARKED, LEFT = 0.35, 0.3
@@ -95,6 +96,8 @@ def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
 
 
 def _is_rigid(turning: Turning) -> bool:
+    if turning.by_chance < LEAST_MARKS:
+        return False
     return turning.disagreement < min(AGREES * turning.standing, BY_CHANCE * turning.by_chance)
 
 
