@@ -21,10 +21,9 @@ from dyngs.config import ControlNodesField
 from dyngs.deform.decoder import head_sizes
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
-from dyngs.deform.spline_fit import SPAN, cubic_fractions, refitted
+from dyngs.deform.spline_fit import SPAN, refitted, spline_values
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.ops.device import sent
 from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
@@ -159,10 +158,7 @@ class ControlNodes(DeformationField):
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
     def at(self, time: float) -> Offsets:
-        place = min(max(time, 0.0), 1.0) * self.num_pieces
-        piece = min(int(place), self.num_pieces - 1)
-        fractions = sent(cubic_fractions(place - piece)[:, None], self.setup.center.device)
-        parts = {n: (fractions * x[:, piece : piece + SPAN]).sum(1) for n, x in self._splines().items()}
+        parts = {name: spline_values(x, time) for name, x in self._splines().items()}
         if "logit_opacities" in parts:
             parts["logit_opacities"] = parts["logit_opacities"][:, 0]
         return Offsets(**parts)

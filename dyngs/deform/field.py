@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
+from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, quat_product
 from dyngs.ops.skinning import add_offsets_
 from dyngs.state import State, moved_to, part_of, prefixed
@@ -70,6 +71,15 @@ class DeformationField:
     def num_values(self) -> int:
         """Number of values that the field stores."""
         return self.parameters.num_values
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        """All that receives gradients."""
+        return self.parameters.leaves
+
+    def step(self, step: int, progress: float) -> Count:
+        """Update all that is optimised; see ``Parameters.step``."""
+        return self.parameters.step(step, progress)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """Return the offsets at ``time`` in [0, 1] of the moving Gaussians with canonical ``means`` (M, 3), in order.

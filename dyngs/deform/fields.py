@@ -9,12 +9,13 @@ from torch import Tensor
 from typing_extensions import assert_never
 
 from dyngs.config import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
+from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
-from dyngs.state import Role, State, with_role
+from dyngs.state import Role, State, part_of, with_role
 from dyngs.tensor_checks import require_positive, require_tensor
 
 
@@ -45,4 +46,6 @@ def restored_field(options: DeformField, tensors: Mapping[str, Tensor], num_movi
     num_times, extent = require_positive("numbers", require_tensor("numbers", tensors["numbers"], (2,), None)).tolist()
     center, half_size = require_tensor("box", tensors["box"], (2, 3))
     setup = FieldSetup(center, require_positive("box", half_size), int(num_times), num_moving, extent)
-    return new_field(options, setup, torch.Generator()).restored(tensors)
+    field = new_field(options, setup, torch.Generator()).restored(tensors)
+    bodies = part_of(tensors, "bodies")
+    return BodyField.stored(field, bodies) if bodies else field

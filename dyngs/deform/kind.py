@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from dyngs.config import DynamicModel
 from dyngs.data.times import evenly_spaced
+from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
@@ -68,6 +69,10 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
         return [footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used]
 
+    def shots(still: Gaussians) -> Shots | None:
+        order = one_camera(views)
+        return None if order is None else shots_of((images[i] for i in order), still, options, background)
+
     return TrainingViews(
         training_times(capture),
         training_cameras(views, config.data),
@@ -75,5 +80,6 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         errors_of,
         cameras_stay=bool(in_place),
         standing=standing,
+        shots=shots,
         options=options,
     )

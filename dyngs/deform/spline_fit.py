@@ -10,6 +10,8 @@ import math
 import torch
 from torch import Tensor
 
+from dyngs.ops.device import sent
+
 SPAN = 4  # Control points that a value depends on
 _SAMPLES_PER_PIECE = 8  # Places per piece at which two splines are compared; a cubic is determined by four
 
@@ -50,3 +52,12 @@ def cubic_fractions(place: float) -> Tensor:
     rest = 1 - place
     middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]
     return torch.tensor([rest**3 / 6, *middle, place**3 / 6], device="cpu")
+
+
+def spline_values(points: Tensor, time: float) -> Tensor:
+    """Return (S, D) values at ``time`` in [0, 1] of the uniform cubic B-splines with control ``points`` (S, P, D)."""
+    pieces = points.shape[1] - SPAN + 1
+    place = min(max(time, 0.0), 1.0) * pieces
+    piece = min(int(place), pieces - 1)
+    fractions = sent(cubic_fractions(place - piece)[:, None], points.device)
+    return (fractions * points[:, piece : piece + SPAN]).sum(1)

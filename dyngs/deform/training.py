@@ -16,6 +16,8 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.config import DynamicModel, FreeField
 from dyngs.data.loader import Image
+from dyngs.deform.bodies.shots import Shots
+from dyngs.deform.bodies.start import Bodies, found_bodies
 from dyngs.deform.field import FieldSetup, Offsets, deformed
 from dyngs.deform.fields import new_field
 from dyngs.deform.fixed_cameras.changes import Footage
@@ -29,11 +31,11 @@ from dyngs.deform.time_window import TimeWindow
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
-from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.ops.adam import Count
+from dyngs.state import Role, State, with_role
 
 SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25
@@ -65,6 +67,8 @@ class TrainingViews:
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False  # in place, so that images show what is still exactly alike
     standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
+    # what one moving camera shows, against N Gaussians that stand still; None where there is no such camera
+    shots: Callable[[Gaussians], Shots | None] = lambda _: None
     options: RenderOptions = field(default_factory=RenderOptions)  # how training images are drawn
 
 
@@ -83,9 +87,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
         self.times = tuple(sorted(set(capture.times)))
-        first = 1.0 if isinstance(options.deform, FreeField) else options.time_window
-        phases = schedule.fine, schedule.opens, schedule.full
-        self._window = TimeWindow.around_middle(capture.times, first, *phases)
+        self._see_all(False)
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
@@ -113,13 +115,13 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if scene.field is None:
             return 0
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
-        return scene.field.parameters.step(step - self.schedule.fine, progress)
+        return scene.field.step(step - self.schedule.fine, progress)
 
     def resting(self, scene: DynamicScene) -> Tensor | None:
         return scene.moving if scene.field is not None and scene.field.momentary else None
 
-    def learned(self, scene: DynamicScene) -> Parameters | None:
-        return None if scene.field is None else scene.field.parameters
+    def leaves(self, scene: DynamicScene) -> list[Tensor]:
+        return [] if scene.field is None else scene.field.leaves
 
     def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
         if self._update.is_due(step, edited):
@@ -144,8 +146,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         first = self._first_motion(now.detach())
         if not errs and not first.moments:
             return None
-        added, start = self._begun(now.detach(), rows, first)
-        result = replace(with_gaussians(now.detach(), added), finding=first.finding)
+        bodies = self._first_bodies(now.detach())
+        added, start = self._begun(now.detach(), rows, first, bodies)
+        finding = first.finding if bodies is None else bodies.finding
+        result = replace(with_gaussians(now.detach(), added), finding=finding)
         if start is not None:
             result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
         gaussians = Gaussians(**result.changes)
@@ -155,6 +159,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         field = new_field(self.options.deform, setup, self._generator)
         if isinstance(field, FreePrimitives) and start is not None:
             field = field.started(start)
+        if bodies is not None:
+            field = bodies.within(field)
+            self._see_all(bodies.explain_all)
         std = self._update.of(gaussians)
         field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
@@ -168,14 +175,31 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return replace(scene, moving=torch.arange(count, device=means.device), field=field)
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
+        self._see_all("all_times" in tensors)
         return DynamicScene.restored(self.options, gaussians, tensors)
 
-    def _begun(self, now: Gaussians, rows: Tensor, first: FirstMotion) -> tuple[Sequence[Gaussians], FreeStart | None]:
+    def state(self) -> State:
+        return with_role({"all_times": torch.ones(1, device="cpu")}, Role.TRAINING) if self._sees_all else {}
+
+    def _see_all(self, at_once: bool) -> None:
+        """Train on all times from the first if ``at_once``: nothing need be followed outwards."""
+        first = 1.0 if at_once or isinstance(self.options.deform, FreeField) else self.options.time_window
+        phases = self.schedule.fine, self.schedule.opens, self.schedule.full
+        self._sees_all, self._window = at_once, TimeWindow.around_middle(self.capture.times, first, *phases)
+
+    def _first_bodies(self, still: Gaussians) -> Bodies | None:
+        """Return what moves rigidly before one moving camera."""
+        shots = None if isinstance(self.options.deform, FreeField) else self.capture.shots(still)
+        return None if shots is None else found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
+
+    def _begun(
+        self, now: Gaussians, rows: Tensor, first: FirstMotion, bodies: Bodies | None
+    ) -> tuple[Sequence[Gaussians], FreeStart | None]:
         """Return the Gaussians to add when motion begins, and the windows of all that move where these have some."""
-        count = 0 if first.moments else self.options.num_random_moving
+        count = 0 if first.moments or (bodies and bodies.explain_all) else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
         if not isinstance(self.options.deform, FreeField):
-            return [added], None
+            return [added, *(bodies.seeds if bodies else ())], None
         start = free_start(now.select(rows).to(device="cpu"), first.moments, added.to(device="cpu"), len(self.times))
         return start.added, start
 

@@ -19,7 +19,6 @@ from dyngs.gaussians.colour.view_dependence import MeasuredView
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.order import morton_order
-from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rates_of
@@ -60,8 +59,9 @@ class SceneTraining(Generic[S]):
         """Update, in place, what the scene learns; return the number of rows left out for bad gradients."""
         return 0
 
-    def learned(self, scene: S) -> Parameters | None:
-        return None
+    def leaves(self, scene: S) -> Sequence[Tensor]:
+        """Return what the scene learns next to the Gaussians and their colours."""
+        return ()
 
     def resting(self, scene: S) -> Tensor | None:
         """Return the indices of the Gaussians that stay as they are in steps that do not show them; None: of none."""
@@ -153,9 +153,8 @@ class GaussianModel(Model[GaussianScene]):
     @property
     def leaves(self) -> Sequence[Tensor]:
         found = [*self._optimizer.parameters.tensors().values()]
-        for learned in (self.colours.learned, self.training.learned(self._scene)):
-            found += [] if learned is None else learned.leaves
-        return found
+        found += [] if self.colours.learned is None else self.colours.learned.leaves
+        return [*found, *self.training.leaves(self._scene)]
 
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
         scene, densifier = self._scene, self.densifier

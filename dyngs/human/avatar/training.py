@@ -15,7 +15,6 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
-from dyngs.gaussians.parameters import Parameters
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
@@ -97,9 +96,9 @@ class HumanTraining(SceneTraining[HumanScene]):
                 scene.learned[name].grad = None
         return scene.learned.step(step - self.refines_from, progress)
 
-    def learned(self, scene: HumanScene) -> Parameters:
+    def leaves(self, scene: HumanScene) -> list[Tensor]:
         """Return the corrections."""
-        return scene.learned
+        return scene.learned.leaves
 
     def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene as it is, and after the last step new values for what the images hardly show."""

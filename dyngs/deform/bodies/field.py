@@ -1,0 +1,122 @@
+"""Rigid bodies that move along splines, within another field: the smallest motion that explains what turns.
+
+Local letters: M moving Gaussians, B bodies, P control points.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dyngs.deform.field import DeformationField, Offsets, chosen
+from dyngs.deform.spline_fit import SPAN, spline_values
+from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.parameters import Parameters
+from dyngs.ops.adam import Count
+from dyngs.ops.quaternions import identity_quat, rotate
+from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
+from dyngs.tensor_checks import require_indices, require_tensor
+
+RATES = {"places": 3e-4, "quats": 3e-3}
+"""Learning rates of the bodies' splines; that of places times the scene extent."""
+LR_DECAY = 0.05
+
+
+@dataclass(frozen=True)
+class BodyRest:
+    """Where bodies lie when they are at rest, and which Gaussians are theirs."""
+
+    centers: Tensor  # (B, 3)
+    labels: Tensor  # (M,) body of each Gaussian, -1 for none
+
+
+class BodyField(DeformationField):
+    """The offsets of ``others``, but for the Gaussians of bodies: these move rigidly, and take colours alone from it.
+
+    A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of the place p and of
+    the quaternion of R; the Gaussians turn with it.
+    """
+
+    def __init__(self, others: DeformationField, rest: BodyRest, splines: Mapping[str, Tensor]) -> None:
+        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies' ``splines``."""
+        self.setup, self.others, self.rest = others.setup, others, rest
+        rates = RATES | {"places": RATES["places"] * self.setup.extent}
+        self.parameters = Parameters(splines, rates, LR_DECAY)
+
+    @property
+    def num_values(self) -> int:
+        return self.parameters.num_values + sum(x.numel() for x in vars(self.rest).values()) + self.others.num_values
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        return [*self.parameters.leaves, *self.others.leaves]
+
+    def step(self, step: int, progress: float) -> Count:
+        return self.parameters.step(step, progress) + self.others.step(step, progress)
+
+    def poses(self, time: float) -> tuple[Tensor, Tensor]:
+        """Return (B, 3) places of the bodies' centres and (B, 4) quaternions, of any length."""
+        return spline_values(self.parameters["places"], time), spline_values(self.parameters["quats"], time)
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        found = self.others.offsets(means, time, rows)
+        labels, means = chosen(self.rest.labels, rows), chosen(means, rows)
+        own = torch.nonzero(labels >= 0)[:, 0]
+        body = labels[own]
+        places, quats = (x.index_select(0, body) for x in self.poses(time))
+        arms = means[own] - self.rest.centers[body]
+        quats = torch.nn.functional.normalize(quats, dim=1)
+        moved = rotate(quats, arms) + places - means[own]
+        turned = found.quats if found.quats is not None else means.new_zeros(len(means), 4)
+        scales = found.log_scales
+        return Offsets(
+            found.means.index_copy(0, own, moved),
+            turned.index_copy(0, own, quats - identity_quat(quats)),
+            None if scales is None else scales.index_fill(0, own, 0.0),
+            found.logit_opacities,
+            found.colors,
+        )
+
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        return self.others.penalties(time)
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        self.others.extend(seen, soon)
+
+    def regroup(self) -> None:
+        self.others.regroup()
+
+    def edited(self, edit: TopologyEdit) -> BodyField:
+        field = copy.copy(self)
+        field.others = self.others.edited(edit)
+        field.rest = replace(self.rest, labels=self.rest.labels[edit.source])
+        return field
+
+    def state(self) -> State:
+        rest = {name: StateTensor(x, Role.SHARED) for name, x in vars(self.rest).items()}
+        rest["labels"] = StateTensor(self.rest.labels, Role.PER_MOVING)
+        return self.others.state() | prefixed("bodies", rest | super().state())
+
+    @staticmethod
+    def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
+        """Return the field of a state within the restored ``others``; raises as ``restored``."""
+        centers = require_tensor("centers", tensors["centers"], (None, 3))
+        labels = require_tensor("labels", tensors["labels"], (others.setup.num_moving,), torch.long)
+        require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
+        learned = part_of(tensors, "learned")
+        points = learned["places"].shape[1] if learned["places"].ndim == 3 else 0
+        if points < SPAN:
+            raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
+        like = {name: centers.new_zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
+        field = BodyField(others, BodyRest(centers, labels), like)
+        field.parameters = field.parameters.restored(learned)
+        return field
+
+    def to(self, device: torch.device | str) -> BodyField:
+        field = super().to(device)
+        field.others, field.rest = self.others.to(device), fields_moved_to(self.rest, device)
+        return field

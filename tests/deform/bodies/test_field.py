@@ -1,0 +1,117 @@
+"""Bodies within another field: they move rigidly, all else as it did, and nothing is lost when they are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tiny_fields import TIMES, cloud, stirred_field, tiny_options
+from torch import Tensor
+
+from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.field import deformed
+from dyngs.deform.fields import field_state, restored_field
+from dyngs.gaussians import TopologyEdit
+from dyngs.state import tensors_of
+
+CENTERS = torch.tensor([[0.2, -0.1, 0.3], [-0.4, 0.0, 0.1]])
+LABELS = torch.tensor([-1, 0, 0, 1, -1, 1, 0, -1, 1])
+
+
+def field_of(kind: str = "control_nodes", points: int = 7) -> BodyField:
+    generator = torch.Generator().manual_seed(0)
+    places = CENTERS[:, None] + 0.3 * torch.randn(2, points, 3, generator=generator)
+    quats = torch.tensor([1.0, 0, 0, 0]) + 0.5 * torch.randn(2, points, 4, generator=generator)
+    rest = BodyRest(CENTERS, LABELS)
+    return BodyField(stirred_field(kind), rest, {"places": places, "quats": quats})
+
+
+@pytest.mark.parametrize("kind", ["control_nodes", "hexplane"])
+def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
+    """x' = R (x - c) + p in float64; the Gaussians turn with their body, and keep their size."""
+    field, gaussians = field_of(kind), cloud()
+    for time in TIMES:
+        places, quats = (x.detach().double().numpy() for x in field.poses(time))
+        turns = Rotation.from_quat(quats[:, [1, 2, 3, 0]])
+        offsets, alone = field.offsets(gaussians.means, time), field.others.offsets(gaussians.means, time)
+        moved = deformed(gaussians, offsets).detach()
+        for body in range(2):
+            own = torch.tensor([i for i, label in enumerate(LABELS.tolist()) if label == body])
+            arms = (gaussians.means[own] - CENTERS[body]).double().numpy()
+            expected = turns[body].apply(arms) + places[body]
+            np.testing.assert_allclose(moved.means[own].numpy(), expected, atol=2e-6)
+            before, after = (
+                Rotation.from_quat(x[own].double().numpy()[:, [1, 2, 3, 0]]) for x in (gaussians.quats, moved.quats)
+            )
+            assert (after * (turns[body] * before).inv()).magnitude().max() < 1e-5
+            assert torch.equal(moved.log_scales[own], gaussians.log_scales[own])
+        rest = torch.nonzero(LABELS < 0)[:, 0]
+        for name, x in vars(offsets).items():
+            assert torch.equal(x[rest], getattr(alone, name)[rest]), name
+        assert offsets.colors is not None
+        assert alone.colors is not None
+        assert torch.equal(offsets.colors, alone.colors)
+
+
+def test_rows_alone_are_computed_alike() -> None:
+    field, means, rows = field_of(), cloud().means, torch.tensor([8, 0, 3])
+    some, every = field.offsets(means, 0.37, rows), field.offsets(means, 0.37).select(rows)
+    for name, x in vars(some).items():
+        torch.testing.assert_close(x, getattr(every, name), rtol=0, atol=1e-6)
+
+
+def test_gradients_reach_the_motion_and_the_gaussians() -> None:
+    field, means = field_of(), cloud().means.requires_grad_()
+    out = field.offsets(means, 0.37)
+    assert out.quats is not None
+    (out.means.square().sum() + out.quats.sum() + sum(field.penalties(0.37).values())).backward()
+    assert all(x.grad is not None and bool(x.grad.any()) for x in field.parameters.leaves)
+    assert means.grad is not None
+    assert len(field.leaves) == len(field.parameters.leaves) + len(field.others.leaves)
+    before = [x.detach().clone() for x in field.leaves]
+    field.step(1, 0.0)
+    assert sum(not torch.equal(x, y) for x, y in zip(field.leaves, before, strict=True)) >= 3
+
+
+def test_what_is_born_belongs_to_its_parents_body() -> None:
+    edited = field_of().edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
+    assert edited.rest.labels.tolist() == [1, 1, -1]
+
+
+def stored(field: BodyField) -> dict[str, Tensor]:
+    return {name: x.clone() for name, x in tensors_of(field_state(field)).items()}
+
+
+def test_a_stored_field_is_the_same_field() -> None:
+    field, means = field_of(), cloud().means
+    again = restored_field(tiny_options("control_nodes"), stored(field), 9)
+    assert isinstance(again, BodyField)
+    assert stored(again).keys() == stored(field).keys()
+    for name, x in stored(again).items():
+        assert torch.equal(x, stored(field)[name]), name
+    assert torch.equal(again.offsets(means, 0.37).means, field.offsets(means, 0.37).means)
+    assert again.num_values == field.num_values
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("bodies.labels", lambda x: x + 1),
+        ("bodies.labels", lambda x: x[1:]),
+        ("bodies.centers", lambda x: x[:1]),
+        ("bodies.learned.places", lambda x: x[:, :3]),
+        ("bodies.learned.quats", lambda x: x[:, 1:]),
+        ("bodies.learned.quats", lambda x: x * float("nan")),
+        ("bodies.learned.places", lambda _: None),
+    ],
+)
+def test_a_forged_state_is_refused(name: str, change: Callable[[Tensor], Tensor | None]) -> None:
+    tensors = stored(field_of())
+    forged = change(tensors.pop(name))
+    if forged is not None:
+        tensors[name] = forged
+    with pytest.raises((KeyError, ValueError)):
+        restored_field(tiny_options("control_nodes"), tensors, 9)

@@ -1,0 +1,38 @@
+"""Paths of what moves before one moving camera: a ball is found where it is, and nothing where nothing moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rolling_ball import rolling
+
+from dyngs.deform.bodies.paths import Discs, found_paths
+
+
+def test_a_ball_is_found_at_all_times() -> None:
+    shots, centers, _ = rolling()
+    (path,) = found_paths(shots)
+    assert np.linalg.norm(path.centers - centers, axis=1).max() < 0.25 * 0.28
+    assert path.radius == pytest.approx(0.28, rel=0.1)
+
+
+def test_nothing_is_found_where_nothing_moves() -> None:
+    """Noise is no thing; nor are three images enough to follow anything."""
+    shots, _, _ = rolling()
+    noise = np.random.default_rng(0).normal(0, 0.03, shots.still.shape).astype(np.float32)
+    assert found_paths(replace(shots, images=shots.still + noise)) == []
+    few = {name: x[:3] for name, x in vars(shots).items() if name != "centers"}
+    assert found_paths(replace(shots, **few)) == []
+
+
+def test_a_disc_stands_out_most_at_its_own_size() -> None:
+    rows, columns = np.mgrid[:60, :60] + 0.5
+    discs = Discs((np.hypot(rows - 30, columns - 24) < 8).astype(np.float32)[None])
+    x, y, radius = discs.peaks(0)[0]
+    assert (x, y) == pytest.approx((24, 30), abs=1)
+    assert radius == pytest.approx(8, rel=0.25)
+    inside, outside = discs.at(np.array([0, 0]), np.array([[24.0, 30.0], [-5.0, 30.0]]), np.array([8.0, 8.0]))
+    assert inside > 0.9
+    assert outside == pytest.approx(-0.2)

@@ -1,0 +1,59 @@
+"""What one moving camera shows: pixels, rays, the pixels on a ball, and what differs from the static model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rolling_ball import rolling
+
+from dyngs.data.capture import View
+from dyngs.deform.bodies.shots import Shots, one_camera
+
+
+def test_rays_go_through_the_points_that_they_show() -> None:
+    shots, centers, _ = rolling()
+    which = np.arange(len(shots))
+    pixels, depths = shots.projected(which, centers)
+    ways = shots.rays(which, pixels)
+    apart = np.cross(centers - shots.centers, ways)
+    assert np.linalg.norm(apart, axis=1).max() < 1e-6
+    assert depths == pytest.approx(((centers - shots.centers) * shots.poses[:, 2, :3]).sum(1))
+
+
+def test_pixels_on_a_ball_see_its_surface() -> None:
+    """They differ from the static model, unless something hides the ball."""
+    shots, centers, _ = rolling()
+    rows, columns, normals = shots.on_ball(3, centers[3], 0.28)
+    assert len(rows) > 50
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
+    points = centers[3] + 0.28 * normals
+    pixels, _ = shots.projected(np.full(len(rows), 3), points)
+    assert pixels == pytest.approx(np.stack([columns, rows], axis=1) + 0.5)
+    inside = shots.differences()[3, rows, columns]
+    assert inside.mean() > 2 * shots.differences()[3].mean()
+    values = {name: x for name, x in vars(shots).items() if name != "centers"}
+    hidden = Shots(**values | {"depths": np.full_like(shots.depths, 0.1)})
+    assert not len(hidden.on_ball(3, centers[3], 0.28)[0])
+    assert not len(shots.on_ball(3, np.array([50.0, 0, 0]), 0.28)[0])
+
+
+def test_shifts_by_a_pixel_and_shadows_hardly_differ() -> None:
+    shots, _, _ = rolling()
+    values = {name: x for name, x in vars(shots).items() if name != "centers"}
+    shifted = Shots(**values | {"images": np.roll(shots.still, 1, axis=2)})
+    assert shifted.differences()[:, 1:-1, 1:-1].max() < 1e-6
+    darker = Shots(**values | {"images": 0.6 * shots.still})
+    assert darker.differences().max() <= 0.25
+
+
+def test_one_camera_shows_each_time_once() -> None:
+    view = View("a", Path("a.png"), np.eye(4), np.eye(3), 4, 4)
+    poses = [np.eye(4) + 0.1 * i * np.eye(4, k=3) for i in range(3)]
+    views = [replace(view, time=time, cam_from_world=pose) for time, pose in zip((0.5, 0.0, 1.0), poses, strict=True)]
+    assert one_camera(views) == [1, 0, 2]
+    assert one_camera([*views, views[0]]) is None
+    assert one_camera([replace(view, time=None)]) is None
+    assert one_camera([replace(v, cam_from_world=np.eye(4)) for v in views]) is None
