@@ -26,6 +26,7 @@ from dyngs.models.views import evaluation_background, training_cameras, training
 from dyngs.static.training import start as start_static
 
 MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
+MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
 
 
 def start(run: RunStart) -> GaussianModel:
@@ -71,7 +72,10 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
 
     def shots(still: Gaussians) -> Shots | None:
         order = one_camera(views)
-        return None if order is None else shots_of((images[i] for i in order), still, options, background)
+        if order is None or len(set(images.sizes)) > 1:
+            return None
+        used = (images[order[i]] for i in evenly_spaced(len(order), MAX_SHOTS))
+        return shots_of(used, still, options, background, shader)
 
     return TrainingViews(
         training_times(capture),

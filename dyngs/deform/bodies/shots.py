@@ -6,7 +6,7 @@ Local letters: T images in order of time, n points or pixels, each in one image.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import static_cameras
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
 LONGEST_SIDE = 200  # Pixels; larger images are shrunk
 
@@ -119,18 +119,30 @@ def one_camera(views: Sequence[View]) -> list[int] | None:
 
 
 @torch.no_grad()
-def shots_of(images: Iterable[Image], still: Gaussians, options: RenderOptions, background: Tensor) -> Shots:
-    """Return ``images``, in order of time, with what ``still`` shows, at most ``LONGEST_SIDE`` pixels wide or high."""
+def shots_of(
+    images: Iterable[Image],
+    still: Gaussians,
+    options: RenderOptions,
+    background: Tensor,
+    shader_at: Callable[[float], Shader | None] = lambda _: None,
+) -> Shots:
+    """Return ``images``, in order of time, with what ``still`` shows, at most ``LONGEST_SIDE`` pixels wide or high.
+
+    All have one size. Masked pixels are as the static model has them.
+    """
     parts: dict[str, list[np.ndarray]] = {}
     options = replace(options, depth="expected")
     for image in images:
         size = max(image.cameras.width, image.cameras.height)
         small = image.shrunk(math.ceil(size / LONGEST_SIDE))
-        drawn = render(still, small.cameras, options, background=background)
+        shader = shader_at(image.time or 0.0)
+        drawn = render(still, small.cameras, options, background=background, shader=shader)
         assert drawn.depth is not None
         alpha = drawn.alpha.reshape(small.cameras.height, small.cameras.width)
         depth = torch.where(alpha > SOLID, drawn.depth.reshape(alpha.shape), NEVER)
-        shown = {"images": small.composite(background), "still": drawn.rgb[0], "depths": depth}
+        rgb = small.composite(background)
+        rgb = rgb if small.mask is None else torch.where(small.mask[..., None] > 0, rgb, drawn.rgb[0])
+        shown = {"images": rgb, "still": drawn.rgb[0], "depths": depth}
         camera = {"poses": small.cameras.cam_from_world[0].double(), "intrinsics": small.cameras.intrinsics[0].double()}
         for name, x in (shown | camera).items():
             parts.setdefault(name, []).append(x.cpu().numpy())

@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from rolling_ball import rolling
+from tiny_fields import cloud
 
+from dyngs.camera import Cameras
 from dyngs.data.capture import View
-from dyngs.deform.bodies.shots import Shots, one_camera
+from dyngs.data.loader import Image
+from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
+from dyngs.gaussians.rendering import RenderOptions
 
 
 def test_rays_go_through_the_points_that_they_show() -> None:
@@ -57,3 +62,21 @@ def test_one_camera_shows_each_time_once() -> None:
     assert one_camera([*views, views[0]]) is None
     assert one_camera([replace(view, time=None)]) is None
     assert one_camera([replace(v, cam_from_world=np.eye(4)) for v in views]) is None
+
+
+def test_masked_pixels_are_as_the_static_model_has_them() -> None:
+    gaussians, camera = cloud(), one_camera_of(8)
+    rgb, mask = torch.rand(8, 8, 3), torch.zeros(8, 8)
+    mask[:4] = 1
+    image = Image("a", camera, rgb, None, mask, 0.5)
+    shots = shots_of([image], gaussians, RenderOptions(), torch.ones(3))
+    assert np.array_equal(shots.images[0, :4], rgb[:4].numpy())
+    assert np.array_equal(shots.images[0, 4:], shots.still[0, 4:])
+    assert shots.times.tolist() == [0.5]
+
+
+def one_camera_of(size: int) -> Cameras:
+    intrinsics = torch.tensor([[[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]]])
+    pose = torch.eye(4)[None].clone()
+    pose[0, 2, 3] = 4
+    return Cameras(pose, intrinsics, size, size)
