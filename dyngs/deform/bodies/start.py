@@ -17,8 +17,11 @@ from dyngs.deform.field import MAX_KEY_TIMES, DeformationField
 from dyngs.deform.spline_fit import spline_basis
 from dyngs.gaussians import Gaussians
 
-AGREES, BY_CHANCE = 0.85, 0.55
-"""Disagreement of a body's colours, as a fraction of that if it did not turn, and of that of any of its colours."""
+AGREES, BY_CHANCE = 0.6, 0.4
+"""Disagreement of a body's colours, as a fraction of that if it did not turn, and of that of any of its colours.
+
+Balls that roll have 0.16 to 0.47 of the former. A die, for which the ball is a poor model, has 0.75, be its rotation 5
+degrees off or 26, where following it cost 1.5 dB."""
 LEAST_MARKS = 0.04  # Disagreement of any of its colours below which these say nothing about how it turns
 INNER, LOGIT, SCALE = 0.7, 0.0, 0.6
 """Of the Gaussians that begin on a body: least distance from its centre in radii, opacity, and size in distances."""
