@@ -86,7 +86,9 @@ def demo_config(capture: Path, run_dir: Path, options: DemoOptions) -> Config:
         f"model.num_random_moving={options.num_points // 3}",
         f"train.steps={options.steps}",
         "model.choose=false",  # the scene is made to move
-        "train.initial_downscale=2",  # the images are small
+        "train.initial_downscale=2",  # the images are small, and soon as large as they get
+        "train.resolution_grows_from=0.35",
+        "train.resolution_full_at=0.45",
         "run.name=demo",
         f"run.threads={options.threads}",
     )

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
+from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY
@@ -48,21 +49,23 @@ class Cut:
 
 def field_size(scene: GaussianScene) -> FieldSize | None:
     """Return the size of the field of ``scene``; None where no control nodes move anything."""
-    match scene:
-        case DynamicScene(field=ControlNodes() as field, is_static=False) if field.num_nodes:
-            return FieldSize(field.num_nodes, field.num_pieces)
-        case _:
-            return None
+    nodes = _nodes_of(scene)
+    return FieldSize(nodes.num_nodes, nodes.num_pieces) if nodes is not None and nodes.num_nodes else None
 
 
 def with_field(scene: GaussianScene, size: FieldSize) -> GaussianScene:
     """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move anything."""
-    match scene:
-        case DynamicScene(field=ControlNodes() as field, is_static=False):
-            means = scene.gaussians.means.detach()[scene.moving]
-            return replace(scene, field=field.reduced(size.nodes, size.pieces, means))
-        case _:
-            return scene
+    nodes = _nodes_of(scene)
+    if nodes is None or not isinstance(scene, DynamicScene):
+        return scene
+    reduced = nodes.reduced(size.nodes, size.pieces, scene.gaussians.means.detach()[scene.moving])
+    return replace(scene, field=scene.field.within(reduced) if isinstance(scene.field, BodyField) else reduced)
+
+
+def _nodes_of(scene: GaussianScene) -> ControlNodes | None:
+    field = scene.field if isinstance(scene, DynamicScene) and not scene.is_static else None
+    field = field.others if isinstance(field, BodyField) else field
+    return field if isinstance(field, ControlNodes) else None
 
 
 def cut_config(config: Config, cut: Cut) -> Config:

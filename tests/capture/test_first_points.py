@@ -54,7 +54,7 @@ def shifted(root: Path, out: Path) -> Path:
             pose = np.array(frame["transform_matrix"])
             pose[:3, 3] += (7, -3, 11)
             frame |= {"transform_matrix": pose.tolist(), "time": 0.055 * frame["time"]}
-            frame.pop("motion_mask_path", None)
+            frame.pop("instance_mask_path", None)
         (out / f"transforms_{folder}.json").write_text(json.dumps(content))
     return out
 

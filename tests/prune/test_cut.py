@@ -10,10 +10,12 @@ import torch
 from tiny_fields import busy_config
 
 from dyngs.config import Config, DynamicModel
+from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.scene import DynamicScene
 from dyngs.kinds import assemble, restored_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.views import background_colour
-from dyngs.prune.cut import Cut, FieldSize, apply_cut, cut_config, field_size
+from dyngs.prune.cut import Cut, FieldSize, apply_cut, cut_config, field_size, with_field
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -58,6 +60,18 @@ def test_everything_that_a_cut_says(trainer: Trainer) -> None:
     assert str(cut) == (
         "50.0% of the Gaussians, alphas below 0.02, all but 2 nodes of 1 pieces, harmonics worth 100 dB"
     )
+
+
+def test_nodes_around_bodies_are_cut_as_without_them(trainer: Trainer) -> None:
+    scene = trainer.model.scene
+    assert isinstance(scene, DynamicScene)
+    assert scene.field is not None
+    labels = torch.full((len(scene.moving),), -1)
+    splines = {"places": torch.zeros(1, 5, 3), "quats": torch.ones(1, 5, 4)}
+    with_body = replace(scene, field=BodyField(scene.field, BodyRest(torch.zeros(1, 3), labels), splines))
+    cut = with_field(with_body, FieldSize(2, 1))
+    assert field_size(cut) == FieldSize(2, 1)
+    assert torch.equal(cut.at(0.4).means, with_field(scene, FieldSize(2, 1)).at(0.4).means)
 
 
 def test_some_harmonics_stay_and_the_others_stay_gone(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:

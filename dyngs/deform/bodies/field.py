@@ -90,9 +90,14 @@ class BodyField(DeformationField):
     def regroup(self) -> None:
         self.others.regroup()
 
-    def edited(self, edit: TopologyEdit) -> BodyField:
+    def within(self, others: DeformationField) -> BodyField:
+        """Return the same bodies within another field of the same Gaussians."""
         field = copy.copy(self)
-        field.others = self.others.edited(edit)
+        field.others = others
+        return field
+
+    def edited(self, edit: TopologyEdit) -> BodyField:
+        field = self.within(self.others.edited(edit))
         field.rest = replace(self.rest, labels=self.rest.labels[edit.source])
         return field
 
