@@ -190,8 +190,3 @@ def _conjugate(quats: Tensor) -> Tensor:
 def chosen(x: Tensor, rows: Tensor | None) -> Tensor:
     """Return the ``rows`` of ``x``; all for None."""
     return x if rows is None else x.index_select(0, rows)
-
-
-def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
-    """Return (M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
-    return quat_product(offsets + identity_quat(offsets), quats)

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_setup
 from torch import Tensor
 
-from dyngs.deform.field import Offsets, deformed, key_times, turned_quats
+from dyngs.deform.field import Offsets, deformed, key_times
 from dyngs.gaussians import Gaussians
+from dyngs.ops.quaternions import identity_quat, quat_product
 
 SHAPES = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (), "colors": (3,)}
 
@@ -121,6 +122,11 @@ def test_values_and_gradients_are_those_of_plain_torch(
             assert torch.equal(leaves[name].detach(), x.to(dtype)), "what is given stays as it is"
     for fast, slow in zip(*found, strict=True):
         torch.testing.assert_close(fast, slow)
+
+
+def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
+    """Return (M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product, not normalised."""
+    return quat_product(offsets + identity_quat(offsets), quats)
 
 
 def slowly_deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None) -> Gaussians:

@@ -16,6 +16,7 @@ from torch import Tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import static_cameras
+from dyngs.deform.fixed_cameras.changes import shadows
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
@@ -82,9 +83,8 @@ class Shots:
             for x in range(3):
                 apart = np.abs(self.images - around[:, y : y + height, x : x + width]).mean(-1)
                 np.minimum(found, apart, out=found)
-        left = (self.images + 0.03) / (self.still + 0.03)
-        shade = (left.max(-1) < 1) & (left.min(-1) > 0.35) & (np.ptp(left, axis=-1) < 0.14)
-        return np.clip(found / TOLERANCE, 0, 1) * np.where(shade, np.float32(SHADE), np.float32(1))
+        weight = np.where(shadows(self.images, self.still), np.float32(SHADE), np.float32(1))
+        return np.clip(found / TOLERANCE, 0, 1) * weight
 
     def on_ball(
         self, index: int, center: np.ndarray, radius: float, reach: float = 0.92

@@ -123,12 +123,10 @@ def disagreements(frames: Frames, rotations: np.ndarray) -> np.ndarray:
 
 
 def rotations_by(vectors: np.ndarray) -> np.ndarray:
-    """Return (..., 3, 3) rotations about the vectors (..., 3) by their lengths, radians (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(vectors / np.maximum(angle[..., 0], 1e-12), -1, 0)
-    none = np.zeros_like(x)
-    cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*x.shape, 3, 3)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * np.einsum("...ij,...jk->...ik", cross, cross)
+    """Return (..., 3, 3) rotations about the vectors (..., 3) by their lengths, radians."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
 
 
 def angles_deg(rotations: np.ndarray) -> np.ndarray:

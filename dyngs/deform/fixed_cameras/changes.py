@@ -84,7 +84,7 @@ def changes(images: np.ndarray) -> np.ndarray:
     threshold = np.maximum(SMALLEST_CHANGE, NOISE_MULTIPLE * np.maximum(own, _MAD_TO_STD * float(np.median(apart))))
     found = np.zeros(apart.shape, bool)
     for i, (difference, image) in enumerate(zip(apart, values, strict=True)):
-        differs = (difference > threshold) & ~_shadows(image, median)
+        differs = (difference > threshold) & ~shadows(image, median)
         differs = ndimage.binary_closing(np.pad(differs, 2), iterations=1)[2:-2, 2:-2]
         found[i] = _without_specks(np.asarray(ndimage.binary_fill_holes(differs)), difference / threshold)
     return found
@@ -103,8 +103,8 @@ def _without_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
     return kept[labels]
 
 
-def _shadows(image: np.ndarray, median: np.ndarray) -> np.ndarray:
-    """Return (H, W) bool: as the ``median`` but darker, all channels alike (after Horprasert et al. 1999)."""
-    left = (image + _DARK) / (median + _DARK)
+def shadows(image: np.ndarray, still: np.ndarray) -> np.ndarray:
+    """Return (..., H, W) bool: as ``still`` but darker, all channels alike (after Horprasert et al. 1999)."""
+    left = (image + _DARK) / (still + _DARK)
     tint = left.max(-1) - left.min(-1)
     return (left.max(-1) < 1) & (left.min(-1) > DARKEST_SHADOW) & (tint < SHADOW_TINT)
