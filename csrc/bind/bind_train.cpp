@@ -46,7 +46,11 @@ AdamState adam_state(const AdamArrays& arrays) {
   if (differs(grad) || differs(exp_avg) || differs(exp_avg_sq) || num_rows * row_size != size ||
       (rows && rows->shape(0) != num_rows))
     throw nb::value_error("adam_steps: arrays of different sizes");
-  return {param.data(),      grad.data(), exp_avg.data(), exp_avg_sq.data(), static_cast<int64_t>(num_rows),
+  return {param.data(),
+          grad.data(),
+          exp_avg.data(),
+          exp_avg_sq.data(),
+          static_cast<int64_t>(num_rows),
           static_cast<int64_t>(row_size)};
 }
 
@@ -56,7 +60,8 @@ void adam_steps_arrays(const std::vector<AdamArrays>& all, Array<int32_t, nb::sh
   std::vector<std::pair<AdamState, AdamRates>> updates;
   for (const AdamArrays& one : all) {
     const auto& rows = std::get<5>(one);
-    updates.push_back({adam_state(one), {std::get<4>(one).data(), rows ? rows->data() : nullptr, beta1, beta2, eps, step}});
+    updates.push_back(
+        {adam_state(one), {std::get<4>(one).data(), rows ? rows->data() : nullptr, beta1, beta2, eps, step}});
   }
   nb::gil_scoped_release release;
   for (const auto& [state, rates] : updates) write_adam_step(state, rates, skipped.data(), threads);

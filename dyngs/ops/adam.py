@@ -42,7 +42,7 @@ def _adam_steps(
 
 
 adam_steps_op = register("adam_steps_", _adam_steps, mutates=("params", "exp_avgs", "exp_avg_sqs"))
-"""Update arrays in place, with rates (C,) and rows (size / C,) bool each; returns the number () int64 of rows skipped."""
+"""Update arrays in place, each with rates (C,) and rows (size / C,) bool; returns the number () of rows skipped."""
 
 
 def _seen_rows(grads: Tensor) -> Tensor:
