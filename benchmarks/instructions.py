@@ -1,11 +1,11 @@
-"""Instructions of each kernel, counted by valgrind, against the stored figures: no change makes a step slower unnoticed.
+"""Instructions of each kernel, by valgrind, against stored figures: no change makes a step slower unnoticed.
 
     python benchmarks/instructions.py BUILD_FOLDER [--write]
 
-BUILD_FOLDER was configured with ``-DDYNGS_TESTS=ON -DDYNGS_ISAS=v3`` (AVX2: valgrind knows no AVX-512) and has the program
-count_instructions_v3. Ends with 1 where a kernel takes more than ``TOLERANCE`` over its figure in ``instructions.json``;
-``--write`` stores the figures. Where valgrind is absent, or the compiler is another one than that of the figures, it
-says so and ends with 0.
+BUILD_FOLDER was configured with ``-DDYNGS_TESTS=ON -DDYNGS_ISAS=v3`` (AVX2: valgrind knows no AVX-512) and has the
+program count_instructions_v3. Ends with 1 where a kernel takes more than ``TOLERANCE`` over its figure in
+``instructions.json``; ``--write`` stores the figures. Where valgrind is absent, or the compiler is another one than
+that of the figures, it says so and ends with 0.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from pathlib import Path
 
 STORED = Path(__file__).with_suffix(".json")
 TOLERANCE = 0.03  # Another minor version of the compiler changes less
-KERNELS = (
-    "project_forward project_backward harmonics_forward harmonics_backward bin_tiles rasterize_forward "
-    "rasterize_backward l1_ssim_loss adam_step skinning_forward skinning_backward nodes_at nodes_at_backward node_penalties"
-).split()
+KERNELS = [
+    *("project_forward", "project_backward", "harmonics_forward", "harmonics_backward", "bin_tiles"),
+    *("rasterize_forward", "rasterize_backward", "l1_ssim_loss", "adam_step", "skinning_forward", "skinning_backward"),
+    *("nodes_at", "nodes_at_backward", "node_penalties"),
+]
 LINE = re.compile(r"^\s*([\d,]+) .*\bdyngs::(\w+)(?:<float>)?\(")
 
 
@@ -36,7 +37,7 @@ def compiler(folder: Path) -> str:
 
 
 def counted(program: Path) -> dict[str, int]:
-    """Return the millions of instructions of each kernel, what it calls included."""
+    """Return the instructions of each kernel, what it calls included."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "callgrind.out"
         collect = ["valgrind", "--tool=callgrind", f"--callgrind-out-file={out}", str(program)]
@@ -44,9 +45,8 @@ def counted(program: Path) -> dict[str, int]:
         show = ["callgrind_annotate", "--inclusive=yes", "--threshold=100", str(out)]
         table = subprocess.run(show, check=True, capture_output=True, text=True).stdout
     found = [(m[2], int(m[1].replace(",", ""))) for line in table.splitlines() if (m := LINE.match(line))]
-    return {
-        name: max(count for kernel, count in found if kernel == name) for name in KERNELS
-    }  # parts bear its name, too
+    # parts of a kernel bear its name, too
+    return {name: max(count for kernel, count in found if kernel == name) for name in KERNELS}
 
 
 def main() -> int:

@@ -68,7 +68,8 @@ class AdamState:
         grad, x.grad = x.grad, None
         if grad is None:
             return None
-        return AdamUpdate(*(_rows(a) for a in (x.detach(), grad, self.exp_avg[name], self.exp_avg_sq[name])), lr)
+        first, second = _rows(self.exp_avg[name]), _rows(self.exp_avg_sq[name])
+        return AdamUpdate(_rows(x.detach()), _rows(grad), first, second, lr)
 
     def mapped(self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None) -> AdamState:
         """Return the moments with ``function`` applied to those of the named tensors; None: of all."""

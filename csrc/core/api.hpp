@@ -319,7 +319,6 @@ void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, c
 
 // Control nodes -------------------------------------------------------------------------------------------------------
 // What nodes do at a time, along uniform cubic B-splines, and what is asked of their motion.
-
 inline constexpr int kHeads = 5;  // means, quaternions less the identity, log scales, opacity logits, colours
 
 template <class S>
@@ -329,7 +328,6 @@ struct NodeSplines {
   int64_t first;           // of the four control points that the time depends on
   S fractions[4];          // their weights
 };
-
 template <class S>
 struct SplineGrads {
   S* heads[kHeads];  // (S, P, head_size), null where the splines are
@@ -338,7 +336,6 @@ struct SplineGrads {
 // Writes motion (S, 7) as SkinNodes has it, and the values (S, width) of all heads but the first, one after the other.
 template <class S>
 void nodes_at(const NodeSplines<S>& splines, S* motion, S* values, int threads);
-
 // Writes the gradients of sum(motion * by_motion) + sum(values * by_values), the latter unless null.
 template <class S>
 void nodes_at_backward(const NodeSplines<S>& splines, const S* by_motion, const S* by_values,
@@ -346,17 +343,13 @@ void nodes_at_backward(const NodeSplines<S>& splines, const S* by_motion, const 
 
 template <class S>
 struct NodeGraph {
-  const S* positions;           // (S, 3)
-  const S* radii;               // (S,), positive
+  const S *positions, *radii;   // (S, 3), (S,) positive
   const int64_t* neighbours;    // (S, B), each in [0, S)
-  const S* motion;              // (S, 7) at a time
-  const S* paths;               // (S, P, 3) control points of the shifts
+  const S *motion, *paths;      // (S, 7) at a time, (S, P, 3) control points of the shifts
   int64_t count, near, points;  // S, B, P
 };
-
-// Writes two penalties in squared radii, and their gradients: the mean square of the second differences of the paths with
-// that by the paths (S, P, 3), and the mean of |d_j - d_i - (R_i - I) (p_j - p_i)|^2 over neighbours j of nodes i, the
-// deviation from rigid motion (Sorkine and Alexa 2007), with that by the motion (S, 7).
+// Writes two penalties in squared radii, and their gradients: the mean square of the paths' second differences, by the paths;
+// the mean of |d_j - d_i - (R_i - I) (p_j - p_i)|^2 over neighbours j of nodes i (Sorkine and Alexa 2007), by the motion.
 template <class S>
 void node_penalties(const NodeGraph<S>& graph, double* penalties, S* by_paths, S* by_motion, int threads);
 
@@ -421,8 +414,7 @@ struct MovedGaussians {
 template <class S>
 void add_offsets(const RowOffsets<S>& offsets, const MovedGaussians<S>& gaussians, int threads);
 
-// Gradients by the Gaussians that were moved, (N, ...), null for what did not change, and where they go: by the offsets,
-// (M, ...), and by the quaternions before they were turned, which for other rows are there already.
+// Gradients by moved Gaussians, (N, ...), null for what did not change; where those by the offsets (M, ...) go.
 template <class S>
 struct OffsetGrads {
   const S *means, *log_scales, *logit_opacities, *sh;

@@ -151,8 +151,8 @@ class ControlNodes(DeformationField):
         """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in squared spacings."""
         if len(self.buffers["positions"]) < 2:
             return {}
-        nodes = (self.buffers[name] for name in ("positions", "radii", "neighbours"))
-        acceleration, strain = node_penalties(*nodes, motion, self.parameters["means"]).unbind()
+        places, radii, near = (self.buffers[name] for name in ("positions", "radii", "neighbours"))
+        acceleration, strain = node_penalties(places, radii, near, motion, self.parameters["means"]).unbind()
         penalties = {"node acceleration": SMOOTHNESS * acceleration}
         return penalties | ({"node rigidity": self.options.rigidity * strain} if self.options.rigidity else {})
 

@@ -163,7 +163,7 @@ class _AddOffsets(torch.autograd.Function):
         add_offsets_(copies, rows, offsets)
         turned = () if offsets[1] is None else (quats, offsets[1])
         ctx.save_for_backward(*([] if rows is None else [rows]), *turned)
-        ctx.has_rows, ctx.count = rows is not None, len(offsets[0])
+        ctx.has_rows, ctx.count = rows is not None, len(means) if rows is None else len(rows)
         return tuple(None if by is None else x for x, by in zip(copies, offsets, strict=True))
 
     @staticmethod

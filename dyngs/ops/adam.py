@@ -114,8 +114,10 @@ def adam_steps_(
     rows = [x.rows for x in chosen]
     if like.dtype == torch.float32 and has_kernel("adam_steps_", like.device):
         return adam_steps_op(params, grads, exp_avgs, exp_avg_sqs, rates, rows, list(betas), eps, step)
-    given = zip(params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True)
-    return torch.stack([_torch_adam_step(*arrays, betas, eps, step) for arrays in given]).sum()
+    skipped = torch.zeros((), dtype=torch.int64, device=like.device)
+    for p, g, m, v, rate, row in zip(params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True):
+        skipped += _torch_adam_step(p, g, m, v, rate, row, betas, eps, step)
+    return skipped
 
 
 @torch.no_grad()

@@ -74,8 +74,10 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> N
 
 def _backward(ctx: Any, g_motion: Tensor, g_values: Tensor) -> tuple[Tensor | None, ...]:
     saved = iter(ctx.saved_tensors)
-    heads = [next(saved) if there else None for there in ctx.there]
-    found = iter(nodes_at_backward_op(*heads, [g_motion, g_values], ctx.time))
+    means, *others = (next(saved) if there else None for there in ctx.there)
+    assert means is not None
+    quats, log_scales, logits, colors = others
+    found = iter(nodes_at_backward_op(means, quats, log_scales, logits, colors, [g_motion, g_values], ctx.time))
     return *(next(found) if there else None for there in ctx.there), None
 
 
@@ -89,7 +91,9 @@ def spline_motion(heads: Sequence[Tensor | None], time: float) -> tuple[Tensor, 
     ``HEAD_SIZES``; the first is there, others may be None. Motion: means, then the identity plus quaternions. Values:
     of all heads that are there but the first, one after the other.
     """
-    return nodes_at_op(*heads, time)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    means, quats, log_scales, logits, colors = heads
+    assert means is not None
+    return nodes_at_op(means, quats, log_scales, logits, colors, time)
 
 
 def _node_penalties(

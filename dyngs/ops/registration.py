@@ -99,7 +99,7 @@ def _with_gradient(op: Any, save: Callable[..., None], formula: Callable[..., An
 
     def dispatched(keys: Any, *arguments: Any) -> Any:
         wanted = torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)  # pyright: ignore[reportPrivateUsage]
-        return Recorded.apply(*arguments, keys) if wanted else below(keys, arguments)
+        return cast(Any, Recorded.apply(*arguments, keys)) if wanted else below(keys, arguments)
 
     return dispatched
 
@@ -148,12 +148,9 @@ def empty_like(x: Tensor) -> Tensor:
 
 
 def _passed(core: ModuleType, value: Any) -> Any:
-    kind = type(value)
-    if kind is Tensor:  # most are
-        return array(value)
-    if kind is int or kind is float or value is None:
-        return value
     match value:
+        case None | int() | float():
+            return value
         case Tensor():
             return array(value)
         case InPlace():
