@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from dyngs.ops.adam import Count, adam_step_
+from dyngs.ops.adam import AdamUpdate, Count, adam_steps_
 from dyngs.state import Role, State, moved_to, prefixed, with_role
 from dyngs.tensor_checks import require_tensor
 
@@ -44,28 +44,32 @@ class AdamState:
     def step_(
         self, name: str, x: Tensor, *, lr: float | Tensor, step: int, eps: float = 1e-15, rows: Tensor | None = None
     ) -> Count:
-        """Update the leaf tensor ``x`` in place, drop its gradient, and return the number of rows left out.
+        """As ``steps_`` of one tensor, of which only the ``rows`` (N,) bool are updated; None: all."""
+        return self.steps_([self.update(name, x, lr, rows)], step=step, eps=eps)
 
-        Rows whose gradient is not finite are left out.
+    def steps_(self, updates: Sequence[AdamUpdate | None], *, step: int, eps: float = 1e-15) -> Count:
+        """Do the ``updates`` in place, those that are None left out, and return the number of rows left out.
 
-        Args:
-            x: (N, ...) with a gradient; nothing is done without one.
-            step: number of this update, from 1, for the bias correction.
-            rows: (N,) bool, the rows to update; None: all.
+        Rows whose gradient is not finite are left out. ``step``: the number of this update, from 1, for the bias
+        correction.
         """
-        if x.grad is None:
-            return 0
-        arrays = x.detach(), x.grad, self.exp_avg[name], self.exp_avg_sq[name]
-        x.grad = None
-        return adam_step_(*arrays, lr=lr, step=step, eps=eps, rows=rows)
+        wanted = [x for x in updates if x is not None]
+        return adam_steps_(wanted, step=step, eps=eps) if wanted else 0
 
-    def step_along_last_axis_(self, name: str, x: Tensor, *, lr: float, step: int) -> Count:
-        """As ``step_``; only the values along the last axis are a row, so that little is left out of a large array."""
-        if x.grad is None:
-            return 0
-        arrays = [_rows(a) for a in (x.detach(), x.grad, self.exp_avg[name], self.exp_avg_sq[name])]
-        x.grad = None
-        return adam_step_(*arrays, lr=lr, step=step)
+    def update(self, name: str, x: Tensor, lr: float | Tensor, rows: Tensor | None = None) -> AdamUpdate | None:
+        """Return the update of the leaf tensor ``x`` (N, ...), and drop its gradient; None where it has none."""
+        grad, x.grad = x.grad, None
+        if grad is None:
+            return None
+        return AdamUpdate(x.detach(), grad, self.exp_avg[name], self.exp_avg_sq[name], lr, rows)
+
+    def update_along_last_axis(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:
+        """As ``update``; only the values along the last axis are a row, so that little is left out of a large array."""
+        grad, x.grad = x.grad, None
+        if grad is None:
+            return None
+        first, second = _rows(self.exp_avg[name]), _rows(self.exp_avg_sq[name])
+        return AdamUpdate(_rows(x.detach()), _rows(grad), first, second, lr)
 
     def mapped(self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None) -> AdamState:
         """Return the moments with ``function`` applied to those of the named tensors; None: of all."""

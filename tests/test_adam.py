@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dyngs.adam import AdamState
+from dyngs.ops.adam import Count
 from dyngs.state import Role, tensors_of
 
 SHAPES = {"weight": (4, 5), "bias": (3,), "planes": (2, 3, 4, 2)}
@@ -32,6 +33,11 @@ def stepped(steps: int) -> tuple[AdamState, dict[str, Tensor]]:
     return adam, tensors
 
 
+def stepped_along(last_axis: bool, adam: AdamState, name: str, x: Tensor, step: int) -> Count:
+    update = adam.update_along_last_axis(name, x, 0.1) if last_axis else adam.update(name, x, 0.1)
+    return adam.steps_([update], step=step)
+
+
 @pytest.mark.parametrize("along_last_axis", [False, True])
 def test_it_is_adam(along_last_axis: bool) -> None:
     mine, theirs = start_values(), start_values()
@@ -40,8 +46,7 @@ def test_it_is_adam(along_last_axis: bool) -> None:
         for seed, name in enumerate(SHAPES):
             grad = random(SHAPES[name], 10 * step + seed)
             mine[name].grad, theirs[name].grad = grad, grad.clone()
-            update = adam.step_along_last_axis_ if along_last_axis else adam.step_
-            assert update(name, mine[name], lr=0.1, step=step) == 0
+            assert stepped_along(along_last_axis, adam, name, mine[name], step) == 0
         reference.step()
     for name, x in theirs.items():
         torch.testing.assert_close(mine[name], x, rtol=1e-5, atol=1e-6)
@@ -52,7 +57,7 @@ def test_without_gradients_nothing_is_done() -> None:
     adam, tensors = stepped(2)
     before = {name: x.clone() for name, x in (tensors | tensors_of(adam.state())).items()}
     for name, x in tensors.items():
-        assert adam.step_(name, x, lr=0.1, step=3) == adam.step_along_last_axis_(name, x, lr=0.1, step=3) == 0
+        assert adam.step_(name, x, lr=0.1, step=3) == stepped_along(True, adam, name, x, 3) == 0
     assert all(torch.equal(x, before[name]) for name, x in (tensors | tensors_of(adam.state())).items())
 
 
@@ -63,8 +68,7 @@ def test_rows_with_bad_gradients_are_left_out_and_counted() -> None:
         adam, before = AdamState.zero({"planes": x}), x.detach().clone()
         x.grad = random(SHAPES["planes"], 1)
         x.grad[1, 2, 3, 0], x.grad[1, 0, 0, 1] = float("nan"), float("inf")
-        update = adam.step_along_last_axis_ if along_last_axis else adam.step_
-        assert update("planes", x, lr=0.1, step=1) == left_out
+        assert stepped_along(along_last_axis, adam, "planes", x, 1) == left_out
         stays = x.detach() == before
         assert stays[1, 2, 3].all()
         assert stays[1, 0, 0].all()

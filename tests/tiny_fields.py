@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from scenes import random_scene
+from torch import Tensor
 
 from dyngs.config import (
     Config,
@@ -22,9 +23,11 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.field import DeformationField, FieldSetup
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets
 from dyngs.deform.fields import new_field
+from dyngs.deform.nodes import Nodes, follow
 from dyngs.gaussians import Gaussians
+from dyngs.ops.quaternions import identity_quat
 
 KINDS = ("hexplane", "mlp", "control_nodes")  # fields that begin as the identity
 ALL_KINDS = (*KINDS, "free")
@@ -64,6 +67,16 @@ def stirred_field(kind: str, num_moving: int = 9, *, size: float = 0.2, everythi
     field.offsets(cloud(num_moving).means, 0.0)
     stir(field, size)
     return field
+
+
+def followed(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
+    """What ``follow`` makes of offsets of the nodes."""
+    heads = {name: x.reshape(len(x), -1) for name, x in vars(at_nodes).items() if x is not None}
+    shifts = heads.pop("means")
+    turns = identity_quat(shifts).expand(len(shifts), 4) + heads.get("quats", 0)
+    values = torch.cat([shifts[:, :0], *heads.values()], 1)
+    sizes = {name: x.shape[1] for name, x in heads.items()}
+    return follow(nodes, means, torch.cat([shifts, turns], 1), values, sizes)
 
 
 def stir(field: DeformationField, size: float = 0.2) -> None:

@@ -39,10 +39,49 @@ void add(const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>, Array<S>>& gau
   add_offsets(from, to, threads);
 }
 
+// `gaussians`: gradients by means, log scales, logits, harmonics; `results`: by the offsets, in their order.
+template <class S>
+void add_backward(const std::tuple<Maybe<S>, Maybe<S>, Maybe<S>, Maybe<S>>& gaussians, const Maybe<int64_t>& rows,
+                  const std::tuple<Maybe<S>, Maybe<S>, MaybeArray<S>>& quats,
+                  const std::tuple<MaybeArray<S>, MaybeArray<S>, MaybeArray<S>, MaybeArray<S>, MaybeArray<S>>& results,
+                  int64_t count, int64_t n, int threads) {
+  if (count == 0) return;  // and so no pointers
+  const auto& [means, log_scales, logits, sh] = gaussians;
+  const auto& [own, by, by_own] = quats;
+  const auto& [by_means, by_quats, by_log_scales, by_logits, by_colors] = results;
+  const RowOffsets<S> from{count,   checked(rows, count, "offsets: rows"),
+                           nullptr, checked(by, 4 * count, "offsets: quats"),
+                           nullptr, nullptr,
+                           nullptr};
+  const int64_t stride = sh && n ? static_cast<int64_t>(sh->size()) / n : 0;
+  const OffsetGrads<S> grads{checked(means, 3 * n, "offsets: means"),
+                             checked(log_scales, 3 * n, "offsets: log_scales"),
+                             checked(logits, n, "offsets: logit_opacities"),
+                             checked(sh, stride * n, "offsets: sh"),
+                             stride,
+                             checked(by_means, 3 * count, "offsets: by_means"),
+                             checked(by_quats, 4 * count, "offsets: by_quats"),
+                             checked(by_log_scales, 3 * count, "offsets: by_log_scales"),
+                             checked(by_logits, count, "offsets: by_logit_opacities"),
+                             checked(by_colors, 3 * count, "offsets: by_colors"),
+                             checked(by_own, 4 * n, "offsets: quats")};
+  const S* before = checked(own, 4 * n, "offsets: quats");
+  const auto differs = [](const void* a, const void* b) { return (a == nullptr) != (b == nullptr); };
+  if (differs(grads.means, grads.by_means) || differs(grads.log_scales, grads.by_log_scales) ||
+      differs(grads.logit_opacities, grads.by_logit_opacities) || differs(grads.sh, grads.by_colors) ||
+      differs(grads.quats, grads.by_quats) || (grads.quats && (!before || !from.quats)))
+    throw nb::value_error("offsets: arrays that do not belong together");
+  nb::gil_scoped_release release;
+  add_offsets_backward(from, before, grads, threads);
+}
+
 }  // namespace
 
 void bind_offsets(nb::module_& module) {
-  for_each_scalar([&]<class S>() { module.def("add_offsets", add<S>); });
+  for_each_scalar([&]<class S>() {
+    module.def("add_offsets", add<S>);
+    module.def("add_offsets_backward", add_backward<S>);
+  });
 }
 
 }  // namespace dyngs

@@ -3,6 +3,11 @@
 #include "bind/results.hpp"
 #include "core/api.hpp"
 
+#include <nanobind/stl/vector.h>
+
+#include <utility>
+#include <vector>
+
 #if defined(__GLIBC__)
 #include <malloc.h>
 #endif
@@ -30,26 +35,36 @@ void l1_ssim_arrays(Array<const float, nb::shape<-1, -1, 3>> rendered, Array<con
 }
 
 using AdamOptions = std::tuple<double, double, double, int64_t>;  // beta1, beta2, eps, step
+// param, grad, exp_avg, exp_avg_sq of any shape, column_rates (C,), rows (size / C,) or None.
+using AdamArrays = std::tuple<Array<float>, Array<const float>, Array<float>, Array<float>,
+                              Array<const float, nb::ndim<1>>, std::optional<Array<const bool, nb::ndim<1>>>>;
 
-void adam_step_arrays(Array<float, nb::ndim<2>> param, Array<const float, nb::ndim<2>> grad,
-                      Array<float, nb::ndim<2>> exp_avg, Array<float, nb::ndim<2>> exp_avg_sq,
-                      Array<const float, nb::ndim<1>> column_rates, std::optional<Array<const bool, nb::ndim<1>>> rows,
-                      Array<int32_t, nb::shape<1>> skipped, const AdamOptions& options, int threads) {
-  const size_t num_rows = param.shape(0), row_size = param.shape(1);
-  const auto differs = [=](const auto& array) { return array.shape(0) != num_rows || array.shape(1) != row_size; };
-  if (differs(grad) || differs(exp_avg) || differs(exp_avg_sq) || column_rates.shape(0) != row_size ||
+AdamState adam_state(const AdamArrays& arrays) {
+  const auto& [param, grad, exp_avg, exp_avg_sq, column_rates, rows] = arrays;
+  const size_t size = param.size(), row_size = column_rates.shape(0), num_rows = row_size ? size / row_size : 0;
+  const auto differs = [=](const auto& array) { return array.size() != size; };
+  if (differs(grad) || differs(exp_avg) || differs(exp_avg_sq) || num_rows * row_size != size ||
       (rows && rows->shape(0) != num_rows))
-    throw nb::value_error("adam_step: arrays of different sizes");
-  const AdamState state{param.data(),
-                        grad.data(),
-                        exp_avg.data(),
-                        exp_avg_sq.data(),
-                        static_cast<int64_t>(num_rows),
-                        static_cast<int64_t>(row_size)};
+    throw nb::value_error("adam_steps: arrays of different sizes");
+  return {param.data(),
+          grad.data(),
+          exp_avg.data(),
+          exp_avg_sq.data(),
+          static_cast<int64_t>(num_rows),
+          static_cast<int64_t>(row_size)};
+}
+
+void adam_steps_arrays(const std::vector<AdamArrays>& all, Array<int32_t, nb::shape<1>> skipped,
+                       const AdamOptions& options, int threads) {
   const auto [beta1, beta2, eps, step] = options;
-  const AdamRates rates{column_rates.data(), rows ? rows->data() : nullptr, beta1, beta2, eps, step};
+  std::vector<std::pair<AdamState, AdamRates>> updates;
+  for (const AdamArrays& one : all) {
+    const auto& rows = std::get<5>(one);
+    updates.push_back(
+        {adam_state(one), {std::get<4>(one).data(), rows ? rows->data() : nullptr, beta1, beta2, eps, step}});
+  }
   nb::gil_scoped_release release;
-  write_adam_step(state, rates, skipped.data(), threads);
+  for (const auto& [state, rates] : updates) write_adam_step(state, rates, skipped.data(), threads);
 }
 
 void seen_rows_arrays(Array<const float, nb::ndim<2>> grads, Array<bool, nb::ndim<1>> seen, int threads) {
@@ -78,9 +93,9 @@ void bind_train(nb::module_& module) {
   module.def("l1_ssim", l1_ssim_arrays, array("rendered"), array("target"), array("mask").none(),
              array("gradient").none(), array("loss"), nb::arg("ssim_weight"), nb::arg("num_threads"),
              "Writes the loss of two (H, W, 3) images, and its gradient by `rendered` unless that is None.");
-  module.def("adam_step", adam_step_arrays, array("param"), array("grad"), array("exp_avg"), array("exp_avg_sq"),
-             array("column_rates"), array("rows").none(), array("skipped"), nb::arg("options"), nb::arg("num_threads"),
-             "Adam step on (N, C) arrays in place; adds the number of rows skipped for a non-finite gradient.");
+  module.def("adam_steps", adam_steps_arrays, array("updates"), array("skipped"), nb::arg("options"),
+             nb::arg("num_threads"),
+             "Adam step of several arrays in place; adds the number of rows skipped for a non-finite gradient.");
   module.def("seen_rows", seen_rows_arrays, array("grads"), array("seen"), nb::arg("num_threads"),
              "Writes which rows of (N, C) gradients have an element other than zero.");
   module.def("keep_freed_memory", keep_freed_memory,

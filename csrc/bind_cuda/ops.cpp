@@ -158,6 +158,28 @@ void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& 
 }
 
 template <>
+void add_offsets_backward(const RowOffsets<float>& offsets, const float* quats, const OffsetGrads<float>& grads, int) {
+  cuda::add_offsets_backward(offsets, quats, grads, current_stream());
+}
+
+template <>
+void nodes_at(const NodeSplines<float>& splines, float* motion, float* values, int) {
+  cuda::nodes_at(splines, motion, values, current_stream());
+}
+
+template <>
+void nodes_at_backward(const NodeSplines<float>& splines, const float* by_motion, const float* by_values,
+                       const SplineGrads<float>& grads, int) {
+  cuda::nodes_at_backward(splines, by_motion, by_values, grads, current_stream());
+}
+
+template <>
+void node_penalties(const NodeGraph<float>& graph, double* penalties, float* by_paths, float* by_motion, int) {
+  const Borrowed memory(cuda::node_penalties_workspace(graph));
+  cuda::node_penalties(graph, penalties, by_paths, by_motion, memory.lent(), current_stream());
+}
+
+template <>
 void shading_inputs(const Shading<float>& in, float* out) {
   cuda::shading_inputs(in, out, current_stream());
 }

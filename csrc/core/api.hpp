@@ -317,6 +317,42 @@ template <class S>
 void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, const Skinned<const S>& g,
                        const SkinGrads<S>& grads, int threads);
 
+// Control nodes -------------------------------------------------------------------------------------------------------
+// What nodes do at a time, along uniform cubic B-splines, and what is asked of their motion.
+inline constexpr int kHeads = 5;  // means, quaternions less the identity, log scales, opacity logits, colours
+
+template <class S>
+struct NodeSplines {
+  const S* heads[kHeads];  // (S, P, head_size) control points, or null; the first is there
+  int64_t count, points;   // S, P
+  int64_t first;           // of the four control points that the time depends on
+  S fractions[4];          // their weights
+};
+template <class S>
+struct SplineGrads {
+  S* heads[kHeads];  // (S, P, head_size), null where the splines are
+};
+
+// Writes motion (S, 7) as SkinNodes has it, and the values (S, width) of all heads but the first, one after the other.
+template <class S>
+void nodes_at(const NodeSplines<S>& splines, S* motion, S* values, int threads);
+// Writes the gradients of sum(motion * by_motion) + sum(values * by_values), the latter unless null.
+template <class S>
+void nodes_at_backward(const NodeSplines<S>& splines, const S* by_motion, const S* by_values,
+                       const SplineGrads<S>& grads, int threads);
+
+template <class S>
+struct NodeGraph {
+  const S *positions, *radii;   // (S, 3), (S,) positive
+  const int64_t* neighbours;    // (S, B), each in [0, S)
+  const S *motion, *paths;      // (S, 7) at a time, (S, P, 3) control points of the shifts
+  int64_t count, near, points;  // S, B, P
+};
+// Writes two penalties in squared radii, and their gradients: the mean square of the paths' second differences, by the paths;
+// the mean of |d_j - d_i - (R_i - I) (p_j - p_i)|^2 over neighbours j of nodes i (Sorkine and Alexa 2007), by the motion.
+template <class S>
+void node_penalties(const NodeGraph<S>& graph, double* penalties, S* by_paths, S* by_motion, int threads);
+
 // Skinning by joints --------------------------------------------------------------------------------------------------
 // A body's Gaussians in a pose, by linear blend skinning (Loper et al. 2015): T = sum_j w_j A_j moves the mean and, exactly,
 // the covariance of each (math/posing.hpp).
@@ -377,6 +413,19 @@ struct MovedGaussians {
 // Adds the offsets in place. Rotations are multiplied by identity + offset, not normalised. No row may occur twice.
 template <class S>
 void add_offsets(const RowOffsets<S>& offsets, const MovedGaussians<S>& gaussians, int threads);
+
+// Gradients by moved Gaussians, (N, ...), null for what did not change; where those by the offsets (M, ...) go.
+template <class S>
+struct OffsetGrads {
+  const S *means, *log_scales, *logit_opacities, *sh;
+  int64_t sh_stride;
+  S *by_means, *by_quats, *by_log_scales, *by_logit_opacities, *by_colors;
+  S* quats;  // (N, 4): in, by the quaternions after; out, before
+};
+
+// `quats` (N, 4): the quaternions before. Of `offsets` the rows and quaternions matter.
+template <class S>
+void add_offsets_backward(const RowOffsets<S>& offsets, const S* quats, const OffsetGrads<S>& grads, int threads);
 
 // Inputs of the network of compact colour (dyngs/ops/shading.py has the formulas in torch) ------------------------------
 

@@ -103,9 +103,10 @@ Plan make_plan(const AdamState& state, const AdamRates& rates) {
   const int64_t rows_per_block = std::max<int64_t>(1, kBlockFloats / state.row_size);
   Plan plan{state, rates, coefficients, rows_per_block,
             std::unique_ptr<float[]>(new float[rows_per_block * state.row_size])};
-  for (int64_t row = 0; row < rows_per_block; ++row)
-    for (int64_t i = 0; i < state.row_size; ++i)
-      plan.step[row * state.row_size + i] = static_cast<float>(rates.column_rates[i] / correction1);
+  float* step = plan.step.get();
+  for (int64_t i = 0; i < state.row_size; ++i) step[i] = static_cast<float>(rates.column_rates[i] / correction1);
+  const int64_t rows = std::min(rows_per_block, state.num_rows);
+  for (int64_t row = 1; row < rows; ++row) std::copy_n(step, state.row_size, step + row * state.row_size);
   return plan;
 }
 

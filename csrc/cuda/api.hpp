@@ -101,7 +101,17 @@ int64_t pose_backward_workspace(int64_t count, int64_t joints);
 void pose_backward(const Posing<float>& in, const Posed<const float>& posed, const PosedGrads<float>& g,
                    const PosingGrads<float>& out, const Lent& workspace, Stream stream);
 
+void nodes_at(const NodeSplines<float>& splines, float* motion, float* values, Stream stream);
+void nodes_at_backward(const NodeSplines<float>& splines, const float* by_motion, const float* by_values,
+                       const SplineGrads<float>& grads, Stream stream);
+int64_t node_penalties_workspace(const NodeGraph<float>& graph);
+// `penalties`: two doubles on the GPU.
+void node_penalties(const NodeGraph<float>& graph, double* penalties, float* by_paths, float* by_motion,
+                    const Lent& workspace, Stream stream);
+
 void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& gaussians, Stream stream);
+void add_offsets_backward(const RowOffsets<float>& offsets, const float* quats, const OffsetGrads<float>& grads,
+                          Stream stream);
 void shading_inputs(const Shading<float>& in, float* out, Stream stream);
 
 // Training ------------------------------------------------------------------------------------------------------------

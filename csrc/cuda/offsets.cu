@@ -32,7 +32,43 @@ __global__ void __launch_bounds__(kThreads) add_offsets_kernel(RowOffsets<float>
   if (offsets.colors != nullptr) add3(global(g.sh) + g.sh_stride * row, global(offsets.colors) + 3 * i);
 }
 
+__device__ void put3(const Array<float>& to, const Array<const float>& from) {
+  for (int c = 0; c < 3; ++c) to[c] = static_cast<float>(from[c]);
+}
+
+__device__ Quat<float> quat_at(const float* rows, int64_t row) {
+  const Array<const float> q = global(rows) + 4 * row;
+  return {q[0], q[1], q[2], q[3]};
+}
+
+__device__ void put_quat(float* rows, int64_t row, const Quat<float>& q) {
+  const Array<float> to = global(rows) + 4 * row;
+  to[0] = q.w, to[1] = q.x, to[2] = q.y, to[3] = q.z;
+}
+
+__global__ void __launch_bounds__(kThreads)
+    add_offsets_backward_kernel(RowOffsets<float> offsets, const float* quats, OffsetGrads<float> g) {
+  const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
+  if (i >= offsets.count) return;
+  const int64_t row = offsets.rows != nullptr ? static_cast<int64_t>(global(offsets.rows)[i]) : i;
+  if (g.by_means != nullptr) put3(global(g.by_means) + 3 * i, global(g.means) + 3 * row);
+  if (g.by_log_scales != nullptr) put3(global(g.by_log_scales) + 3 * i, global(g.log_scales) + 3 * row);
+  if (g.by_logit_opacities != nullptr)
+    global(g.by_logit_opacities)[i] = static_cast<float>(global(g.logit_opacities)[row]);
+  if (g.by_colors != nullptr) put3(global(g.by_colors) + 3 * i, global(g.sh) + g.sh_stride * row);
+  if (g.by_quats == nullptr) return;
+  const Quat<float> by = quat_at(g.quats, row), offset = quat_at(offsets.quats, i);
+  put_quat(g.by_quats, i, by * conjugate(quat_at(quats, row)));
+  put_quat(g.quats, row, conjugate(Quat<float>{offset.w + 1.f, offset.x, offset.y, offset.z}) * by);
+}
+
 }  // namespace
+
+void add_offsets_backward(const RowOffsets<float>& offsets, const float* quats, const OffsetGrads<float>& grads,
+                          Stream stream) {
+  launch("add_offsets_backward", {blocks_for(offsets.count, kThreads), kThreads}, stream, add_offsets_backward_kernel,
+         offsets, quats, grads);
+}
 
 void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& gaussians, Stream stream) {
   launch("add_offsets", {blocks_for(offsets.count, kThreads), kThreads}, stream, add_offsets_kernel, offsets,

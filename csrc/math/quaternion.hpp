@@ -45,6 +45,11 @@ DYNGS_HD Quat<R> operator*(const Quat<R>& a, const Quat<R>& b) {
           a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w};
 }
 
+template <class R>
+DYNGS_HD Quat<R> conjugate(const Quat<R>& q) {
+  return {q.w, -q.x, -q.y, -q.z};
+}
+
 // Of a unit quaternion.
 template <class R>
 DYNGS_HD Mat3<R> rotation_matrix(const Quat<R>& q) {

@@ -13,17 +13,19 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import fields
 
 import torch
 from torch import Tensor
 
 from dyngs.config import ControlNodesField
-from dyngs.deform.decoder import head_sizes
+from dyngs.deform.decoder import head_sizes, offsets_of
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets
 from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
-from dyngs.deform.spline_fit import SPAN, refitted, spline_values
+from dyngs.deform.spline_fit import refitted
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
+from dyngs.ops.nodes import SPAN, node_penalties, spline_motion
 from dyngs.state import Role, State, StateTensor, moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
@@ -124,21 +126,35 @@ class ControlNodes(DeformationField):
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         if not len(means):  # whatever nodes there are
             return self.at(time).select(slice(0))
-        nodes, now = self.nodes_for(means), self.at(time)
-        if rows is not None:
-            nodes, means = nodes.followed_by(rows), means.index_select(0, rows)
-        return follow(nodes, means, now)
+        return self._follow(means, rows, *self._motion(means, time))
+
+    def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
+        if not len(means):
+            return super().in_training(means, time)
+        motion, values = self._motion(means, time)
+        return self._follow(means, None, motion, values), self._penalties(motion)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
+        return self._penalties(spline_motion(self._heads(), time)[0])
+
+    def _motion(self, means: Tensor, time: float) -> tuple[Tensor, Tensor]:
+        self.nodes_for(means)
+        return spline_motion(self._heads(), time)
+
+    def _follow(self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor) -> Offsets:
+        nodes = self.nodes_for(means)
+        if rows is not None:
+            nodes, means = nodes.followed_by(rows), means.index_select(0, rows)
+        return follow(nodes, means, motion, values, head_sizes(self.options))
+
+    def _penalties(self, motion: Tensor) -> dict[str, Tensor]:
         """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in squared spacings."""
         if len(self.buffers["positions"]) < 2:
             return {}
-        penalties = {}
-        bend = self.parameters["means"].diff(n=2, dim=1) / self.buffers["radii"][:, None, None]
-        penalties["node acceleration"] = SMOOTHNESS * bend.square().mean()
-        if self.options.rigidity:
-            penalties["node rigidity"] = self.options.rigidity * self._strain(self.at(time))
-        return penalties
+        places, radii, near = (self.buffers[name] for name in ("positions", "radii", "neighbours"))
+        acceleration, strain = node_penalties(places, radii, near, motion, self.parameters["means"]).unbind()
+        penalties = {"node acceleration": SMOOTHNESS * acceleration}
+        return penalties | ({"node rigidity": self.options.rigidity * strain} if self.options.rigidity else {})
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
@@ -150,6 +166,8 @@ class ControlNodes(DeformationField):
         last = self.num_points - 1
         low = 0 if seen[0] <= 0 else math.floor(seen[0] * self.num_pieces) + 1
         high = last if seen[1] >= 1 else math.ceil(seen[1] * self.num_pieces) + SPAN - 3
+        if low == 0 and high == last:  # nothing lies beyond
+            return
         reach, device = min(2, high - low), self.setup.center.device
         after = torch.arange(1, last - high + 1, device=device)[:, None]
         before = torch.arange(low, 0, -1, device=device)[:, None]
@@ -158,10 +176,8 @@ class ControlNodes(DeformationField):
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
     def at(self, time: float) -> Offsets:
-        parts = {name: spline_values(x, time) for name, x in self._splines().items()}
-        if "logit_opacities" in parts:
-            parts["logit_opacities"] = parts["logit_opacities"][:, 0]
-        return Offsets(**parts)
+        motion, values = spline_motion(self._heads(), time)
+        return offsets_of(motion[:, :3], values, head_sizes(self.options))
 
     def _untrained(self, count: int) -> Parameters:
         sizes, device = head_sizes(self.options), self.setup.center.device
@@ -171,6 +187,9 @@ class ControlNodes(DeformationField):
 
     def _splines(self) -> dict[str, Tensor]:
         return {name: self.parameters[name] for name in head_sizes(self.options)}
+
+    def _heads(self) -> list[Tensor | None]:
+        return [self.parameters.get(field.name) for field in fields(Offsets)]
 
     def nodes_for(self, means: Tensor) -> Nodes:
         """Return the nodes, placed among ``means`` (M, 3) if need be, which follow them."""
@@ -211,11 +230,3 @@ class ControlNodes(DeformationField):
             swing = turned(splines["quats"][nodes.followed], arms) - arms
             started["means"] = started["means"] + torch.einsum("mb,mbpd->mpd", weights, swing)
         return started
-
-    def _strain(self, now: Offsets) -> Tensor:
-        """Return the mean of |x_j - x_i - R_i (p_j - p_i)|^2 over the squared spacing (Sorkine and Alexa 2007)."""
-        positions, neighbours = self.buffers["positions"], self.buffers["neighbours"]
-        arms = positions[neighbours] - positions[:, None]
-        kept = arms if now.quats is None else turned(now.quats[:, None].expand(-1, arms.shape[1], -1), arms)
-        strain = arms + now.means[neighbours] - now.means[:, None] - kept
-        return (strain / self.buffers["radii"][:, None, None]).square().sum(-1).mean()

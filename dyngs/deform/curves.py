@@ -17,7 +17,8 @@ from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, Offsets
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.nodes import FOLLOWED
-from dyngs.deform.spline_fit import SPAN, spline_basis
+from dyngs.deform.spline_fit import spline_basis
+from dyngs.ops.nodes import SPAN
 
 SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
 FEWEST_PIECES, MOST_PIECES = 8, 256

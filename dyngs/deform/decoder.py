@@ -58,8 +58,13 @@ def head_sizes(options: FieldSection) -> Mapping[str, int]:
 
 def split_heads(outputs: Tensor, options: FieldSection) -> Offsets:
     """Return the outputs (M, K) of the heads by name."""
-    heads = head_sizes(options)
-    parts = dict(zip(heads, outputs.split(list(heads.values()), dim=1), strict=True))
+    return offsets_of(outputs[:, :3], outputs[:, 3:], head_sizes(options))
+
+
+def offsets_of(means: Tensor, values: Tensor, heads: Mapping[str, int]) -> Offsets:
+    """Return offsets with ``means`` (M, 3), and the ``values`` (M, D) of all other ``heads`` by name."""
+    sizes = {name: size for name, size in heads.items() if name != "means"}
+    parts = dict(zip(sizes, values.split(list(sizes.values()), dim=1), strict=True))
     if "logit_opacities" in parts:
         parts["logit_opacities"] = parts["logit_opacities"][:, 0]
-    return Offsets(**parts)
+    return Offsets(means, **parts)

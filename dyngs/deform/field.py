@@ -17,8 +17,7 @@ from torch.autograd.function import once_differentiable
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
-from dyngs.ops.quaternions import identity_quat, quat_product
-from dyngs.ops.skinning import add_offsets_
+from dyngs.ops.skinning import add_offsets_, offset_gradients
 from dyngs.state import State, moved_to, part_of, prefixed
 
 F = TypeVar("F", bound="DeformationField")
@@ -93,6 +92,10 @@ class DeformationField:
         """Return differentiable regularizers of the field itself, weighted, by name; some look at ``time`` only."""
         return {}
 
+    def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
+        """Return ``offsets`` and ``penalties`` of one time, which may share work."""
+        return self.offsets(means, time), self.penalties(time)
+
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
 
@@ -158,9 +161,9 @@ class _AddOffsets(torch.autograd.Function):
         own = means, quats, log_scales, logit_opacities, sh
         copies = [x if by is None else x.contiguous().clone() for x, by in zip(own, offsets, strict=True)]
         add_offsets_(copies, rows, offsets)
-        turned = () if offsets[1] is None else (chosen(quats, rows), offsets[1])
+        turned = () if offsets[1] is None else (quats, offsets[1])
         ctx.save_for_backward(*([] if rows is None else [rows]), *turned)
-        ctx.has_rows = rows is not None
+        ctx.has_rows, ctx.count = rows is not None, len(means) if rows is None else len(rows)
         return tuple(None if by is None else x for x, by in zip(copies, offsets, strict=True))
 
     @staticmethod
@@ -168,23 +171,8 @@ class _AddOffsets(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         saved = list(ctx.saved_tensors)
         rows = saved.pop(0) if ctx.has_rows else None
-        means, quats, log_scales, logit_opacities, sh = grads
-        by_means, by_log_scales, by_logits = (
-            None if x is None else chosen(x, rows) for x in (means, log_scales, logit_opacities)
-        )
-        by_quats, by_colors = None, None if sh is None else chosen(sh[:, 0], rows)
-        if quats is not None:
-            own, offset = saved
-            here = chosen(quats, rows)
-            by_quats = quat_product(here, _conjugate(own))
-            by_own = quat_product(_conjugate(offset + identity_quat(offset)), here)
-            quats = by_own if rows is None else quats.index_copy(0, rows, by_own)
-        own_grads = (means, quats, log_scales, logit_opacities, sh)
-        return None, *own_grads, by_means, by_quats, by_log_scales, by_logits, by_colors
-
-
-def _conjugate(quats: Tensor) -> Tensor:
-    return torch.cat([quats[:, :1], -quats[:, 1:]], dim=1)
+        by_offsets, by_quats = offset_gradients(grads, rows, ctx.count, *(saved or (None, None)))
+        return None, grads[0], by_quats, *grads[2:], *by_offsets
 
 
 def chosen(x: Tensor, rows: Tensor | None) -> Tensor:

@@ -5,12 +5,14 @@ Local letters: S nodes, B nodes that one Gaussian follows.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from dyngs.deform.decoder import offsets_of
 from dyngs.deform.field import Offsets
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.ops.skinning import blend_skinning
@@ -73,22 +75,14 @@ def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
     return torch.tensor(chosen, dtype=torch.long, device=points.device)
 
 
-def follow(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
-    """Return offsets of the points ``means`` (M, 3) from those of the nodes.
+def follow(nodes: Nodes, means: Tensor, motion: Tensor, values: Tensor, heads: Mapping[str, int]) -> Offsets:
+    """Return offsets of the points ``means`` (M, 3) from the nodes' ``motion`` (S, 7) and ``values`` (S, D).
 
     A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b); differentiable in x,
-    the weights taken as constant. All other offsets are blended alike.
+    the weights taken as constant. The values of all other ``heads``, names and sizes in order, are blended alike.
     """
-    identity = identity_quat(at_nodes.means)
-    quats = identity.expand(len(at_nodes.means), 4) if at_nodes.quats is None else at_nodes.quats + identity
-    others = {name: x for name, x in vars(at_nodes).items() if name != "means" and x is not None}
-    values = torch.cat(
-        [at_nodes.means.new_zeros(len(quats), 0), *(x.reshape(len(x), -1) for x in others.values())], dim=1
-    )
-    motion = torch.cat([at_nodes.means, quats], dim=1)
     moved, blended = blend_skinning(means, nodes.positions, nodes.radii, nodes.followed, motion, values)
-    parts = blended.split([x[0].numel() for x in others.values()], dim=1)
-    return Offsets(moved, **{n: p.reshape(-1, *x.shape[1:]) for (n, x), p in zip(others.items(), parts, strict=True)})
+    return offsets_of(moved, blended, heads)
 
 
 def turned(offsets: Tensor, vectors: Tensor) -> Tensor:

@@ -72,19 +72,20 @@ class DynamicScene(GaussianScene):
         now = clamped_time(time)
         if self.field is None or self.is_static:
             return GaussianTimeStep(filtered(self.gaussians, self.filter_std), now)
-        return GaussianTimeStep(self.deformed_at(now)[0], now)
+        part = self._drawn_around(now)
+        return GaussianTimeStep(part.moved(self.field.offsets(part.moving_means, now, part.asked)), now)
 
-    def deformed_at(self, time: float, *, detach: bool = False) -> tuple[Gaussians, Offsets]:
-        """Return the Gaussians drawn at ``time``, and the offsets of those of them that move.
+    def in_training(self, time: float, *, detach: bool) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
+        """Return the Gaussians at ``time``, the offsets of those that move, and the field's penalties.
 
         Args:
             detach: gradients reach the field alone, not the canonical Gaussians.
         """
-        if self.field is None:
-            raise ValueError("nothing moves")
-        part = self._drawn_around(time, detach=detach)
-        offsets = self.field.offsets(part.moving_means, time, part.asked)
-        return filtered(deformed(part.gaussians, offsets, part.rows), part.filter_std), offsets
+        if self.field is None or self.masks is not None:
+            raise ValueError("nothing moves, or not all is drawn at all times")
+        part = self._selected(self.gaussians.detach() if detach else self.gaussians, 0)
+        offsets, penalties = self.field.in_training(part.moving_means, time)
+        return part.moved(offsets), offsets, penalties
 
     def edited(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
@@ -110,11 +111,11 @@ class DynamicScene(GaussianScene):
             state["rows"] = StateTensor(self.moving, Role.SHARED)
         return state if self.masks is None else state | prefixed("masks", self.masks.state())
 
-    def _drawn_around(self, time: float, *, detach: bool) -> _Part:
+    def _drawn_around(self, time: float) -> _Part:
         """Return the Gaussians drawn around ``time``; without gradients, those of the last mask interval are kept."""
         interval = 0 if self.masks is None else self.masks.interval(time)
         if torch.is_grad_enabled():
-            return self._selected(self.gaussians.detach() if detach else self.gaussians, interval)
+            return self._selected(self.gaussians, interval)
         if interval not in self._derived:
             self._derived.clear()
             self._derived[interval] = self._selected(self.gaussians, interval)
@@ -145,3 +146,6 @@ class _Part:
     moving_means: Tensor  # (M, 3) canonical means of all that move
     asked: Tensor | None  # which of the M are drawn; None: all
     rows: Tensor | None  # their places among the A; None: all of them, in order
+
+    def moved(self, offsets: Offsets) -> Gaussians:
+        return filtered(deformed(self.gaussians, offsets, self.rows), self.filter_std)

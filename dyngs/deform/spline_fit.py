@@ -10,9 +10,8 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.ops.device import sent
+from dyngs.ops.nodes import SPAN
 
-SPAN = 4  # Control points that a value depends on
 _SAMPLES_PER_PIECE = 8  # Places per piece at which two splines are compared; a cubic is determined by four
 
 
@@ -45,19 +44,3 @@ def refitted(points: Tensor, pieces: int) -> Tensor:
     places = (torch.arange(count, dtype=torch.float64, device=points.device) + 0.5) / count
     fit = torch.linalg.lstsq(spline_basis(places, pieces), spline_basis(places, old)).solution
     return torch.einsum("qp,spd->sqd", fit, points.double()).to(points)
-
-
-def cubic_fractions(place: float) -> Tensor:
-    """Return the (4,) weights of the control points of a piece of a uniform cubic B-spline, at ``place`` in [0, 1]."""
-    rest = 1 - place
-    middle = [(3 * x**3 - 6 * x**2 + 4) / 6 for x in (place, rest)]
-    return torch.tensor([rest**3 / 6, *middle, place**3 / 6], device="cpu")
-
-
-def spline_values(points: Tensor, time: float) -> Tensor:
-    """Return (S, D) values at ``time`` in [0, 1] of the uniform cubic B-splines with control ``points`` (S, P, D)."""
-    pieces = points.shape[1] - SPAN + 1
-    place = min(max(time, 0.0), 1.0) * pieces
-    piece = min(int(place), pieces - 1)
-    fractions = sent(cubic_fractions(place - piece)[:, None], points.device)
-    return (fractions * points[:, piece : piece + SPAN]).sum(1)

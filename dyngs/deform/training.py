@@ -107,9 +107,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if scene.field is None:
             return scene.time_step(image.time)
         time = image.time or 0.0
-        gaussians, offsets = scene.deformed_at(time, detach=self._window.tracks(step))
-        penalties = scene.field.penalties(time) | self._sparsity(offsets)
-        return GaussianTimeStep(gaussians, image.time, None, penalties)
+        gaussians, offsets, penalties = scene.in_training(time, detach=self._window.tracks(step))
+        return GaussianTimeStep(gaussians, image.time, None, penalties | self._sparsity(offsets))
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         if scene.field is None:

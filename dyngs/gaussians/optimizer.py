@@ -58,10 +58,8 @@ class GaussianOptimizer:
         }
         if frozen_rest is not None and self.parameters.sh.grad is not None:
             self.parameters.sh.grad[frozen_rest, 1:] = 0
-        return sum(
-            self._adam.step_(name, x, lr=rates[name], step=step, eps=ADAM_EPS, rows=rows)
-            for name, x in self.parameters.tensors().items()
-        )
+        updates = [self._adam.update(name, x, rates[name], rows) for name, x in self.parameters.tensors().items()]
+        return self._adam.steps_(updates, step=step, eps=ADAM_EPS)
 
     def apply(self, result: EditResult) -> None:
         """Change the set of Gaussians: parameters and moments of survivors move along, new rows start without moments.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.adam import MOMENTS, AdamState
 from dyngs.gaussians import TopologyEdit
-from dyngs.ops.adam import Count, seen_rows
+from dyngs.ops.adam import AdamUpdate, Count, seen_rows
 from dyngs.state import Role, State, StateTensor, moved_to
 from dyngs.tensor_checks import require_tensor
 
@@ -60,16 +60,13 @@ class Parameters:
 
     def update(self, step: int, factor: float) -> Count:
         """As ``step``, with all rates multiplied by ``factor``."""
-        return sum(
-            self._update_one(name, x, self.rates[name] * factor, step)
-            for name, x in self._tensors.items()
-            if x.grad is not None
-        )
+        updates = [self._update_of(name, x, self.rates[name] * factor) for name, x in self._tensors.items()]
+        return self._adam.steps_(updates, step=step)
 
-    def _update_one(self, name: str, x: Tensor, lr: float, step: int) -> Count:
+    def _update_of(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:
         if self._roles[name] is not Role.PER_MOVING:
-            return self._adam.step_along_last_axis_(name, x, lr=lr, step=step)
-        return self._adam.step_(name, x, lr=lr, step=step, rows=None if x.grad is None else seen_rows(x.grad))
+            return self._adam.update_along_last_axis(name, x, lr)
+        return self._adam.update(name, x, lr, None if x.grad is None else seen_rows(x.grad))
 
     def edited(self, role: Role, edit: TopologyEdit) -> Parameters:
         """Return the parameters after an edit of the Gaussians that ``role`` speaks of."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import torch
@@ -14,27 +16,33 @@ from dyngs.ops.native import num_threads
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
 
 Count: TypeAlias = int | Tensor  # a number, or a tensor () of one that may still be on a GPU, where int waits for it
+_ARRAYS = "param", "grad", "exp_avg", "exp_avg_sq"
 
 
-def _adam_step(
-    param: Tensor,
-    grad: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    rates: Tensor,
-    rows: Tensor | None,
+def _adam_steps(
+    params: list[Tensor],
+    grads: list[Tensor],
+    exp_avgs: list[Tensor],
+    exp_avg_sqs: list[Tensor],
+    rates: list[Tensor],
+    rows: list[Tensor | None],
     betas: list[float],
     eps: float,
     step: int,
 ) -> Tensor:
-    skipped = param.new_zeros(1, dtype=torch.int32)
-    changed, options = [InPlace(x) for x in (param, exp_avg, exp_avg_sq)], (betas[0], betas[1], eps, step)
-    launch(param, "adam_step", changed[0], grad, *changed[1:], rates, rows, skipped, options, num_threads())
+    skipped = params[0].new_zeros(1, dtype=torch.int32)
+    arrays = [
+        (InPlace(param), grad, InPlace(first), InPlace(second), rate, chosen)
+        for param, grad, first, second, rate, chosen in zip(
+            params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True
+        )
+    ]
+    launch(params[0], "adam_steps", arrays, skipped, (betas[0], betas[1], eps, step), num_threads())
     return skipped[0].long()
 
 
-adam_step_op = register("adam_step_", _adam_step, mutates=("param", "exp_avg", "exp_avg_sq"))
-"""Update (N, C) arrays in place, with rates (C,) and rows (N,) bool; returns the number () int64 of rows skipped."""
+adam_steps_op = register("adam_steps_", _adam_steps, mutates=("params", "exp_avgs", "exp_avg_sqs"))
+"""Update arrays in place, each with rates (C,) and rows (size / C,) bool; returns the number () of rows skipped."""
 
 
 def _seen_rows(grads: Tensor) -> Tensor:
@@ -46,7 +54,22 @@ def _seen_rows(grads: Tensor) -> Tensor:
 seen_rows_op = register("seen_rows", _seen_rows)
 
 
-@torch.no_grad()
+@dataclass(frozen=True)
+class AdamUpdate:
+    """An update of ``param`` (N, ...): N rows of C numbers.
+
+    ``grad`` and the moments have its shape; ``lr``: a rate, or (C,) rates, better on the CPU; ``rows`` (N,) bool: the
+    rows to update, None: all. All but ``grad`` contiguous.
+    """
+
+    param: Tensor
+    grad: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    lr: float | Tensor
+    rows: Tensor | None = None
+
+
 def adam_step_(
     param: Tensor,
     grad: Tensor,
@@ -59,26 +82,42 @@ def adam_step_(
     betas: tuple[float, float] = (0.9, 0.999),
     rows: Tensor | None = None,
 ) -> Tensor:
-    """Update ``param`` and its two moments in place; return the number () int64 of rows skipped for a bad gradient.
+    """As ``adam_steps_`` of one array."""
+    return adam_steps_([AdamUpdate(param, grad, exp_avg, exp_avg_sq, lr, rows)], step=step, eps=eps, betas=betas)
+
+
+@torch.no_grad()
+def adam_steps_(
+    updates: Sequence[AdamUpdate], *, step: int, eps: float = 1e-15, betas: tuple[float, float] = (0.9, 0.999)
+) -> Tensor:
+    """Update arrays of one dtype and device in place; return the number () int64 of rows skipped for a bad gradient.
 
     Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global ``step`` (from 1) also for
     rows skipped before. A gradient is bad if it is NaN, infinite, or so large that its square is not safely finite
-    (2^63 in float32, 2^511 in float64). ``param`` (N, ...) contiguous: N rows of C numbers; ``grad`` and the moments
-    have its shape, the moments contiguous; ``lr``: a rate, or (C,) rates, better on the CPU; ``rows`` (N,) bool: the
-    rows to update, None: all. Raises DyngsError: shapes or dtypes that do not fit, or constants out of range.
+    (2^63 in float32, 2^511 in float64). At least one update. Raises DyngsError: shapes or dtypes that do not fit, or
+    constants out of range; then nothing is updated.
     """
-    _check(param, grad, exp_avg, exp_avg_sq, rows, step)
-    if not torch.finfo(param.dtype).tiny <= eps < math.inf:
-        raise DyngsError(f"Adam: eps must be at least {torch.finfo(param.dtype).tiny:.3g} and finite, got {eps}")
+    like = updates[0].param
+    for update in updates:
+        _check(update, like)
+    if step < 1:
+        raise DyngsError(f"Adam: step counts from 1, got {step}")
+    if not torch.finfo(like.dtype).tiny <= eps < math.inf:
+        raise DyngsError(f"Adam: eps must be at least {torch.finfo(like.dtype).tiny:.3g} and finite, got {eps}")
     if not all(0 <= beta < 1 for beta in betas):
         raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
-    if param.numel() == 0:
-        return torch.zeros((), dtype=torch.int64, device=param.device)
-    row_size = param.numel() // len(param)
-    rates = _column_rates(lr, row_size, param)
-    p, g, m, v = (x.detach().view(len(param), row_size) for x in (param, grad.contiguous(), exp_avg, exp_avg_sq))
-    native = param.dtype == torch.float32 and has_kernel("adam_step_", param.device)
-    return (adam_step_op if native else _torch_adam_step)(p, g, m, v, rates, rows, list(betas), eps, step)
+    chosen = [x for x in updates if x.param.numel()]
+    rates = [_column_rates(x.lr, x.param.numel() // len(x.param), x.param) for x in chosen]
+    if not chosen:
+        return torch.zeros((), dtype=torch.int64, device=like.device)
+    params, grads, exp_avgs, exp_avg_sqs = ([getattr(x, n).detach() for x in chosen] for n in _ARRAYS)
+    rows = [x.rows for x in chosen]
+    if like.dtype == torch.float32 and has_kernel("adam_steps_", like.device):
+        return adam_steps_op(params, grads, exp_avgs, exp_avg_sqs, rates, rows, list(betas), eps, step)
+    skipped = torch.zeros((), dtype=torch.int64, device=like.device)
+    for p, g, m, v, rate, row in zip(params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True):
+        skipped += _torch_adam_step(p, g, m, v, rate, row, betas, eps, step)
+    return skipped
 
 
 @torch.no_grad()
@@ -98,11 +137,12 @@ def _torch_adam_step(
     exp_avg_sq: Tensor,
     rates: Tensor,
     rows: Tensor | None,
-    betas: list[float],
+    betas: tuple[float, float],
     eps: float,
     step: int,
 ) -> Tensor:
-    """Return the number of rows skipped, as ``adam_step_op``, in plain torch: for other dtypes and devices."""
+    """Return the number of rows skipped, as ``adam_steps_op``, in plain torch: for other dtypes and devices."""
+    param, grad, exp_avg, exp_avg_sq = (x.reshape(len(x), -1) for x in (param, grad, exp_avg, exp_avg_sq))
     too_large = 2.0 ** (math.frexp(torch.finfo(grad.dtype).max)[1] // 2 - 1)
     usable = (grad.abs() < too_large).all(dim=1)  # NaN is not
     wanted = torch.ones_like(usable) if rows is None else rows
@@ -131,18 +171,16 @@ def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     return rates.contiguous()
 
 
-def _check(param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rows: Tensor | None, step: int) -> None:
+def _check(update: AdamUpdate, like: Tensor) -> None:
+    param, rows = update.param, update.rows
     if param.ndim == 0:
         raise DyngsError("Adam: the parameter must have at least one dimension, got a scalar")
-    for name, x in (("grad", grad), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
-        if x.shape != param.shape or x.dtype != param.dtype:
-            raise DyngsError(
-                f"Adam: {name} is {tuple(x.shape)} {x.dtype}, but the parameter {tuple(param.shape)} {param.dtype}"
-            )
-    for name, x in (("param", param), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
-        if not x.is_contiguous():
+    shape, dtype = param.shape, like.dtype
+    for name in _ARRAYS:
+        x: Tensor = getattr(update, name)
+        if x.shape != shape or x.dtype != dtype:
+            raise DyngsError(f"Adam: {name} is {tuple(x.shape)} {x.dtype}, but the parameter {tuple(shape)} {dtype}")
+        if name != "grad" and not x.is_contiguous():
             raise DyngsError(f"Adam: {name} must be contiguous, as it is updated in place; call .contiguous() first")
-    if rows is not None and (rows.shape != param.shape[:1] or rows.dtype != torch.bool):
+    if rows is not None and (rows.shape != shape[:1] or rows.dtype != torch.bool):
         raise DyngsError(f"Adam: rows must be ({len(param)},) bool, got {tuple(rows.shape)} {rows.dtype}")
-    if step < 1:
-        raise DyngsError(f"Adam: step counts from 1, got {step}")

@@ -66,10 +66,42 @@ def register(
     for device in devices:
         if device != "cuda" or has_cuda_core():
             implement(name, device, kernel)
+    op = getattr(getattr(torch.ops, NAMESPACE), name).default
     if gradient is not None:
         formula = _first_order(qualified, gradient.backward)
-        torch.library.register_autograd(qualified, formula, setup_context=gradient.save, lib=_LIBRARY)
-    return cast(Callable[P, R], getattr(getattr(torch.ops, NAMESPACE), name).default)
+        if "[]" in schema.replace("int[]", "").replace(
+            "float[]", ""
+        ):  # lists of tensors, which autograd has no place for
+            torch.library.register_autograd(qualified, formula, setup_context=gradient.save, lib=_LIBRARY)
+        else:
+            _LIBRARY.impl(name, _with_gradient(op, gradient.save, formula), "Autograd", with_keyset=True)
+    return cast(Callable[P, R], op)
+
+
+def _with_gradient(op: Any, save: Callable[..., None], formula: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``op`` for tensors that may require gradients, as ``torch.library.register_autograd`` in half the time."""
+
+    def below(keys: Any, arguments: tuple[Any, ...]) -> Any:
+        with torch._C._AutoDispatchBelowAutograd():  # pyright: ignore[reportPrivateUsage]
+            return op.redispatch(keys & torch._C._after_autograd_keyset, *arguments)  # pyright: ignore[reportPrivateUsage]
+
+    class Recorded(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, *arguments: Any) -> Any:  # the last are the keys
+            output = below(arguments[-1], arguments[:-1])
+            save(ctx, arguments[:-1], output)
+            return output
+
+        @staticmethod
+        def backward(ctx: Any, *grads: Tensor | None) -> Any:
+            results = formula(ctx, *grads)
+            return (*results, None) if isinstance(results, tuple) else (results, None)
+
+    def dispatched(keys: Any, *arguments: Any) -> Any:
+        wanted = torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments)  # pyright: ignore[reportPrivateUsage]
+        return cast(Any, Recorded.apply(*arguments, keys)) if wanted else below(keys, arguments)
+
+    return dispatched
 
 
 @dataclass(frozen=True)
@@ -117,6 +149,8 @@ def empty_like(x: Tensor) -> Tensor:
 
 def _passed(core: ModuleType, value: Any) -> Any:
     match value:
+        case None | int() | float():
+            return value
         case Tensor():
             return array(value)
         case InPlace():

@@ -147,3 +147,34 @@ def add_offsets_(gaussians: Sequence[Tensor], rows: Tensor | None, offsets: Sequ
         x.data.contiguous() if offset is None else x.detach() for x, offset in zip(gaussians, offsets, strict=True)
     )
     add_offsets_op(means, quats, log_scales, logits, sh, rows, by_means, by_quats, by_log_scales, by_logits, by_colors)
+
+
+def _add_offsets_backward(
+    grads: list[Tensor | None], rows: Tensor | None, count: int, quats: Tensor | None, offset: Tensor | None
+) -> list[Tensor]:
+    like = next(x for x in grads if x is not None)
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3))
+    results = [None if x is None else like.new_empty(shape) for x, shape in zip(grads, shapes, strict=True)]
+    means, turned, log_scales, logits, sh = grads
+    before = None if turned is None else turned.clone(memory_format=torch.contiguous_format)
+    own = (None,) * 3 if before is None else (quats, offset, InPlace(before))
+    given = (means, log_scales, logits, sh)
+    launch(like, "add_offsets_backward", given, rows, own, results, count, like.shape[0], num_threads())
+    return [x for x in (*results, before) if x is not None]
+
+
+add_offsets_backward_op = register("add_offsets_backward", _add_offsets_backward)
+
+
+def offset_gradients(
+    grads: Sequence[Tensor | None], rows: Tensor | None, count: int, quats: Tensor | None, offset: Tensor | None
+) -> tuple[list[Tensor | None], Tensor | None]:
+    """Return the gradients by the M = ``count`` offsets of ``add_offsets_``, and by the quaternions before it.
+
+    ``grads``: by means, quats, log scales, opacity logits and harmonics after it, None where there is none, and then
+    there is none in what is returned. ``quats`` (N, 4) before it, and their ``offset`` (M, 4), where they were turned.
+    """
+    if all(x is None for x in grads):
+        return [None] * len(grads), None
+    found = iter(add_offsets_backward_op(list(grads), rows, count, quats, offset))
+    return [None if x is None else next(found) for x in grads], next(found, None)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny_fields import HEADS, KINDS, cloud, stirred_field
+from tiny_fields import HEADS, KINDS, cloud, followed, stirred_field
 
 from dyngs.deform.curves import Curves, curves_of, fitted_curves
 from dyngs.deform.field import Offsets
-from dyngs.deform.nodes import Nodes, follow
+from dyngs.deform.nodes import Nodes
 from dyngs.deform.spline_fit import spline_basis
 
 
@@ -46,7 +46,7 @@ def test_nodes_are_exact() -> None:
     for time in (0.0, 0.31, 1.0):
         heads = played(curves, time)
         heads["logit_opacities"] = heads["logit_opacities"][:, 0]
-        truth, found = field.offsets(means, time), follow(nodes, means, Offsets(**heads))
+        truth, found = field.offsets(means, time), followed(nodes, means, Offsets(**heads))
         for name, x in vars(truth).items():
             torch.testing.assert_close(getattr(found, name), x.detach(), atol=1e-5, rtol=1e-4)
 

@@ -7,10 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tiny_fields import followed
 from torch import Tensor
 
 from dyngs.deform.field import Offsets
-from dyngs.deform.nodes import FOLLOWED, Nodes, follow, nodes_at, spread_out, turned
+from dyngs.deform.nodes import FOLLOWED, Nodes, nodes_at, spread_out, turned
 
 
 def points(count: int, seed: int = 0) -> Tensor:
@@ -46,7 +47,7 @@ def test_a_rigid_motion_of_the_nodes_moves_all_followers_rigidly(count: int, num
     rotation, quat, shift = rigid(seed)
     target = nodes.positions @ matrix(rotation).T + shift
     at_nodes = Offsets(target - nodes.positions, (quat - IDENTITY).expand(len(target), 4))
-    moved = follow(nodes, means, at_nodes)
+    moved = followed(nodes, means, at_nodes)
     torch.testing.assert_close(means + moved.means, means @ matrix(rotation).T + shift, rtol=0, atol=1e-9)
     assert moved.quats is not None
     torch.testing.assert_close(moved.quats, (quat - IDENTITY).expand(count, 4), rtol=0, atol=1e-12)
@@ -75,7 +76,7 @@ def test_a_gaussian_far_from_all_nodes_still_follows_them() -> None:
 def test_without_rotations_nodes_only_shift() -> None:
     means = points(6)
     nodes = place_nodes(means, 3)
-    moved = follow(nodes, means, Offsets(torch.ones(3, 3, dtype=torch.float64)))
+    moved = followed(nodes, means, Offsets(torch.ones(3, 3, dtype=torch.float64)))
     torch.testing.assert_close(moved.means, torch.ones(6, 3, dtype=torch.float64))
     assert moved.quats is None
     assert moved.colors is None
@@ -88,7 +89,7 @@ def test_all_other_offsets_are_blended() -> None:
     at_nodes = Offsets(
         torch.zeros(5, 3).double(), None, values[:, None].expand(5, 3), values, -values[:, None].expand(5, 3)
     )
-    moved = follow(nodes, means, at_nodes)
+    moved = followed(nodes, means, at_nodes)
     expected = (nodes.weights(means) * values[nodes.followed]).sum(1)
     assert moved.log_scales is not None
     torch.testing.assert_close(moved.logit_opacities, expected)
@@ -130,7 +131,7 @@ def test_few_nodes(means: Tensor, num_nodes: int, dtype: torch.dtype) -> None:
     assert nodes.positions.dtype == nodes.radii.dtype == dtype
     assert nodes.followed.shape == (len(means), min(count, FOLLOWED))
     assert (nodes.radii > 0).all()
-    moved = follow(nodes, means, Offsets(torch.ones(count, 3, dtype=dtype), torch.zeros(count, 4, dtype=dtype)))
+    moved = followed(nodes, means, Offsets(torch.ones(count, 3, dtype=dtype), torch.zeros(count, 4, dtype=dtype)))
     torch.testing.assert_close(moved.means, torch.ones(len(means), 3, dtype=dtype))
 
 
@@ -166,12 +167,12 @@ def test_gradients_of_follow() -> None:
     leaves = [(0.3 * torch.randn(s, generator=generator, dtype=torch.float64)).requires_grad_() for s in shapes]
 
     def moved(*at_nodes: Tensor) -> tuple[Tensor, ...]:
-        return tuple(vars(follow(nodes, means, Offsets(*at_nodes))).values())
+        return tuple(vars(followed(nodes, means, Offsets(*at_nodes))).values())
 
     assert torch.autograd.gradcheck(moved, leaves)
     rotation, quat, shift = rigid(5)
     target = nodes.positions @ matrix(rotation).T + shift
     at_nodes = Offsets(target - nodes.positions, (quat - IDENTITY).expand(3, 4))
     x, direction = means.clone().requires_grad_(), points(4, seed=2)
-    (slope,) = torch.autograd.grad(((x + follow(nodes, x, at_nodes).means) * direction).sum(), [x])
+    (slope,) = torch.autograd.grad(((x + followed(nodes, x, at_nodes).means) * direction).sum(), [x])
     torch.testing.assert_close(slope, direction @ matrix(rotation), rtol=0, atol=1e-12)

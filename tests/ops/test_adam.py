@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.ops.adam import adam_step_, adam_step_op, seen_rows, seen_rows_op
+from dyngs.ops.adam import AdamUpdate, adam_step_, adam_steps_, adam_steps_op, seen_rows, seen_rows_op
 
 # Rows shorter and longer than a vector, tails, several blocks of 2048 floats, and one row longer than a block.
 SHAPES = [(1,), (700,), (5000,), (701, 3), (1, 4), (90, 15, 3), (130, 16, 3), (3, 2500)]
@@ -229,12 +230,39 @@ def test_arguments_that_do_not_fit() -> None:
             adam_step_(param, grad, exp_avg, exp_avg_sq, lr=0.1, step=1, betas=betas)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_several_at_once_are_as_each_alone(dtype: torch.dtype) -> None:
+    rows = torch.arange(701) % 3 == 0
+    together, alone = ([make_state(shape, dtype, seed) for seed, shape in enumerate(SHAPES)] for _ in range(2))
+    for state in (together, alone):
+        state[3][1][6, 0] = math.nan
+    found = adam_steps_(
+        [AdamUpdate(*x, 0.1, rows if len(x[0]) == 701 else None) for x in together], step=3, betas=(0.8, 0.99)
+    )
+    skipped = [
+        adam_step_(*x, lr=0.1, step=3, betas=(0.8, 0.99), rows=rows if len(x[0]) == 701 else None) for x in alone
+    ]
+    assert found == sum(skipped) == 1
+    for one, other in zip(together, alone, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip(one, other, strict=True) if not x.isnan().any())
+
+
+def test_nothing_is_updated_where_one_does_not_fit() -> None:
+    good, bad = (AdamUpdate(*make_state((6, 3)), 0.1) for _ in range(2))
+    before = good.param.clone()
+    with pytest.raises(DyngsError, match="grad is"):
+        adam_steps_([good, dataclasses.replace(bad, grad=torch.zeros(5, 3))], step=1)
+    assert torch.equal(good.param, before)
+
+
 @pytest.mark.parametrize("masked", [True, False])
 def test_is_a_well_behaved_torch_op(masked: bool) -> None:
     param, grad, exp_avg, exp_avg_sq = make_state((6, 3))
     rows = torch.tensor([True, False] * 3) if masked else None
     rates = torch.full((3,), 0.1)
-    torch.library.opcheck(adam_step_op, (param, grad, exp_avg, exp_avg_sq, rates, rows, [0.9, 0.999], 1e-15, 3))
+    other = [x.clone() for x in make_state((8,))]
+    lists = [[x, y] for x, y in zip((param, grad, exp_avg, exp_avg_sq), other, strict=True)]
+    torch.library.opcheck(adam_steps_op, (*lists, [rates, rates[:1]], [rows, None], [0.9, 0.999], 1e-15, 3))
     torch.library.opcheck(seen_rows_op, (grad,))
 
 

@@ -21,13 +21,14 @@ from dyngs.ops import native
 from dyngs.ops.adam import adam_step_, seen_rows
 from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.loss import l1_ssim_loss
+from dyngs.ops.nodes import HEAD_SIZES, node_penalties, spline_motion
 from dyngs.ops.perceptron import GPU_LAYERS, GPU_WIDTH, Layer, perceptron, perceptron_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
 from dyngs.ops.shading import Sight, shading_inputs
-from dyngs.ops.skinning import add_offsets_, blend_skinning
+from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -121,6 +122,21 @@ def moved() -> Made:
     return tensors
 
 
+def controlled() -> Made:
+    """Nodes at a time and their penalties, with gradients by the splines; and those by offsets of rows."""
+    generator = torch.Generator().manual_seed(0)
+    heads: list[Tensor | None] = [torch.randn(6, 7, size, generator=generator).requires_grad_() for size in HEAD_SIZES]
+    leaves = [x for x in heads if x is not None]
+    motion, values = spline_motion(heads, 0.4)
+    near = torch.tensor([1, 2, 3, 4, 5, 0])[:, None]
+    penalties = node_penalties(torch.randn(6, 3, generator=generator), torch.full((6,), 1.3), near, motion, leaves[0])
+    total = motion.square().sum() + values.square().sum() + penalties.sum()
+    tensors = list(single().gaussians.tensors().values())
+    grads, own = offset_gradients(tensors, torch.tensor([3, 1]), 2, tensors[1], torch.ones(2, 4))
+    found = [x for x in (*grads, own) if x is not None]
+    return [motion, values, penalties, *torch.autograd.grad(total, leaves), *found]
+
+
 def shaded() -> Made:
     """Inputs of a colour network, of a body at rest with all that there is, and of a scene with the least."""
     scene, rows = single(), torch.tensor([4, 0, 9])
@@ -198,6 +214,7 @@ CASES: dict[str, Callable[[], Made]] = {
     "loss": compared,
     "adam": updated,
     "offsets": moved,
+    "nodes": controlled,
     "shading": shaded,
     "planes": looked_up,
     "skinning": skinned,

@@ -14,7 +14,14 @@ from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
-from dyngs.ops.skinning import add_offsets_, add_offsets_op, blend_skinning, skinning_backward_op, skinning_op
+from dyngs.ops.skinning import (
+    add_offsets_,
+    add_offsets_backward_op,
+    add_offsets_op,
+    blend_skinning,
+    skinning_backward_op,
+    skinning_op,
+)
 
 IDENTITY = torch.tensor([0, 0, 0, 1.0, 0, 0, 0], dtype=torch.float64)
 NAN = float("nan")
@@ -339,3 +346,6 @@ def test_offsets_are_a_well_behaved_torch_op(all_of_them: bool) -> None:
     by_means, *others = (torch.ones(2, *width) for width in ((3,), (4,), (3,), (), (3,)))
     given = others if all_of_them else [None] * 4
     torch.library.opcheck(add_offsets_op, (*tensors, torch.tensor([7, 2]), by_means, *given))
+    grads = list(tensors) if all_of_them else [tensors[0], None, None, None, None]
+    turned = (tensors[1], torch.zeros(2, 4)) if all_of_them else (None, None)
+    torch.library.opcheck(add_offsets_backward_op, (grads, torch.tensor([7, 2]), 2, *turned))

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from dyngs.deform.field import DeformationField, Offsets, chosen
-from dyngs.deform.spline_fit import SPAN, spline_values
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
+from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_tensor
@@ -60,10 +60,17 @@ class BodyField(DeformationField):
 
     def poses(self, time: float) -> tuple[Tensor, Tensor]:
         """Return (B, 3) places of the bodies' centres and (B, 4) quaternions, of any length."""
-        return spline_values(self.parameters["places"], time), spline_values(self.parameters["quats"], time)
+        motion, quats = spline_motion([self.parameters["places"], self.parameters["quats"], None, None, None], time)
+        return motion[:, :3], quats
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        found = self.others.offsets(means, time, rows)
+        return self._with_bodies(self.others.offsets(means, time, rows), means, time, rows)
+
+    def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
+        found, penalties = self.others.in_training(means, time)
+        return self._with_bodies(found, means, time, None), penalties
+
+    def _with_bodies(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
         labels, means = chosen(self.rest.labels, rows), chosen(means, rows)
         own = torch.nonzero(labels >= 0)[:, 0]
         body = labels[own]

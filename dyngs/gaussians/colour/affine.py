@@ -55,11 +55,14 @@ def fitted_affine(shown: Sequence[Shown], background: Tensor, counts: Tensor | N
     background = background.to(shown[0][1].rgb.device)
     identity = torch.eye(3, 4, dtype=torch.float64, device=background.device)
     affine, equations = identity, [_equations(image, rendering, background, counts) for image, rendering in shown]
+    used: list[Tensor] = []
     for _ in range(ROUNDS):
+        before, used = used, [weight * ~((target >= SATURATED) & (x @ affine.T > 1)) for x, target, weight in equations]
+        if before and all(torch.equal(x, y) for x, y in zip(used, before, strict=True)):
+            break  # the same equations again
         products, sides = torch.zeros_like(identity.new_empty(3, 4, 4)), torch.zeros_like(identity)
         total = identity.new_zeros(())
-        for seen, target, weight in equations:
-            known = weight * ~((target >= SATURATED) & (seen @ affine.T > 1))
+        for (seen, target, weight), known in zip(equations, used, strict=True):
             for channel in range(3):
                 weighted = seen * known[:, channel, None]
                 products[channel] += weighted.T @ seen
@@ -82,4 +85,5 @@ def _equations(
     weight = torch.ones_like(through) if image.mask is None else image.mask[..., None]
     weight = weight if counts is None else weight * counts[..., None]
     seen = torch.cat([rgb, ones], -1)
-    return seen.reshape(-1, 4).double(), truth.reshape(-1, 3).double(), weight.reshape(-1, 1).double()
+    counted = weight.reshape(-1) > 0
+    return tuple(x.reshape(-1, x.shape[-1])[counted].double() for x in (seen, truth, weight))  # type: ignore[return-value]
