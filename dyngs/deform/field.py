@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -22,6 +22,7 @@ from dyngs.ops.skinning import add_offsets_
 from dyngs.state import State, moved_to, part_of, prefixed
 
 F = TypeVar("F", bound="DeformationField")
+O = TypeVar("O", bound="OuterField")
 
 MAX_KEY_TIMES = 256  # Limit on the default number of key times; longer clips may set more, which takes memory
 
@@ -40,6 +41,9 @@ class Offsets:
     def select(self, index: Tensor | slice) -> Offsets:
         others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
         return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
+
+    def replace(self, **changes: Tensor | None) -> Offsets:
+        return replace(self, **changes)
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,8 @@ class DeformationField:
     """All that is optimised."""
     momentary = False
     """Moving Gaussians are there for a while each, and stay as they are in steps that do not show them."""
+    fades = False
+    """Moving Gaussians may be there for a part of the clip only."""
 
     @property
     def num_values(self) -> int:
@@ -123,6 +129,57 @@ class DeformationField:
         field = copy.copy(self)
         field.parameters = parameters
         return field
+
+
+class OuterField(DeformationField):
+    """A field that changes the offsets of another one, ``others``, of the same Gaussians."""
+
+    def __init__(self, others: DeformationField) -> None:
+        self.setup, self.others = others.setup, others
+
+    @property
+    def num_values(self) -> int:
+        return self.parameters.num_values + self.others.num_values
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        return [*self.parameters.leaves, *self.others.leaves]
+
+    def step(self, step: int, progress: float) -> Count:
+        return self.parameters.step(step, progress) + self.others.step(step, progress)
+
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        return self.others.penalties(time)
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        self.others.extend(seen, soon)
+
+    def regroup(self) -> None:
+        self.others.regroup()
+
+    def edited(self: O, edit: TopologyEdit) -> O:
+        return self.around(self.others.edited(edit))
+
+    def around(self: O, others: DeformationField) -> O:
+        """Return the same changes of another field of the same Gaussians."""
+        field = copy.copy(self)
+        field.others = others
+        return field
+
+    def to(self: O, device: torch.device | str) -> O:
+        field = super().to(device)
+        field.others = self.others.to(device)
+        return field
+
+
+def innermost(field: DeformationField) -> DeformationField:
+    """Return the field within all others that change its offsets."""
+    return innermost(field.others) if isinstance(field, OuterField) else field
+
+
+def with_innermost(field: DeformationField, inner: DeformationField) -> DeformationField:
+    """Return ``field`` with ``inner`` within all others that change its offsets."""
+    return field.around(with_innermost(field.others, inner)) if isinstance(field, OuterField) else inner
 
 
 def key_times(num_times: int) -> int:

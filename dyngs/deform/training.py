@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DynamicModel, FreeField
+from dyngs.config import ControlNodesField, DynamicModel, FreeField
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
@@ -28,6 +28,7 @@ from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussia
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
+from dyngs.deform.windows import WindowedField
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
@@ -40,6 +41,8 @@ from dyngs.state import Role, State, with_role
 SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
+import os
+WINDOWS = os.environ.get("WINDOWS", "1") == "1"
 MIN_MOVING_FRACTION = 0.02  # Fraction of surely moving Gaussians up to which the scene counts as still
 
 
@@ -131,6 +134,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if edited:
             scene.field.regroup()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
+        if step == self.schedule.full and WINDOWS and isinstance(self.options.deform, ControlNodesField):
+            scene = replace(scene, field=WindowedField(scene.field, len(scene.moving)).to(scene.moving.device))
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:

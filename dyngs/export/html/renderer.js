@@ -33,8 +33,9 @@ class Renderer {
       ROW,
       DEGREE: scene.degree,
       HARMONIC_TEXELS: Math.ceil((3 * terms) / 4),
-      SETS: motion.drivers ? Math.ceil(motion.perGaussian / 4) : 0,
       MOVING: motion.moving,
+      WINDOWED: motion.windows ? 1 : 0,
+      EDGE: (scene.curves && scene.curves.edge || 1).toFixed(6),
       BONES: motion.bones ? 1 : 0,
       FILTERED: scene.filtered ? 1 : 0,
       LAYERS: network ? network.layers : 0,
@@ -144,6 +145,7 @@ class Renderer {
       this.list("uDriven", motion.followed, "16UI");
       this.list("uDrivenShares", motion.shares, "32F");
     }
+    if (motion.windows) this.list("uWindows", motion.windows, "32F");
   }
 
   prepareBuffers() {

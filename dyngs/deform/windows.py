@@ -1,0 +1,79 @@
+"""Windows in time: each Gaussian that follows a field may be there for a part of the clip only.
+
+Flat-topped, so that what is opaque is equally so for all of its window; open over the whole clip before training.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
+from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians.parameters import Parameters
+from dyngs.state import Role, State, StateTensor, part_of, prefixed
+from dyngs.tensor_checks import require_tensor
+
+EDGE = float(os.environ.get("W_EDGE", 0.05))  # Time over which the logit of the opacity falls by 1 outside of a window, in units of the clip
+OPEN = float(os.environ.get("W_OPEN", 6.0))
+"""Edges that a new window is longer than the clip, at either end: logits there change by 0.0025."""
+LR = float(os.environ.get("W_LR", 2e-3))
+LR_DECAY = float(os.environ.get("W_DECAY", 0.1))
+HALVES = os.environ.get("W_HALVES", "0") == "1"
+
+
+class WindowedField(OuterField):
+    """The offsets of ``others``, and log s((t - a) / e) + log s((b - t) / e) more of the logit of each opacity.
+
+    a and b, ``edges`` (M, 2), are where the window of each of M Gaussians begins and ends, s the logistic function.
+    """
+
+    fades = True
+
+    def __init__(self, others: DeformationField, num_moving: int) -> None:
+        super().__init__(others)
+        edges = torch.tensor([-OPEN * EDGE, 1 + OPEN * EDGE], device="cpu").expand(num_moving, 2)
+        self.parameters = Parameters({"edges": edges}, {"edges": LR}, LR_DECAY, Role.PER_MOVING)
+
+    @property
+    def edges(self) -> Tensor:
+        return self.parameters["edges"]
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        found = self.others.offsets(means, time, rows)
+        edges = chosen(self.edges, rows)
+        inside = torch.stack([time - edges[:, 0], edges[:, 1] - time], dim=1) / EDGE
+        window = torch.nn.functional.logsigmoid(inside).sum(1)
+        logits = window if found.logit_opacities is None else found.logit_opacities + window
+        return found.replace(logit_opacities=logits)
+
+    def step(self, step: int, progress: float):
+        count = super().step(step, progress)
+        edges = self.edges.data
+        edges[:, 0].clamp_(-OPEN * EDGE, 1)
+        edges[:, 1].clamp_(0, 1 + OPEN * EDGE)
+        return count
+
+    def edited(self, edit: TopologyEdit) -> WindowedField:
+        field = super().edited(edit).with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+        if HALVES and bool(edit.is_new.any()):
+            new = torch.nonzero(edit.is_new)[:, 0]
+            ordered = new[edit.source[new].sort(stable=True).indices]
+            edges = field.edges.data
+            middle = edges[ordered].clamp(0, 1).mean(1)
+            edges[ordered[::2], 0] = middle[::2]
+            edges[ordered[1::2], 1] = middle[1::2]
+        return field
+
+    def state(self) -> State:
+        return self.others.state() | prefixed("windows", self.parameters.state())
+
+    @staticmethod
+    def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> WindowedField:
+        """Return the field of a state within the restored ``others``; raises as ``restored``."""
+        field = WindowedField(others, others.setup.num_moving)
+        field.parameters = field.parameters.restored(tensors)
+        return field
