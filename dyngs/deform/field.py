@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import torch
@@ -41,9 +41,6 @@ class Offsets:
     def select(self, index: Tensor | slice) -> Offsets:
         others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
         return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
-
-    def replace(self, **changes: Tensor | None) -> Offsets:
-        return replace(self, **changes)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -14,28 +15,29 @@ from torch import Tensor
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.state import Role, State, StateTensor, part_of, prefixed
-from dyngs.tensor_checks import require_tensor
+from dyngs.ops.adam import Count
+from dyngs.state import Role, State, prefixed
 
-EDGE = float(os.environ.get("W_EDGE", 0.05))  # Time over which the logit of the opacity falls by 1 outside of a window, in units of the clip
-OPEN = float(os.environ.get("W_OPEN", 6.0))
-"""Edges that a new window is longer than the clip, at either end: logits there change by 0.0025."""
-LR = float(os.environ.get("W_LR", 2e-3))
-LR_DECAY = float(os.environ.get("W_DECAY", 0.1))
+EDGE = float(os.environ.get("W_EDGE", 0.05))  # Time over which the logit falls by 1 outside of a window, in units of the clip
+MARGIN = float(os.environ.get("W_OPEN", 3.0))  # Edges by which an open window is longer than the clip, at either end: it can still be felt
+LR, LR_DECAY = float(os.environ.get("W_LR", 1e-2)), float(os.environ.get("W_DECAY", 0.1))
+OPEN = -MARGIN * EDGE, 1 + MARGIN * EDGE
+
 HALVES = os.environ.get("W_HALVES", "0") == "1"
 
 
 class WindowedField(OuterField):
-    """The offsets of ``others``, and log s((t - a) / e) + log s((b - t) / e) more of the logit of each opacity.
+    """The offsets of ``others``, and the window of each of M Gaussians added to the logit of its opacity.
 
-    a and b, ``edges`` (M, 2), are where the window of each of M Gaussians begins and ends, s the logistic function.
+    w(t) = log s((t - a) / e) + log s((b - t) / e), less what it is where a window is open: s is the logistic function,
+    a and b, the ``edges`` (M, 2), are where the window begins and ends.
     """
 
     fades = True
 
     def __init__(self, others: DeformationField, num_moving: int) -> None:
         super().__init__(others)
-        edges = torch.tensor([-OPEN * EDGE, 1 + OPEN * EDGE], device="cpu").expand(num_moving, 2)
+        edges = torch.tensor(OPEN, device="cpu").expand(num_moving, 2)
         self.parameters = Parameters({"edges": edges}, {"edges": LR}, LR_DECAY, Role.PER_MOVING)
 
     @property
@@ -45,16 +47,14 @@ class WindowedField(OuterField):
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         found = self.others.offsets(means, time, rows)
         edges = chosen(self.edges, rows)
-        inside = torch.stack([time - edges[:, 0], edges[:, 1] - time], dim=1) / EDGE
-        window = torch.nn.functional.logsigmoid(inside).sum(1)
+        window = _window(edges, time) - _window(edges.new_tensor([OPEN]), time)
         logits = window if found.logit_opacities is None else found.logit_opacities + window
-        return found.replace(logit_opacities=logits)
+        return replace(found, logit_opacities=logits)
 
-    def step(self, step: int, progress: float):
+    def step(self, step: int, progress: float) -> Count:
         count = super().step(step, progress)
-        edges = self.edges.data
-        edges[:, 0].clamp_(-OPEN * EDGE, 1)
-        edges[:, 1].clamp_(0, 1 + OPEN * EDGE)
+        self.edges.data[:, 0].clamp_min_(OPEN[0])
+        self.edges.data[:, 1].clamp_max_(OPEN[1])
         return count
 
     def edited(self, edit: TopologyEdit) -> WindowedField:
@@ -77,3 +77,8 @@ class WindowedField(OuterField):
         field = WindowedField(others, others.setup.num_moving)
         field.parameters = field.parameters.restored(tensors)
         return field
+
+
+def _window(edges: Tensor, time: float) -> Tensor:
+    inside = torch.stack([time - edges[:, 0], edges[:, 1] - time], dim=1) / EDGE
+    return torch.nn.functional.logsigmoid(inside).sum(1)

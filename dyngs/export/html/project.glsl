@@ -84,6 +84,13 @@ Gaussian stored(int i) {
   return Gaussian(a.xyz, a.w, b, c.xyz, c.w, at(uGaussians, 4 * i + 3).rgb, a.xyz, mat3(1.0), mat3(1.0));
 }
 
+#if WINDOWED
+// Log opacity of a window in time that begins and ends so.
+float windowAt(vec2 window) {
+  return -log(1.0 + exp((window.x - uTime) / EDGE)) - log(1.0 + exp((uTime - window.y) / EDGE));
+}
+#endif
+
 #if MOVING
 // Changes by the four drivers, and by the window in time, of a Gaussian that moves.
 void drive(int i, inout Gaussian g) {
@@ -106,8 +113,7 @@ void drive(int i, inout Gaussian g) {
 #if WINDOWED
   vec4 two = at(uWindows, i >> 1);
   vec2 window = (i & 1) == 0 ? two.xy : two.zw;
-  vec2 inside = vec2(uTime - window.x, window.y - uTime) / EDGE;
-  g.logit -= log(1.0 + exp(-inside.x)) + log(1.0 + exp(-inside.y));
+  g.logit += windowAt(window) - windowAt(vec2(OPEN));
 #endif
 }
 #endif
