@@ -14,6 +14,7 @@ from dyngs.deform.keys import (
     FreeField,
     HexplaneField,
     MlpField,
+    NetworkField,
 )
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
@@ -42,6 +43,7 @@ __all__ = [
     "MlpField",
     "ModelSection",
     "NetworkColour",
+    "NetworkField",
     "OptimConfig",
     "PointsInit",
     "Positive",
