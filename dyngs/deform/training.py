@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import ControlNodesField, DynamicModel, FreeField
+from dyngs.config import DynamicModel, FreeField
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
-from dyngs.deform.field import FieldSetup, Offsets, deformed
+from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.field import FieldSetup, Offsets, deformed, innermost
 from dyngs.deform.fields import new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
@@ -41,8 +42,6 @@ from dyngs.state import Role, State, with_role
 SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
 SURELY_STILL = 0.25
 """Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in place."""
-import os
-WINDOWS = os.environ.get("WINDOWS", "1") == "1"
 MIN_MOVING_FRACTION = 0.02  # Fraction of surely moving Gaussians up to which the scene counts as still
 
 
@@ -134,8 +133,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if edited:
             scene.field.regroup()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
-        if step == self.schedule.full and WINDOWS and isinstance(self.options.deform, ControlNodesField):
-            scene = replace(scene, field=WindowedField(scene.field, len(scene.moving)).to(scene.moving.device))
+        scene = self._windowed(scene, step)
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
@@ -214,6 +212,15 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options)
+
+    def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
+        """Return the scene in which what follows nodes may be there for a part of the clip, once all times are seen."""
+        field = scene.field
+        if step != max(self.schedule.full, self.schedule.fine + 1) or field is None:
+            return scene
+        if isinstance(field, WindowedField) or not isinstance(innermost(field), ControlNodes):
+            return scene
+        return replace(scene, field=WindowedField(field, len(scene.moving)).to(scene.moving.device))
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
         """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""

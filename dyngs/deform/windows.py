@@ -5,7 +5,6 @@ Flat-topped, so that what is opaque is equally so for all of its window; open ov
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -18,12 +17,10 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, prefixed
 
-EDGE = float(os.environ.get("W_EDGE", 0.05))  # Time over which the logit falls by 1 outside of a window, in units of the clip
-MARGIN = float(os.environ.get("W_OPEN", 3.0))  # Edges by which an open window is longer than the clip, at either end: it can still be felt
-LR, LR_DECAY = float(os.environ.get("W_LR", 1e-2)), float(os.environ.get("W_DECAY", 0.1))
+EDGE = 0.05  # Time over which the logit falls by 1 outside of a window, in units of the clip
+MARGIN = 3.0  # Edges by which an open window is longer than the clip, at either end: slopes can still be felt
 OPEN = -MARGIN * EDGE, 1 + MARGIN * EDGE
-
-HALVES = os.environ.get("W_HALVES", "0") == "1"
+LR, LR_DECAY = 1e-2, 0.1
 
 
 class WindowedField(OuterField):
@@ -58,15 +55,7 @@ class WindowedField(OuterField):
         return count
 
     def edited(self, edit: TopologyEdit) -> WindowedField:
-        field = super().edited(edit).with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
-        if HALVES and bool(edit.is_new.any()):
-            new = torch.nonzero(edit.is_new)[:, 0]
-            ordered = new[edit.source[new].sort(stable=True).indices]
-            edges = field.edges.data
-            middle = edges[ordered].clamp(0, 1).mean(1)
-            edges[ordered[::2], 0] = middle[::2]
-            edges[ordered[1::2], 1] = middle[1::2]
-        return field
+        return super().edited(edit).with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
 
     def state(self) -> State:
         return self.others.state() | prefixed("windows", self.parameters.state())
