@@ -22,7 +22,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.field import DeformationField, FieldSetup
+from dyngs.deform.field import DeformationField, FieldSetup, innermost
 from dyngs.deform.fields import new_field
 from dyngs.gaussians import Gaussians
 
@@ -70,7 +70,7 @@ def stirred_field(kind: str, num_moving: int = 9, *, size: float = 0.2, everythi
 def stir(field: DeformationField, size: float = 0.2) -> None:
     """Put noise on all that is learned."""
     generator = torch.Generator().manual_seed(4)
-    for name, x in field.parameters.values().items():
+    for name, x in innermost(field).parameters.values().items():
         noise = size * torch.randn(x.shape, generator=generator)
         x += noise.abs() if name.startswith(("bias", "space")) else noise
 
