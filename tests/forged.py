@@ -15,9 +15,9 @@ from torch import Tensor
 
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
+from dyngs.deform.windows import WindowedField
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.deform.windows import WindowedField
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.state import prefixed, tensors_of

@@ -5,7 +5,6 @@ Local letters: M moving Gaussians, B bodies, P control points.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -16,7 +15,6 @@ from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.deform.spline_fit import SPAN, spline_values
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.ops.adam import Count
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_tensor
