@@ -35,11 +35,10 @@ TIMES = (0.0, 0.37, 1.0)
 def tiny_options(kind: str, *, everything: bool = True) -> DeformField:
     """Options of a field that moves every attribute, or only positions."""
     heads = dict.fromkeys(HEADS, everything)
-    of_nodes = {name: value for name, value in heads.items() if name != "move_opacities"}
     if kind == "hexplane":
         return HexplaneField(channels=3, resolution=5, levels=(1, 2), width=8, **heads)
     if kind == "control_nodes":
-        return ControlNodesField(nodes=5, pieces=3, **of_nodes)
+        return ControlNodesField(nodes=5, pieces=3, **heads)
     if kind == "free":
         return FreeField()
     return MlpField(depth=2, width=8, **heads)

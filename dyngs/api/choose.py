@@ -22,6 +22,7 @@ from dyngs.config import (
     DefaultStrategy,
     DeformField,
     DynamicModel,
+    FieldSection,
     FreeField,
     NetworkColour,
     OptimConfig,
@@ -304,9 +305,11 @@ def _settings(config: Config) -> list[OpenSetting]:
         )
     if config.train.robust == "auto":
         found.append(OpenSetting("train.robust=always", _robust, explained))
-    asks_colour = config.colour == ShColour() and not config.colour.model_fields_set
-    if isinstance(model, DynamicModel) and model.choose and asks_colour:
-        found.append(OpenSetting("colour.kind=network", _network))
+    if isinstance(model, DynamicModel) and model.choose:
+        if config.colour == ShColour() and not config.colour.model_fields_set:
+            found.append(OpenSetting("colour.kind=network", _network))
+        if "move_opacities" not in model.deform.model_fields_set:
+            found.append(OpenSetting("model.deform.move_opacities=true", _moving_opacities))
     return found
 
 
@@ -350,6 +353,14 @@ def _what_moves(given: Config, field: DeformField, free: bool) -> tuple[Config, 
 
 def _network(config: Config) -> Config | None:
     return config.model_copy(update={"colour": NetworkColour()}) if isinstance(config.model, DynamicModel) else None
+
+
+def _moving_opacities(config: Config) -> Config | None:
+    match config.model:
+        case DynamicModel(deform=FieldSection() as field):
+            return _with(config, "model", deform=field.model_copy(update={"move_opacities": True}))
+        case _:
+            return None
 
 
 def _with(config: Config, section: str, **values: object) -> Config:

@@ -14,7 +14,6 @@ from dyngs.deform.keys import (
     FreeField,
     HexplaneField,
     MlpField,
-    NetworkField,
 )
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
@@ -43,7 +42,6 @@ __all__ = [
     "MlpField",
     "ModelSection",
     "NetworkColour",
-    "NetworkField",
     "OptimConfig",
     "PointsInit",
     "Positive",

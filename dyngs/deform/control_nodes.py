@@ -29,7 +29,7 @@ from dyngs.tensor_checks import require_indices, require_positive, require_tenso
 
 NOTHING = torch.zeros(0, 3, device="cpu")
 COMPARED_TIMES = 16  # Times at which the paths of nodes are compared where some of them are to go
-LR = {"quats": 6e-3, "log_scales": 1e-3, "colors": 2e-3}
+LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
 """Learning rates of the nodes' attributes other than positions."""
 LR_DECAY = 0.2  # Ratio of the last to the first learning rate
 PIECES_PER_TIME = 0.3
@@ -158,7 +158,10 @@ class ControlNodes(DeformationField):
             x[:, :low] = x[:, low, None] + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
 
     def at(self, time: float) -> Offsets:
-        return Offsets(**{name: spline_values(x, time) for name, x in self._splines().items()})
+        parts = {name: spline_values(x, time) for name, x in self._splines().items()}
+        if "logit_opacities" in parts:
+            parts["logit_opacities"] = parts["logit_opacities"][:, 0]
+        return Offsets(**parts)
 
     def _untrained(self, count: int) -> Parameters:
         sizes, device = head_sizes(self.options), self.setup.center.device

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from dyngs.config import FieldSection, NetworkField
+from dyngs.config import FieldSection
 from dyngs.deform.field import Offsets
 from dyngs.gaussians.parameters import Parameters
 from dyngs.initialisation import glorot
@@ -50,7 +50,7 @@ def head_sizes(options: FieldSection) -> Mapping[str, int]:
         "means": (3, True),
         "quats": (4, options.move_rotations),
         "log_scales": (3, options.move_scales),
-        "logit_opacities": (1, isinstance(options, NetworkField) and options.move_opacities),
+        "logit_opacities": (1, options.move_opacities),
         "colors": (3, options.move_colors),
     }
     return {name: size for name, (size, is_on) in wanted.items() if is_on}

@@ -17,18 +17,13 @@ class FieldSection(Section):
 
     move_rotations: bool = Field(default=True, description="rotations change over time")
     move_scales: bool = Field(default=True, description="scales change over time")
-    move_colors: bool = Field(default=False, description="base colours change over time")
-
-
-class NetworkField(FieldSection):
-    """Keys of fields that end in a small network."""
-
     move_opacities: bool = Field(
         default=False, description="opacities change over time: things may appear and disappear"
     )
+    move_colors: bool = Field(default=False, description="base colours change over time")
 
 
-class HexplaneField(NetworkField):
+class HexplaneField(FieldSection):
     """Planes over pairs of space and time axes and a small decoder (4DGS, Wu et al. 2024)."""
 
     kind: Literal["hexplane"] = Field(
@@ -48,7 +43,7 @@ class HexplaneField(NetworkField):
     lr_decoder: Positive = Field(default=1.6e-4, description="learning rate of the decoder, times the scene extent")
 
 
-class MlpField(NetworkField):
+class MlpField(FieldSection):
     """A multilayer perceptron on encoded position and time (Deformable-3DGS, Yang et al. 2024)."""
 
     kind: Literal["mlp"] = Field(
@@ -107,7 +102,7 @@ class DynamicModel(SceneModel):
     choose: bool = Field(
         default=False,
         description="find out first, by small runs compared on training views held out, whether motion pays, and what "
-        "colours are made of where that was not requested (docs/dynamic.md)",
+        "colours are made of and whether opacities change where that was not requested (docs/dynamic.md)",
     )
     motion_from: Fraction = Field(
         default=0.13,

@@ -179,9 +179,9 @@ def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
     field = config.model.deform
     kind = wanted.field or field.kind
     if kind != field.kind:
+        given = field if isinstance(field, FieldSection) else FieldSection()
         section = section_class(DynamicModel.model_fields["deform"], kind)
-        given = dict(field if isinstance(field, FieldSection) else FieldSection())
-        moves = {name: x for name, x in given.items() if name.startswith("move_") and name in section.model_fields}
+        moves = {name: getattr(given, name) for name in FieldSection.model_fields if name in section.model_fields}
         field = section(**moves)
         yield f"model.deform.kind={kind}"
         yield from (f"model.deform.{name}={str(value).lower()}" for name, value in moves.items())

@@ -21,7 +21,7 @@ from dyngs.deform.field import Offsets
 from dyngs.gaussians import TopologyEdit
 from dyngs.state import tensors_of
 
-MEANS_ONLY = {name: False for name in HEADS if name != "move_opacities"}
+MEANS_ONLY = dict.fromkeys(HEADS, False)
 
 
 def control_nodes(nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object) -> ControlNodes:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_fields import HEADS
 
-from dyngs.config import NetworkField
+from dyngs.config import FieldSection
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
 from dyngs.gaussians.parameters import Parameters
 
@@ -18,7 +18,7 @@ SIZES = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "colors"
 
 def decoder_with(hidden: list[int], *, skip: int | None = None) -> tuple[Decoder, Parameters]:
     """A decoder of 5 features with random weights in all layers."""
-    decoder = Decoder(5, hidden, NetworkField(), skip=skip)
+    decoder = Decoder(5, hidden, FieldSection(), skip=skip)
     generator = torch.Generator().manual_seed(1)
     values = decoder.start_values(generator)
     values = {name: torch.randn(x.shape, generator=generator) for name, x in values.items()}
@@ -28,7 +28,7 @@ def decoder_with(hidden: list[int], *, skip: int | None = None) -> tuple[Decoder
 @pytest.mark.parametrize("chosen", list(product([False, True], repeat=len(HEADS))))
 def test_heads_by_name(chosen: tuple[bool, ...]) -> None:
     """Outputs are consecutive columns in the order of the attributes; what is off has none."""
-    options = NetworkField(**dict(zip(HEADS, chosen, strict=True)))
+    options = FieldSection(**dict(zip(HEADS, chosen, strict=True)))
     is_on = dict(zip(SIZES, (True, *chosen), strict=True))
     sizes = {name: size for name, size in SIZES.items() if is_on[name]}
     assert dict(head_sizes(options)) == sizes
@@ -57,7 +57,7 @@ def test_it_is_a_plain_perceptron(hidden: list[int], skip: int | None) -> None:
 
 @pytest.mark.parametrize("skip", [None, 1])
 def test_it_starts_at_zero_with_weights_of_glorot(skip: int | None) -> None:
-    decoder = Decoder(20, [60, 50], NetworkField(), skip=skip)
+    decoder = Decoder(20, [60, 50], FieldSection(), skip=skip)
     values = decoder.start_values(torch.Generator().manual_seed(0))
     assert not values["weight2"].any()
     assert not any(values[f"bias{i}"].any() for i in range(3))
@@ -72,7 +72,7 @@ def test_it_starts_at_zero_with_weights_of_glorot(skip: int | None) -> None:
 
 
 def test_the_generator_decides_the_weights() -> None:
-    decoder = Decoder(3, [4], NetworkField())
+    decoder = Decoder(3, [4], FieldSection())
     first, second, other = (decoder.start_values(torch.Generator().manual_seed(seed)) for seed in (5, 5, 6))
     assert all(torch.equal(first[name], second[name]) for name in first)
     assert not torch.equal(first["weight0"], other["weight0"])

@@ -55,8 +55,7 @@ def test_a_field_moves_just_the_attributes_it_may(kind: str) -> None:
         field = stirred_field(kind, everything=everything)
         moved = deformed(gaussians, field.offsets(gaussians.means, 0.37))
         changed = {name for name, x in gaussians.tensors().items() if not torch.equal(getattr(moved, name), x)}
-        fading = set() if kind == "control_nodes" else {"logit_opacities"}
-        assert changed == ({"means", "quats", "log_scales", "sh"} | fading if everything else {"means"})
+        assert changed == ({"means", "quats", "log_scales", "logit_opacities", "sh"} if everything else {"means"})
 
 
 @pytest.mark.parametrize("kind", KINDS)

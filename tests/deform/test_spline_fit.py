@@ -55,8 +55,7 @@ def test_a_field_with_all_nodes_and_pieces_moves_as_before() -> None:
             same, fewer = field.reduced(5, 3, means), field.reduced(3, 2, means)
         case _:
             raise AssertionError
-    for name in ("means", "quats", "log_scales", "colors"):
-        x = getattr(field.offsets(means, 0.37), name)
+    for name, x in vars(field.offsets(means, 0.37)).items():
         assert torch.allclose(x, getattr(same.offsets(means, 0.37), name), atol=1e-6)
     assert (fewer.num_nodes, fewer.num_pieces) == (3, 2)
     assert fewer.num_values < field.num_values
