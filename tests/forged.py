@@ -140,7 +140,7 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
     elif kind != "static":
         name = "control_nodes" if kind in ("masked", "windowed") else kind
         model, field = DynamicModel(deform=tiny_options(name)), stirred_field(name, len(_ROWS))
-        field = WindowedField(field) if kind == "windowed" else field
+        field = WindowedField(field, len(_ROWS)) if kind == "windowed" else field
         state |= tensors_of(prefixed("field", field_state(field)))
         state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}
     if kind == "masked":

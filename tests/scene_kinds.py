@@ -49,7 +49,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
         masks = VisibilityMasks.pack(SEEN_AT, seen)
     field = stirred_field(_field(kind), len(MOVING))
     if kind == "windowed":
-        field = WindowedField(field)
+        field = WindowedField(field, len(MOVING))
         field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN])
     return DynamicScene(
         gaussians=cloud(), seen_at=SEEN_AT, field=field, moving=MOVING, filter_std=std, masks=masks, colour=_network()

@@ -22,7 +22,7 @@ from dyngs.ops.skinning import add_offsets_
 from dyngs.state import State, moved_to, part_of, prefixed
 
 F = TypeVar("F", bound="DeformationField")
-O = TypeVar("O", bound="OuterField")
+Outer = TypeVar("Outer", bound="OuterField")
 
 MAX_KEY_TIMES = 256  # Limit on the default number of key times; longer clips may set more, which takes memory
 
@@ -154,16 +154,16 @@ class OuterField(DeformationField):
     def regroup(self) -> None:
         self.others.regroup()
 
-    def edited(self: O, edit: TopologyEdit) -> O:
+    def edited(self: Outer, edit: TopologyEdit) -> Outer:
         return self.around(self.others.edited(edit))
 
-    def around(self: O, others: DeformationField) -> O:
+    def around(self: Outer, others: DeformationField) -> Outer:
         """Return the same changes of another field of the same Gaussians."""
         field = copy.copy(self)
         field.others = others
         return field
 
-    def to(self: O, device: torch.device | str) -> O:
+    def to(self: Outer, device: torch.device | str) -> Outer:
         field = super().to(device)
         field.others = self.others.to(device)
         return field

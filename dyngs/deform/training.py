@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import ControlNodesField, DynamicModel, FreeField
+from dyngs.config import DynamicModel, FreeField
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
-from dyngs.deform.field import FieldSetup, Offsets, deformed
+from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.field import FieldSetup, Offsets, deformed, innermost
 from dyngs.deform.fields import new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
@@ -132,6 +133,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if edited:
             scene.field.regroup()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
+        scene = self._windowed(scene, step)
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
@@ -163,8 +165,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if bodies is not None:
             field = bodies.within(field)
             self._see_all(bodies.explain_all)
-        if isinstance(self.options.deform, ControlNodesField):
-            field = WindowedField(field)
         std = self._update.of(gaussians)
         field = field.to(now.means.device)
         return replace(scene, gaussians=gaussians, field=field, moving=moving, filter_std=std), result
@@ -212,6 +212,16 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options)
+
+    def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
+        """Return the scene in which what follows nodes may be there for a part of the clip, once all times are seen."""
+        field = scene.field
+        if step != max(self.schedule.full, self.schedule.fine + 1) or field is None:
+            return scene
+        if isinstance(field, WindowedField) or not isinstance(innermost(field), ControlNodes):
+            return scene
+        open_ = WindowedField(field, len(scene.moving)).to(scene.moving.device)
+        return replace(scene, field=open_)
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
         """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""

@@ -32,9 +32,9 @@ class WindowedField(OuterField):
 
     fades = True
 
-    def __init__(self, others: DeformationField) -> None:
+    def __init__(self, others: DeformationField, num_moving: int) -> None:
         super().__init__(others)
-        edges = torch.tensor(OPEN, device="cpu").expand(self.setup.num_moving, 2)
+        edges = torch.tensor(OPEN, device="cpu").expand(num_moving, 2)
         self.parameters = Parameters({"edges": edges}, {"edges": LR}, LR_DECAY, Role.PER_MOVING)
 
     @property
@@ -63,7 +63,7 @@ class WindowedField(OuterField):
     @staticmethod
     def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> WindowedField:
         """Return the field of a state within the restored ``others``; raises as ``restored``."""
-        field = WindowedField(others)
+        field = WindowedField(others, others.setup.num_moving)
         field.parameters = field.parameters.restored(tensors)
         return field
 

@@ -22,7 +22,7 @@ COUNT = 9
 
 def windowed(kind: str = "control_nodes", *, everything: bool = True) -> WindowedField:
     """A field of which each Gaussian is there for a part of the clip only."""
-    field = WindowedField(stirred_field(kind, everything=everything))
+    field = WindowedField(stirred_field(kind, everything=everything), COUNT)
     generator = torch.Generator().manual_seed(1)
     field.edges.data[:] = torch.rand(COUNT, 2, generator=generator).sort(dim=1).values
     return field
@@ -31,7 +31,7 @@ def windowed(kind: str = "control_nodes", *, everything: bool = True) -> Windowe
 @pytest.mark.parametrize("everything", [True, False])
 def test_an_open_window_changes_nothing(everything: bool) -> None:
     others = stirred_field("control_nodes", everything=everything)
-    field, gaussians = WindowedField(others), cloud()
+    field, gaussians = WindowedField(others, COUNT), cloud()
     for time in TIMES:
         before = deformed(gaussians, others.offsets(gaussians.means, time))
         after = deformed(gaussians, field.offsets(gaussians.means, time))
@@ -71,7 +71,7 @@ def test_rows_alone_are_computed_alike() -> None:
 
 
 def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they_began() -> None:
-    field, means = WindowedField(stirred_field("control_nodes")), cloud().means
+    field, means = WindowedField(stirred_field("control_nodes"), COUNT), cloud().means
     began = field.edges.detach().clone()
     for step in range(1, 200):
         for time, sign in ((0.0, 1.0), (1.0, -1.0)):  # unwanted at first, wanted at last
