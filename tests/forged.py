@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dyngs.config import DynamicModel, NetworkColour, SceneModel, StaticModel
 from dyngs.deform.fields import field_state
+from dyngs.deform.windows import WindowedField
 from dyngs.gaussians.colour.training import NetworkTraining
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
@@ -25,7 +26,7 @@ from dyngs.storage.tensors import Coding, TensorKind
 
 Tensors = dict[str, Tensor]
 Header = dict[str, Any]
-CONTENTS = ("static", "network", "masked", *ALL_KINDS)
+CONTENTS = ("static", "network", "masked", "windowed", *ALL_KINDS)
 _ROWS = (0, 2, 3, 6)
 
 _VALUES = (torch.nan, torch.inf, -torch.inf, 3e38, -3e38, 1e20, 1e-45, -1.0, 0.0, 1e9, 255.0)
@@ -127,7 +128,8 @@ def one_line(error: Exception, path: Path) -> None:
 
 
 def contents(kind: str) -> tuple[Tensors, SceneModel]:
-    """Of a checkpoint of nine Gaussians: "static", "network", "masked", or a field's kind; and its model."""
+    """Of a checkpoint of nine Gaussians: "static", "network", "masked", "windowed", or a field's kind; and its
+    model."""
     gaussians, model = cloud(9), StaticModel()
     state: Tensors = {"filter_std": torch.rand(9, generator=torch.Generator().manual_seed(1))}
     if kind == "network":
@@ -136,9 +138,10 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         colours = NetworkTraining(options, 10, box, torch.Generator().manual_seed(0), sees_time=True)
         state |= tensors_of(prefixed("colour", colours.network.state() | colours.state()))
     elif kind != "static":
-        field = "control_nodes" if kind == "masked" else kind
-        model = DynamicModel(deform=tiny_options(field))
-        state |= tensors_of(prefixed("field", field_state(stirred_field(field, len(_ROWS)))))
+        name = "control_nodes" if kind in ("masked", "windowed") else kind
+        model, field = DynamicModel(deform=tiny_options(name)), stirred_field(name, len(_ROWS))
+        field = WindowedField(field, len(_ROWS)) if kind == "windowed" else field
+        state |= tensors_of(prefixed("field", field_state(field)))
         state |= {"rows": torch.tensor(_ROWS), "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}
     if kind == "masked":
         masks = VisibilityMasks.pack((0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None])

@@ -10,6 +10,7 @@ from tiny_fields import cloud, stirred_field, tiny_options
 from dyngs.camera import Cameras
 from dyngs.config import DynamicModel, HumanModel
 from dyngs.deform.scene import DynamicScene
+from dyngs.deform.windows import OPEN, WindowedField
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
@@ -28,14 +29,15 @@ from dyngs.ops.shading import num_inputs
 from dyngs.state import State, part_of, tensors_of
 from dyngs.static.scene import StaticScene
 
-KINDS = ("static", *FIELDS, "masked", "human")
+KINDS = ("static", *FIELDS, "windowed", "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])
 SEEN_AT = (0.0, 0.5, 1.0)
 PERSON = HumanModel(sh_degree=0)
 
 
 def scene_of_kind(kind: str) -> GaussianScene:
-    """Nine Gaussians with a 3D filter, of which four may move, or a person; ``masked`` is a hexplane with masks."""
+    """Nine Gaussians with a 3D filter, of which four may move, or a person; ``masked`` is a hexplane with masks,
+    ``windowed`` are nodes of which each Gaussian is there for a part of the clip."""
     std = 0.01 + torch.arange(9.0) / 100
     if kind == "static":
         return StaticScene(gaussians=cloud(), filter_std=std, seen_at=SEEN_AT)
@@ -46,6 +48,9 @@ def scene_of_kind(kind: str) -> GaussianScene:
         seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
         masks = VisibilityMasks.pack(SEEN_AT, seen)
     field = stirred_field(_field(kind), len(MOVING))
+    if kind == "windowed":
+        field = WindowedField(field, len(MOVING))
+        field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN])
     return DynamicScene(
         gaussians=cloud(), seen_at=SEEN_AT, field=field, moving=MOVING, filter_std=std, masks=masks, colour=_network()
     )
@@ -69,7 +74,7 @@ def onlooker() -> Cameras:
 
 
 def _field(kind: str) -> str:
-    return "hexplane" if kind == "masked" else kind
+    return {"masked": "hexplane", "windowed": "control_nodes"}.get(kind, kind)
 
 
 def _network() -> ColourNetwork:

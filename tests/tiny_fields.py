@@ -23,7 +23,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
 from dyngs.deform.fields import new_field
 from dyngs.deform.nodes import Nodes, follow
 from dyngs.gaussians import Gaussians
@@ -82,7 +82,7 @@ def followed(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
 def stir(field: DeformationField, size: float = 0.2) -> None:
     """Put noise on all that is learned."""
     generator = torch.Generator().manual_seed(4)
-    for name, x in field.parameters.values().items():
+    for name, x in innermost(field).parameters.values().items():
         noise = size * torch.randn(x.shape, generator=generator)
         x += noise.abs() if name.startswith(("bias", "space")) else noise
 

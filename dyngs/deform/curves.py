@@ -8,7 +8,7 @@ Local letters: M moving Gaussians, S drivers, P control points, B drivers that o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from dyngs.deform.field import DeformationField, Offsets
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.nodes import FOLLOWED
 from dyngs.deform.spline_fit import spline_basis
+from dyngs.deform.windows import WindowedField
 from dyngs.ops.nodes import SPAN
 
 SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
@@ -35,6 +36,7 @@ class Curves:
         followed: (M, B) drivers of each Gaussian, B = 4; None as above.
         shares: (M, B) of theirs, rows sum to 1; None as above.
         is_steep: control points lie far outside what is drawn, and are to be kept as they are.
+        windows: (M, 2) begin and end of each Gaussian's window in time (``WindowedField``); None: all are always there.
         error: of a driver's place: the quantile ``CHECKED``, in world units.
     """
 
@@ -43,6 +45,7 @@ class Curves:
     followed: Tensor | None = None
     fractions: Tensor | None = None
     is_steep: bool = False
+    windows: Tensor | None = None
     error: float = 0.0
 
 
@@ -50,6 +53,8 @@ class Curves:
 def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> Curves:
     """Return the motion of ``means`` (M, 3) as splines."""
     match field:
+        case WindowedField(others=others):
+            return replace(curves_of(others, means, num_times, tolerance), windows=field.edges)
         case ControlNodes():
             return _curves_of_nodes(field, means)
         case FreePrimitives():  # straight lines and parabolas

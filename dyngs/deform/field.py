@@ -21,6 +21,7 @@ from dyngs.ops.skinning import add_offsets_, offset_gradients
 from dyngs.state import State, moved_to, part_of, prefixed
 
 F = TypeVar("F", bound="DeformationField")
+Outer = TypeVar("Outer", bound="OuterField")
 
 MAX_KEY_TIMES = 256  # Limit on the default number of key times; longer clips may set more, which takes memory
 
@@ -65,6 +66,8 @@ class DeformationField:
     """All that is optimised."""
     momentary = False
     """Moving Gaussians are there for a while each, and stay as they are in steps that do not show them."""
+    fades = False
+    """Moving Gaussians may be there for a part of the clip only."""
 
     @property
     def num_values(self) -> int:
@@ -126,6 +129,57 @@ class DeformationField:
         field = copy.copy(self)
         field.parameters = parameters
         return field
+
+
+class OuterField(DeformationField):
+    """A field that changes the offsets of another one, ``others``, of the same Gaussians."""
+
+    def __init__(self, others: DeformationField) -> None:
+        self.setup, self.others = others.setup, others
+
+    @property
+    def num_values(self) -> int:
+        return self.parameters.num_values + self.others.num_values
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        return [*self.parameters.leaves, *self.others.leaves]
+
+    def step(self, step: int, progress: float) -> Count:
+        return self.parameters.step(step, progress) + self.others.step(step, progress)
+
+    def penalties(self, time: float) -> dict[str, Tensor]:
+        return self.others.penalties(time)
+
+    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
+        self.others.extend(seen, soon)
+
+    def regroup(self) -> None:
+        self.others.regroup()
+
+    def edited(self: Outer, edit: TopologyEdit) -> Outer:
+        return self.around(self.others.edited(edit))
+
+    def around(self: Outer, others: DeformationField) -> Outer:
+        """Return the same changes of another field of the same Gaussians."""
+        field = copy.copy(self)
+        field.others = others
+        return field
+
+    def to(self: Outer, device: torch.device | str) -> Outer:
+        field = super().to(device)
+        field.others = self.others.to(device)
+        return field
+
+
+def innermost(field: DeformationField) -> DeformationField:
+    """Return the field within all others that change its offsets."""
+    return innermost(field.others) if isinstance(field, OuterField) else field
+
+
+def with_innermost(field: DeformationField, inner: DeformationField) -> DeformationField:
+    """Return ``field`` with ``inner`` within all others that change its offsets."""
+    return field.around(with_innermost(field.others, inner)) if isinstance(field, OuterField) else inner
 
 
 def key_times(num_times: int) -> int:

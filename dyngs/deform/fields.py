@@ -15,6 +15,7 @@ from dyngs.deform.field import DeformationField, FieldSetup
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.hexplane import Hexplane
 from dyngs.deform.mlp import Mlp
+from dyngs.deform.windows import WindowedField
 from dyngs.state import Role, State, part_of, with_role
 from dyngs.tensor_checks import require_positive, require_tensor
 
@@ -48,4 +49,6 @@ def restored_field(options: DeformField, tensors: Mapping[str, Tensor], num_movi
     setup = FieldSetup(center, require_positive("box", half_size), int(num_times), num_moving, extent)
     field = new_field(options, setup, torch.Generator()).restored(tensors)
     bodies = part_of(tensors, "bodies")
-    return BodyField.stored(field, bodies) if bodies else field
+    field = BodyField.stored(field, bodies) if bodies else field
+    windows = part_of(tensors, "windows")
+    return WindowedField.stored(field, windows) if windows else field

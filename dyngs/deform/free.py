@@ -41,7 +41,7 @@ class FreePrimitives(DeformationField):
     learned: a window may shift without its path.
     """
 
-    momentary = True
+    momentary = fades = True
 
     def __init__(self, options: FreeField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup

@@ -18,7 +18,8 @@ from dyngs.config import DynamicModel, FreeField
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.shots import Shots
 from dyngs.deform.bodies.start import Bodies, found_bodies
-from dyngs.deform.field import FieldSetup, Offsets, deformed
+from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.field import FieldSetup, Offsets, deformed, innermost
 from dyngs.deform.fields import new_field
 from dyngs.deform.fixed_cameras.changes import Footage
 from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
@@ -28,6 +29,7 @@ from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussia
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.still_error import StillErrors, two_group_threshold
 from dyngs.deform.time_window import TimeWindow
+from dyngs.deform.windows import WindowedField
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
@@ -130,6 +132,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if edited:
             scene.field.regroup()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
+        scene = self._windowed(scene, step)
         return self._frozen(scene) if step in self.schedule.splits else scene
 
     def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
@@ -208,6 +211,16 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             return FirstMotion()
         standing, limit = self.capture.standing(), self.options.num_random_moving
         return first_motion(standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options)
+
+    def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
+        """Return the scene in which what follows nodes may be there for a part of the clip, once all times are seen."""
+        field = scene.field
+        if step != max(self.schedule.full, self.schedule.fine + 1) or field is None:
+            return scene
+        if isinstance(field, WindowedField) or not isinstance(innermost(field), ControlNodes):
+            return scene
+        open_ = WindowedField(field, len(scene.moving)).to(scene.moving.device)
+        return replace(scene, field=open_)
 
     def _frozen(self, scene: DynamicScene) -> DynamicScene:
         """Return the scene in which Gaussians whose motion is too small to be seen no longer move."""

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from dyngs.config import AutoColour, Config, ControlNodesField, DynamicModel
-from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
+from dyngs.deform.field import innermost, with_innermost
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY
 from dyngs.gaussians.colour.view_dependence import MeasuredView, find_view_dependent
@@ -56,15 +56,16 @@ def field_size(scene: GaussianScene) -> FieldSize | None:
 def with_field(scene: GaussianScene, size: FieldSize) -> GaussianScene:
     """Return ``scene`` with so many of its nodes and pieces; as it is where no control nodes move anything."""
     nodes = _nodes_of(scene)
-    if nodes is None or not isinstance(scene, DynamicScene):
+    if nodes is None or not isinstance(scene, DynamicScene) or scene.field is None:
         return scene
     reduced = nodes.reduced(size.nodes, size.pieces, scene.gaussians.means.detach()[scene.moving])
-    return replace(scene, field=scene.field.within(reduced) if isinstance(scene.field, BodyField) else reduced)
+    return replace(scene, field=with_innermost(scene.field, reduced))
 
 
 def _nodes_of(scene: GaussianScene) -> ControlNodes | None:
-    field = scene.field if isinstance(scene, DynamicScene) and not scene.is_static else None
-    field = field.others if isinstance(field, BodyField) else field
+    if not isinstance(scene, DynamicScene) or scene.field is None or scene.is_static:
+        return None
+    field = innermost(scene.field)
     return field if isinstance(field, ControlNodes) else None
 
 

@@ -256,7 +256,7 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor) -> Visi
     fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
     seen = fractions > MASKED_BELOW
     moved = field_scene_of(scene)
-    if moved is not None and moved.field is not None and moved.field.momentary:
+    if moved is not None and moved.field is not None and moved.field.fades:
         seen |= there_after(scene, times, trainer.model.options.alpha_min).to(seen.device)
     return VisibilityMasks.pack(tuple(times), seen[:, kept])
 

@@ -96,7 +96,7 @@ def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
             if x.role is Role.PER_MOVING:
                 assert len(x.tensor) == one.num_moving, name
     assert {f"gaussians.{name}" for name in scene.gaussians.tensors()} <= names_with(scene, Role.PER_GAUSSIAN)
-    assert (kind in ("control_nodes", "free")) == bool(names_with(scene, Role.PER_MOVING))
+    assert (kind in ("control_nodes", "windowed", "free")) == bool(names_with(scene, Role.PER_MOVING))
     assert scene.drawing_state().keys() == scene.state().keys() - names_with(scene, Role.TRAINING) - WITHIN_OTHERS
     assert all(not x.tensor.requires_grad for x in scene.state().values())
 

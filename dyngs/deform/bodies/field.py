@@ -5,17 +5,15 @@ Local letters: M moving Gaussians, B bodies, P control points.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from dyngs.deform.field import DeformationField, Offsets, chosen
+from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.ops.adam import Count
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
@@ -34,7 +32,7 @@ class BodyRest:
     labels: Tensor  # (M,) body of each Gaussian, -1 for none
 
 
-class BodyField(DeformationField):
+class BodyField(OuterField):
     """The offsets of ``others``, but for the Gaussians of bodies: these move rigidly, and take colours alone from it.
 
     A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of the place p and of
@@ -43,20 +41,14 @@ class BodyField(DeformationField):
 
     def __init__(self, others: DeformationField, rest: BodyRest, splines: Mapping[str, Tensor]) -> None:
         """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies' ``splines``."""
-        self.setup, self.others, self.rest = others.setup, others, rest
+        super().__init__(others)
+        self.rest = rest
         rates = RATES | {"places": RATES["places"] * self.setup.extent}
         self.parameters = Parameters(splines, rates, LR_DECAY)
 
     @property
     def num_values(self) -> int:
-        return self.parameters.num_values + sum(x.numel() for x in vars(self.rest).values()) + self.others.num_values
-
-    @property
-    def leaves(self) -> list[Tensor]:
-        return [*self.parameters.leaves, *self.others.leaves]
-
-    def step(self, step: int, progress: float) -> Count:
-        return self.parameters.step(step, progress) + self.others.step(step, progress)
+        return super().num_values + sum(x.numel() for x in vars(self.rest).values())
 
     def poses(self, time: float) -> tuple[Tensor, Tensor]:
         """Return (B, 3) places of the bodies' centres and (B, 4) quaternions, of any length."""
@@ -88,23 +80,8 @@ class BodyField(DeformationField):
             found.colors,
         )
 
-    def penalties(self, time: float) -> dict[str, Tensor]:
-        return self.others.penalties(time)
-
-    def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        self.others.extend(seen, soon)
-
-    def regroup(self) -> None:
-        self.others.regroup()
-
-    def within(self, others: DeformationField) -> BodyField:
-        """Return the same bodies within another field of the same Gaussians."""
-        field = copy.copy(self)
-        field.others = others
-        return field
-
     def edited(self, edit: TopologyEdit) -> BodyField:
-        field = self.within(self.others.edited(edit))
+        field = super().edited(edit)
         field.rest = replace(self.rest, labels=self.rest.labels[edit.source])
         return field
 
@@ -130,5 +107,5 @@ class BodyField(DeformationField):
 
     def to(self, device: torch.device | str) -> BodyField:
         field = super().to(device)
-        field.others, field.rest = self.others.to(device), fields_moved_to(self.rest, device)
+        field.rest = fields_moved_to(self.rest, device)
         return field

@@ -151,6 +151,7 @@ class Motion {
     this.drivers = scene.curves ? new Drivers(scene) : null;
     this.bones = scene.bones ? new Bones(scene) : null;
     this.means = lists.means;
+    this.windows = lists.windows; // when each Gaussian that moves is there: from, to
     this.masks = scene.masks ? { times: scene.masks.times, bits: lists.masks, bytes: Math.ceil(this.count / 8) } : null;
     if (this.drivers) {
       this.perGaussian = lists.followed ? lists.followed.length / this.moving : 1;

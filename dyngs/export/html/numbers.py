@@ -17,6 +17,7 @@ from torch import Tensor
 from dyngs.deform.curves import Curves, curves_of, fitted_curves
 from dyngs.deform.field import Offsets
 from dyngs.deform.scene import DynamicScene, field_scene_of
+from dyngs.deform.windows import EDGE, OPEN
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.order import storage_order
@@ -153,7 +154,11 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
         lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
         lists.exact("shares", _fractions(curves.fractions[order]))
     count, points, _ = curves.heads["means"].shape
-    return {"count": count, "points": points, "moving": len(order), "error": curves.error}
+    told = {"count": count, "points": points, "moving": len(order), "error": curves.error}
+    if curves.windows is not None:
+        lists.quantised("windows", _numpy(curves.windows[order]), 16)
+        told |= {"edge": EDGE, "open": OPEN}
+    return told
 
 
 def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:

@@ -15,8 +15,9 @@ uniform sampler2D uHarmonics;    // HARMONIC_TEXELS: the other harmonics, three 
 uniform usampler2D uBoned;       // 2: its bones
 uniform sampler2D uBonedShares;  // 2: their shares
 // Of each Gaussian that moves:
-uniform usampler2D uDriven;      // SETS: its drivers
-uniform sampler2D uDrivenShares; // SETS: their shares
+uniform usampler2D uDriven;      // its drivers
+uniform sampler2D uDrivenShares; // their shares
+uniform sampler2D uWindows;      // half of one: when its window in time begins and ends
 // Of each driver, each bone, and the network:
 uniform sampler2D uDrivers;      // 6: rows of the affine map; changes of quaternion; of log scales and logit; of colour
 uniform sampler2D uBones;        // 3: rows of the affine map
@@ -83,41 +84,37 @@ Gaussian stored(int i) {
   return Gaussian(a.xyz, a.w, b, c.xyz, c.w, at(uGaussians, 4 * i + 3).rgb, a.xyz, mat3(1.0), mat3(1.0));
 }
 
-#if SETS
-// Changes by the drivers of one set of four.
-void driveBy(int place, vec3 mean, out vec3 moved, out vec4 quat, out vec4 sizes, out vec3 color) {
-  uvec4 drivers = at(uDriven, place);
-  vec4 shares = at(uDrivenShares, place);
-  moved = vec3(0.0); quat = vec4(0.0); sizes = vec4(0.0); color = vec3(0.0);
+#if WINDOWED
+// Log opacity of a window in time that begins and ends so.
+float windowAt(vec2 window) {
+  return -log(1.0 + exp((window.x - uTime) / EDGE)) - log(1.0 + exp((uTime - window.y) / EDGE));
+}
+#endif
+
+#if MOVING
+// Changes by the four drivers, and by the window in time, of a Gaussian that moves.
+void drive(int i, inout Gaussian g) {
+  uvec4 drivers = at(uDriven, i);
+  vec4 shares = at(uDrivenShares, i), point = vec4(g.mean, 1.0), quat = vec4(0.0), sizes = vec4(0.0);
+  vec3 moved = vec3(0.0), color = vec3(0.0);
   for (int k = 0; k < 4; ++k) {
     int d = 6 * int(drivers[k]);
     float share = shares[k];
-    vec4 point = vec4(mean, 1.0);
     for (int row = 0; row < 3; ++row) moved[row] += share * dot(at(uDrivers, d + row), point);
     quat += share * at(uDrivers, d + 3);
     sizes += share * at(uDrivers, d + 4);
     color += share * at(uDrivers, d + 5).rgb;
   }
-}
-
-void drive(int i, inout Gaussian g) {
-  vec3 moved, color;
-  vec4 quat, sizes;
-  driveBy(SETS * i, g.mean, moved, quat, sizes, color);
-#if SETS > 1  // of another rigid group: q and -q are one rotation
-  vec3 otherMoved, otherColor;
-  vec4 otherQuat, otherSizes;
-  driveBy(SETS * i + 1, g.mean, otherMoved, otherQuat, otherSizes, otherColor);
-  moved += otherMoved;
-  quat += dot(quat, otherQuat) < 0.0 ? -otherQuat : otherQuat;
-  sizes += otherSizes;
-  color += otherColor;
-#endif
   g.mean = moved;
   g.quat = product(quat, g.quat);
   g.logScales += sizes.xyz;
   g.logit += sizes.w;
   g.base += color;
+#if WINDOWED
+  vec4 two = at(uWindows, i >> 1);
+  vec2 window = (i & 1) == 0 ? two.xy : two.zw;
+  g.logit += windowAt(window) - windowAt(vec2(OPEN));
+#endif
 }
 #endif
 
@@ -248,7 +245,7 @@ void main() {
   vColor0 = vColor1 = vColor2 = vColor3 = vec4(0.0);
   int i = int(aIndex);
   Gaussian g = stored(i);
-#if SETS
+#if MOVING
   if (i < MOVING) drive(i, g);
 #endif
 #if BONES

@@ -33,8 +33,10 @@ class Renderer {
       ROW,
       DEGREE: scene.degree,
       HARMONIC_TEXELS: Math.ceil((3 * terms) / 4),
-      SETS: motion.drivers ? Math.ceil(motion.perGaussian / 4) : 0,
       MOVING: motion.moving,
+      WINDOWED: motion.windows ? 1 : 0,
+      EDGE: motion.windows ? scene.curves.edge.toFixed(6) : 1,
+      OPEN: motion.windows ? scene.curves.open.map((x) => x.toFixed(6)).join(", ") : 0,
       BONES: motion.bones ? 1 : 0,
       FILTERED: scene.filtered ? 1 : 0,
       LAYERS: network ? network.layers : 0,
@@ -144,6 +146,7 @@ class Renderer {
       this.list("uDriven", motion.followed, "16UI");
       this.list("uDrivenShares", motion.shares, "32F");
     }
+    if (motion.windows) this.list("uWindows", motion.windows, "32F");
   }
 
   prepareBuffers() {

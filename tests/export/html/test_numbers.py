@@ -28,7 +28,8 @@ def test_every_kind_has_the_lists_that_it_needs(kind: str) -> None:
         assert (layout[name]["rows"], layout[name]["columns"]) == (len(scene), columns)
     assert ("boned" in layout, "bones" in told) == (kind == "human",) * 2
     assert ("masks" in layout) == (kind == "masked")
-    assert ("pivots" in layout) == (kind == "control_nodes")
+    assert ("pivots" in layout) == (kind in ("control_nodes", "windowed"))
+    assert ("windows" in layout) == (kind == "windowed")
     assert ("network" in told) == (scene.colour is not None)
     assert ("rest" in layout) == (scene.colour is None and scene.gaussians.sh_degree > 0)
     assert ("curve_means" in layout) == (kind != "static")

@@ -1,0 +1,135 @@
+"""Windows in time: nothing changes while they are open, closed ones hide, and nothing is lost when they are stored."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from tiny_fields import TIMES, cloud, stirred_field, tiny_options
+from torch import Tensor
+
+from dyngs.deform.field import deformed, innermost, with_innermost
+from dyngs.deform.fields import field_state, restored_field
+from dyngs.deform.windows import EDGE, OPEN, WindowedField
+from dyngs.gaussians import TopologyEdit
+from dyngs.state import tensors_of
+
+COUNT = 9
+
+
+def windowed(kind: str = "control_nodes", *, everything: bool = True) -> WindowedField:
+    """A field of which each Gaussian is there for a part of the clip only."""
+    field = WindowedField(stirred_field(kind, everything=everything), COUNT)
+    generator = torch.Generator().manual_seed(1)
+    field.edges.data[:] = torch.rand(COUNT, 2, generator=generator).sort(dim=1).values
+    return field
+
+
+@pytest.mark.parametrize("everything", [True, False])
+def test_an_open_window_changes_nothing(everything: bool) -> None:
+    others = stirred_field("control_nodes", everything=everything)
+    field, gaussians = WindowedField(others, COUNT), cloud()
+    for time in TIMES:
+        before = deformed(gaussians, others.offsets(gaussians.means, time))
+        after = deformed(gaussians, field.offsets(gaussians.means, time))
+        for name, x in after.tensors().items():
+            assert torch.equal(x, before.tensors()[name]), name
+
+
+def test_windows_are_flat_inside_and_fall_off_outside() -> None:
+    """log s((t - a) / e) + log s((b - t) / e) in float64, less that of an open one."""
+
+    def window(a: float, b: float, time: float) -> float:
+        return -math.log1p(math.exp((a - time) / EDGE)) - math.log1p(math.exp((time - b) / EDGE))
+
+    field, means = windowed(everything=False), cloud().means
+    for time in (0.0, 0.2, 0.5, 0.9, 1.0):
+        found = field.offsets(means, time).logit_opacities
+        assert found is not None
+        for (a, b), x in zip(field.edges.tolist(), found.tolist(), strict=True):
+            assert x == pytest.approx(window(a, b, time) - window(*OPEN, time), abs=1e-4)
+
+
+def test_windows_add_to_opacities_that_change() -> None:
+    field, means = windowed("hexplane"), cloud().means
+    found, alone = field.offsets(means, 0.37), field.others.offsets(means, 0.37)
+    plain = windowed("hexplane", everything=False).offsets(means, 0.37)
+    assert found.logit_opacities is not None
+    assert alone.logit_opacities is not None
+    assert plain.logit_opacities is not None
+    torch.testing.assert_close(found.logit_opacities, alone.logit_opacities + plain.logit_opacities)
+
+
+def test_rows_alone_are_computed_alike() -> None:
+    field, means, rows = windowed(), cloud().means, torch.tensor([8, 0, 3])
+    some, every = field.offsets(means, 0.37, rows), field.offsets(means, 0.37).select(rows)
+    for name, x in vars(some).items():
+        torch.testing.assert_close(x, getattr(every, name), rtol=0, atol=1e-6)
+
+
+def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they_began() -> None:
+    field, means = WindowedField(stirred_field("control_nodes"), COUNT), cloud().means
+    began = field.edges.detach().clone()
+    for step in range(1, 200):
+        for time, sign in ((0.0, 1.0), (1.0, -1.0)):  # unwanted at first, wanted at last
+            logits = field.offsets(means, time).logit_opacities
+            assert logits is not None
+            (sign * logits.sum()).backward()
+        field.step(step, 0.0)
+    assert bool((field.edges[:, 0] > began[:, 0]).all())
+    assert torch.equal(field.edges[:, 1], began[:, 1])
+    assert len(field.leaves) == 1 + len(field.others.leaves)
+    assert field.penalties(0.3).keys() == field.others.penalties(0.3).keys()
+
+
+def test_what_is_born_has_its_parents_window() -> None:
+    field = windowed()
+    edited = field.edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
+    assert torch.equal(edited.edges, field.edges[[3, 3, 0]])
+
+
+def test_the_field_within_can_be_exchanged() -> None:
+    field, other = windowed(), stirred_field("mlp")
+    assert innermost(field) is field.others
+    exchanged = with_innermost(field, other)
+    assert isinstance(exchanged, WindowedField)
+    assert exchanged.others is other
+    assert torch.equal(exchanged.edges, field.edges)
+    assert with_innermost(other, field.others) is field.others
+
+
+def stored(field: WindowedField) -> dict[str, Tensor]:
+    return {name: x.clone() for name, x in tensors_of(field_state(field)).items()}
+
+
+def test_a_stored_field_is_the_same_field() -> None:
+    field, means = windowed(), cloud().means
+    again = restored_field(tiny_options("control_nodes"), stored(field), COUNT)
+    assert isinstance(again, WindowedField)
+    assert stored(again).keys() == stored(field).keys()
+    for name, x in stored(again).items():
+        assert torch.equal(x, stored(field)[name]), name
+    for name, x in vars(again.offsets(means, 0.37)).items():
+        assert torch.equal(x, getattr(field.offsets(means, 0.37), name)), name
+    assert again.num_values == field.num_values == field.others.num_values + 2 * COUNT
+
+
+@pytest.mark.parametrize(
+    "change", [lambda x: x[1:], lambda x: x[:, :1], lambda x: x * float("nan"), lambda x: x.double(), lambda _: None]
+)
+def test_a_forged_state_is_refused(change: Callable[[Tensor], Tensor | None]) -> None:
+    tensors = stored(windowed())
+    forged = change(tensors.pop("windows.edges"))
+    if forged is not None:
+        tensors["windows.edges"] = forged
+    with pytest.raises((KeyError, ValueError)):
+        restored_field(tiny_options("control_nodes"), tensors, COUNT)
+
+
+def test_copies_do_not_share_windows() -> None:
+    field = windowed()
+    other = copy.copy(field).to("cpu")
+    assert torch.equal(other.edges, field.edges)
