@@ -1,7 +1,7 @@
 """Paths of things that move before one moving camera, from where the static model fails.
 
-A thing is a ball here: a disc in every image. Three discs in nearby images fix a straight path; the best are followed
-outwards in time, each image adding the ray on which the thing must lie, to a smooth path through all.
+A thing is a ball here: a disc in every image. Three discs in nearby images fix a straight piece of a path; the pieces
+are linked over time, and each image then adds the ray on which the thing must lie, to a smooth path through all.
 
 Local letters: T images, n candidates, K peaks, S sizes of discs.
 """
@@ -17,8 +17,11 @@ from dyngs.deform.bodies.shots import Shots
 SIZES, SMALLEST, LARGEST = 9, 3.0, 0.2  # Radii of discs: number, least in pixels, greatest in image widths
 PEAKS, LEAST_PEAK = 6, 0.08
 HALF = 3  # Images on either side that a straight path is tried on
-TRIPLES = 400  # Candidates per middle image
-FOLLOWED = 8  # Candidates that are followed through all images
+TRIPLES = 1500  # Candidates per middle image
+KEPT, SKIPPED, FOLLOWED = 10, 14, 4
+# Straight paths around an image, and images after which the next may follow
+ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7  # Of looking for the ball around its path, that many radii away
+KINK, REWEIGHTED = 0.1, 4
 LEAST_SUPPORT = 0.28  # Contrast of a disc with its ring, mean over images, from which it is a thing
 MOST_THINGS = 4
 STIFFNESS = 3.0
@@ -85,8 +88,8 @@ def found_paths(shots: Shots) -> list[Path]:
     random = np.random.default_rng(0)
     while len(shots) > 2 * HALF and len(paths) < MOST_THINGS:
         discs = Discs(maps)
-        starts = sorted(_straight_paths(shots, discs, random), key=lambda start: -start[0])[:FOLLOWED]
-        followed = [_followed(shots, discs, *start[1:]) for start in starts]
+        chains = _chains(_straight_pieces(shots, discs, random), len(shots))
+        followed = [_followed(shots, discs, chain) for chain in chains]
         if not followed or max(path.support for path in followed) < LEAST_SUPPORT:
             break
         paths.append(max(followed, key=lambda path: path.support))
@@ -107,10 +110,29 @@ def _contrast(shots: Shots, discs: Discs, centers: np.ndarray, radius: float) ->
     return discs.at(which, pixels, radius * shots.focal / depths)
 
 
-def _straight_paths(
-    shots: Shots, discs: Discs, random: np.random.Generator
-) -> list[tuple[float, int, np.ndarray, np.ndarray, float]]:
-    """Return contrast, middle image, centre and step (3,) per image there, and radius of straight paths."""
+@dataclass(frozen=True)
+class Pieces:
+    """Straight paths of n things for a few images around one, the most marked first."""
+
+    middle: int
+    scores: np.ndarray  # (n,) contrast
+    centers: np.ndarray  # (n, 3) at the middle image
+    steps: np.ndarray  # (n, 3) per image
+    radii: np.ndarray  # (n,)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a ball is in the images from ``first`` to ``last``."""
+
+    centers: np.ndarray  # (T, 3); those of other images say nothing
+    radius: float
+    first: int
+    last: int
+
+
+def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) -> list[Pieces]:
+    """Return straight paths through the most marked discs, around every other image."""
     peaks, found = [discs.peaks(i) for i in range(len(shots))], []
     for middle in range(HALF, len(shots) - HALF, 2):
         near = [t for t in range(middle - HALF, middle + HALF + 1) if len(peaks[t])]
@@ -120,15 +142,78 @@ def _straight_paths(
         ranks = random.integers(0, np.array([len(one) for one in peaks])[which])
         picked = np.array([[peaks[t][k] for t, k in zip(*row, strict=True)] for row in zip(which, ranks, strict=True)])
         centers, steps, radii = _through(shots, which, middle, picked)
-        which = np.arange(middle - HALF, middle + HALF + 1)
         values = []
-        for t in which:
+        for t in range(middle - HALF, middle + HALF + 1):
             pixels, depths = shots.projected(np.full(len(centers), t), centers + (t - middle) * steps)
             values.append(discs.at(np.full(len(centers), t), pixels, radii * shots.focal[t] / depths))
-        score = np.sort(np.array(values), axis=0)[1:].mean(0)
-        for i in np.argsort(-score, kind="stable")[:6]:
-            found.append((float(score[i]), middle, centers[i], steps[i], float(radii[i])))
+        scores, kept = np.sort(np.array(values), axis=0)[1:].mean(0), []
+        for i in np.argsort(-scores, kind="stable"):
+            if len(kept) < KEPT and all(np.linalg.norm(centers[i] - centers[k]) > radii[k] / 2 for k in kept):
+                kept.append(i)
+        if kept:
+            found.append(Pieces(middle, *(x[kept] for x in (scores, centers, steps, radii))))
     return found
+
+
+def _chains(pieces: list[Pieces], count: int) -> list[Start]:
+    """Return where chains of pieces lead, and where their best piece alone does; no two chains share a piece."""
+    left, found = [piece.scores.copy() for piece in pieces], []
+    while pieces and len(found) < 2 * FOLLOWED:
+        chain = _best_chain(pieces, left)
+        best = max(chain, key=lambda at: left[at[0]][at[1]])
+        found += [_along([(pieces[i], k) for i, k in part], count) for part in (chain, [best])]
+        for i, k in chain:
+            left[i][k] = -1.0
+    return found
+
+
+def _best_chain(pieces: list[Pieces], scores: list[np.ndarray]) -> list[tuple[int, int]]:
+    """Return which pieces, in order of time, have the most of ``scores`` in all less what parts them (Viterbi 1967).
+
+    Pieces must meet, but may change direction where they do, as what hops. Up to ``SKIPPED`` images may show nothing.
+    """
+    totals = [x.copy() for x in scores]
+    before: list[list[tuple[int, int] | None]] = [[None] * len(x) for x in scores]
+    for j, later in enumerate(pieces):
+        for i in range(j):
+            if later.middle - pieces[i].middle <= SKIPPED:
+                reached = totals[i][:, None] - _parting(pieces[i], later) + scores[j]
+                best = reached.argmax(0)
+                for k in np.nonzero(reached.max(0) > totals[j])[0]:
+                    totals[j][k], before[j][k] = reached[best[k], k], (i, int(best[k]))
+    last = int(np.argmax([total.max() for total in totals]))
+    at: tuple[int, int] | None = (last, int(totals[last].argmax()))
+    chain = []
+    while at is not None:
+        chain.append(at)
+        at = before[at[0]][at[1]]
+    return chain[::-1]
+
+
+def _along(chain: list[tuple[Pieces, int]], count: int) -> Start:
+    """Return where a thing moves along straight pieces."""
+    middles = np.array([piece.middle for piece, _ in chain])
+    places = np.array([piece.centers[k] for piece, k in chain])
+    centers = np.stack([np.interp(np.arange(count), middles, x) for x in places.T], axis=1)
+    first, last = int(middles[0]) - HALF, int(middles[-1]) + HALF
+    for (piece, k), times in zip(
+        (chain[0], chain[-1]), (np.arange(first, middles[0]), np.arange(middles[-1] + 1, last + 1)), strict=True
+    ):
+        centers[times] += (times - piece.middle)[:, None] * piece.steps[k]
+    return Start(centers, float(np.median([piece.radii[k] for piece, k in chain])), first, last)
+
+
+def _parting(first: Pieces, later: Pieces) -> np.ndarray:
+    """Return the (n, m) costs of going from each of the pieces ``first`` to each of ``later``."""
+    apart = np.full((len(first.scores), len(later.scores)), np.inf)
+    for t in range(first.middle, later.middle + 1):
+        one = first.centers + (t - first.middle) * first.steps
+        other = later.centers + (t - later.middle) * later.steps
+        apart = np.minimum(apart, np.linalg.norm(one[:, None] - other, axis=-1))
+    radii = np.sqrt(first.radii[:, None] * later.radii)
+    bends = np.linalg.norm(first.steps[:, None] - later.steps, axis=-1) / radii
+    sizes = np.abs(np.log(first.radii[:, None] / later.radii))
+    return 2 * (apart / radii) ** 2 + 0.3 * np.minimum(bends, 1) + 2 * sizes
 
 
 def _through(
@@ -157,13 +242,16 @@ def _through(
     return centers[agree], steps[agree], radii[agree]
 
 
-def _followed(shots: Shots, discs: Discs, middle: int, center: np.ndarray, step: np.ndarray, radius: float) -> Path:
-    """Return the smooth path through all images that begins straight around ``middle``."""
-    count, which = len(shots), np.arange(len(shots))
+def _followed(shots: Shots, discs: Discs, start: Start) -> Path:
+    """Return the smooth path through all images of the ball that begins as ``start`` says.
+
+    Followed outwards from there image by image, then looked for in all images at once.
+    """
+    count, which, radius, centers = len(shots), np.arange(len(shots)), start.radius, start.centers
     ways, weights = np.zeros((count, 3)), np.zeros(count)
 
-    def look(t: int, guess: np.ndarray, reach: float) -> None:
-        (pixel,), (depth,) = shots.projected(which[t : t + 1], guess[None])
+    def look(t: int, reach: float) -> None:
+        (pixel,), (depth,) = shots.projected(which[t : t + 1], centers[t : t + 1])
         size = radius * shots.focal[t] / depth
         far = max(1.0, reach * size)
         grid = np.arange(-far, far + 0.1, max(0.5, far / 8))
@@ -173,29 +261,30 @@ def _followed(shots: Shots, discs: Discs, middle: int, center: np.ndarray, step:
         ways[t] = shots.rays(which[t : t + 1], (pixel + shift[best])[None])[0]
         weights[t] = max(float(values[best]), 0.0) ** 2
 
-    low, high = middle - HALF, middle + HALF
+    low, high = start.first, start.last
     for t in range(low, high + 1):
-        look(t, center + (t - middle) * step, 0.5)
-    centers = _smooth(shots, ways, weights)
+        look(t, REACH)
+    centers = _smooth(shots, ways, weights, radius)
     while low > 0 or high < count - 1:
         for t in {max(low - 1, 0), min(high + 1, count - 1)} - set(range(low, high + 1)):
-            look(t, centers[t], 0.7)
+            look(t, REACH_NEW)
         low, high = max(low - 1, 0), min(high + 1, count - 1)
-        centers = _smooth(shots, ways, weights)
-    for turn in range(8):
+        centers = _smooth(shots, ways, weights, radius)
+    for turn in range(ROUNDS):
         for t in range(count):
-            look(t, centers[t], 0.5)
-        centers = _smooth(shots, ways, weights)
+            look(t, REACH)
+        centers = _smooth(shots, ways, weights, radius)
         if turn % 2:
             sizes = radius * np.geomspace(0.8, 1.25, 9)
             radius = float(sizes[np.argmax([_contrast(shots, discs, centers, size).mean() for size in sizes])])
     return Path(centers, radius, float(_contrast(shots, discs, centers, radius).mean()))
 
 
-def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the (T, 3) places nearest to the rays along ``ways``, with small second differences.
+def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray, radius: float) -> np.ndarray:
+    """Return the (T, 3) places nearest to the rays along ``ways``, with small second differences but at kinks.
 
-    Least squares; images of weight 0 have no ray, and the path goes straight on there.
+    Reweighted least squares: second differences above ``KINK`` radii count by their length. Images of weight 0 have
+    no ray, and the path goes straight on there.
     """
     from scipy.linalg import solveh_banded
 
@@ -203,13 +292,16 @@ def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray) -> np.ndarray:
     stiffness = STIFFNESS * float(np.median(weights[weights > 0])) if (weights > 0).any() else 1.0
     across = weights[:, None, None] * (np.eye(3) - ways[:, :, None] * ways[:, None])
     right = np.einsum("tij,tj->ti", across, shots.centers).ravel()
-    full = np.zeros((7, 3 * count))  # upper bands: entry (i, j) lies in row 6 + i - j, column j
+    rays = np.zeros((7, 3 * count))  # upper bands: entry (i, j) lies in row 6 + i - j, column j
     for i in range(3):
         for j in range(i, 3):
-            full[6 + i - j, j::3] += across[:, i, j]
-    second = np.diff(np.eye(count), n=2, axis=0)
-    bend = stiffness * np.einsum("ki,kj->ij", second, second)
-    for gap in range(3):
-        full[6 - 3 * gap, 3 * gap :] += np.repeat(np.diagonal(bend, gap), 3)
-    full[6] += 1e-9
-    return solveh_banded(full, right).reshape(count, 3)
+            rays[6 + i - j, j::3] += across[:, i, j]
+    rays[6] += 1e-9
+    second, stiff = np.diff(np.eye(count), n=2, axis=0), np.ones(count - 2)
+    for _ in range(REWEIGHTED):
+        bend, full = stiffness * (second.T * stiff) @ second, rays.copy()
+        for gap in range(3):
+            full[6 - 3 * gap, 3 * gap :] += np.repeat(np.diagonal(bend, gap), 3)
+        found = solveh_banded(full, right).reshape(count, 3)
+        stiff = np.minimum(1, KINK * radius / np.maximum(np.linalg.norm(second @ found, axis=1), 1e-12))
+    return found

@@ -20,9 +20,10 @@ from dyngs.deform.fixed_cameras.changes import shadows
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
-LONGEST_SIDE = 200  # Pixels; larger images are shrunk
+LONGEST_SIDE = 160  # Pixels; larger images are shrunk
 
 TOLERANCE = 0.12  # Difference of colours, mean over channels, that counts in full
+ALPHA_TOLERANCE = 0.5
 SHADE = 0.25  # Weight of differences that a shadow would make
 NEVER = 1e9  # Depth where the static model shows nothing solid
 SOLID = 0.6  # Opacity from which it hides what lies behind
@@ -35,6 +36,8 @@ class Shots:
     times: np.ndarray  # (T,) ascending, in [0, 1]
     images: np.ndarray  # (T, H, W, 3) float32
     still: np.ndarray  # (T, H, W, 3) float32, as the static model has them
+    alphas: np.ndarray  # (T, H, W) of the images, 0 where they have none
+    still_alphas: np.ndarray  # (T, H, W) of the static model, 0 where images have none
     depths: np.ndarray  # (T, H, W) of the static model, ``NEVER`` where it is not solid
     poses: np.ndarray  # (T, 4, 4) world to camera
     intrinsics: np.ndarray  # (T, 3, 3)
@@ -74,17 +77,12 @@ class Shots:
     def differences(self) -> np.ndarray:
         """Return (T, H, W) in [0, 1]: where an image differs from the static model, moved by up to one pixel.
 
-        What is darker alike in all channels may be a shadow and counts less.
+        In colour or in alpha. What is darker alike in all channels may be a shadow and counts less.
         """
-        height, width = self.size
-        around = np.pad(self.still, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
-        found = np.full(self.images.shape[:3], np.inf, np.float32)
-        for y in range(3):
-            for x in range(3):
-                apart = np.abs(self.images - around[:, y : y + height, x : x + width]).mean(-1)
-                np.minimum(found, apart, out=found)
         weight = np.where(shadows(self.images, self.still), np.float32(SHADE), np.float32(1))
-        return np.clip(found / TOLERANCE, 0, 1) * weight
+        colors = np.clip(_apart(self.images, self.still) / TOLERANCE, 0, 1) * weight
+        outlines = _apart(self.alphas[..., None], self.still_alphas[..., None]) / ALPHA_TOLERANCE
+        return np.maximum(colors, np.clip(outlines, 0, 1))
 
     def on_ball(
         self, index: int, center: np.ndarray, radius: float, reach: float = 0.92
@@ -108,6 +106,17 @@ class Shots:
         in_front = (along @ self.poses[index, 2, :3]) - 0.15 * radius
         seen = self.depths[index, rows, columns] > in_front
         return rows[seen], columns[seen], ((offset + along) / radius)[seen]
+
+
+def _apart(images: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the (T, H, W) differences, mean over channels, from ``others`` moved by up to one pixel."""
+    height, width = images.shape[1:3]
+    around = np.pad(others, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
+    found = np.full(images.shape[:3], np.inf, np.float32)
+    for y in range(3):
+        for x in range(3):
+            np.minimum(found, np.abs(images - around[:, y : y + height, x : x + width]).mean(-1), out=found)
+    return found
 
 
 def one_camera(views: Sequence[View]) -> list[int] | None:
@@ -142,7 +151,9 @@ def shots_of(
         depth = torch.where(alpha > SOLID, drawn.depth.reshape(alpha.shape), NEVER)
         rgb = small.composite(background)
         rgb = rgb if small.mask is None else torch.where(small.mask[..., None] > 0, rgb, drawn.rgb[0])
-        shown = {"images": rgb, "still": drawn.rgb[0], "depths": depth}
+        nothing = torch.zeros_like(alpha)
+        alphas = (nothing, nothing) if small.alpha is None else (small.alpha, alpha)
+        shown = {"images": rgb, "still": drawn.rgb[0], "depths": depth, "alphas": alphas[0], "still_alphas": alphas[1]}
         camera = {"poses": small.cameras.cam_from_world[0].double(), "intrinsics": small.cameras.intrinsics[0].double()}
         for name, x in (shown | camera).items():
             parts.setdefault(name, []).append(x.cpu().numpy())

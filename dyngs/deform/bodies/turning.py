@@ -1,9 +1,10 @@
 """How things turn along their paths, from the colours of their surfaces: a search that needs no model of them.
 
 For a hypothesis of the rotations, every pixel falls on one direction in the body's own frame. Colours that fall on the
-same cell in several images must agree, once the light has been divided out. First, few numbers describe the whole
-clip: rolling on the plane of the path, turning with its direction, and a constant rate; then every image is searched
-around its place against all others.
+same cell in several images must agree, once the light has been divided out. First, few numbers describe a few images:
+a constant rate, alone or added to rolling on the plane of the path or to turning with its direction. From where colours
+agree best, the rotation is followed image by image in both directions; at last every image is searched around its
+place against all others.
 
 Local letters: T images, H hypotheses, n pixels, C cells of the sphere, B basis motions.
 """
@@ -20,13 +21,19 @@ from dyngs.deform.bodies.shots import Shots
 
 COARSE, FINE = 6, 8  # Cells along an edge of the cube that the sphere is divided by
 MOST_PIXELS, FEWER_PIXELS = 250, 80  # Of a body in an image that are looked at, and that the first search looks at
+FEWEST_PIXELS = 20  # Of a body in an image, for that image to say how it turns
 LEAST_PIXELS = 2  # In a cell, for its mean colour to count
 CUT, UNKNOWN = 0.37, 0.13  # Squared colour differences: the greatest that counts, and that of cells never seen
-FREE_DEG, GIVEN_DEG, STEP_DEG = 220.0, 110.0, 55.0
-"""Constant turns over the clip that are tried: without another motion, and added to one."""
-REFINED, ROUNDS, SAMPLES = 6, 6, 48
+WINDOW, FREE_DEG, GIVEN_DEG, STEP_DEG = 14, 200.0, 60.0, 30.0
+"""Images that few numbers describe, and turns in that time that are tried: without another motion, and added to one."""
+LEAST_SEEN = 0.6  # Of the images of a window, for it to begin with
+REFINED, ROUNDS, SAMPLES = 4, 4, 32
+FOLLOWED = 3  # Windows from which the rotation is followed; the one whose colours agree best in all is taken
+PACE = 3  # Images over which the rate is measured that the next is expected to turn at
+FOLLOWED_DEG = (20.0, 5.0, 1e-4)
 ROUNDS_DEG = ((10.0, 5.0, 1e-4), (5.0, 2.5, 2e-4), (3.0, 1.5, 2e-4))
-"""Reach and step of the search around each image's rotation, and the weight of squared degrees from the neighbours'."""
+"""Reach and step of the search around each image's rotation, and the weight of squared degrees from what is expected:
+where it is followed, and in rounds at last."""
 
 Frames = Sequence[tuple[np.ndarray, np.ndarray]]
 """For each of T images (n, 3) unit normals in the world and (n, 3) colours."""
@@ -56,11 +63,12 @@ class Turning:
 def found_turning(shots: Shots, path: Path) -> Turning:
     """Return how the body on ``path`` turns."""
     frames = without_light([_frame(shots, path, t) for t in range(len(shots))])
-    basis = _basis(shots.times, path)
-    rotations = _polished(frames, integrated(_best_numbers(frames, basis), basis)[0])
+    starts = _windows(frames, _basis(shots.times, path))
+    still = np.broadcast_to(np.eye(3), (len(frames), 3, 3))
+    tried = np.stack([_polished(frames, _followed(frames, *start)) for start in starts] or [still])
+    rotations = tried[disagreements(frames, tried).argmin()]
     rotations = np.einsum("tij,kj->tik", rotations, rotations[len(frames) // 2])
     sums, counts = _total([_sums(frame, rotation) for frame, rotation in zip(frames, rotations, strict=True)])
-    still = np.broadcast_to(np.eye(3), rotations.shape)
     moved, stood = disagreements(frames, np.stack([rotations, still]))
     every = np.concatenate([colors for _, colors in frames])
     by_chance = 2 * float(every.var(axis=0).sum()) if len(every) else 0.0
@@ -161,24 +169,40 @@ def _basis(times: np.ndarray, path: Path) -> np.ndarray:
     return np.concatenate([[rolling, heading], np.eye(3)[:, None] * gaps])
 
 
-def _best_numbers(frames: Frames, basis: np.ndarray) -> np.ndarray:
-    """Return the (1, 5) numbers with which colours agree best: a grid, then random steps around the best of it."""
+def _windows(frames: Frames, basis: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """Return the first image of the windows that colours agree best in, and (W, 3, 3) rotations there."""
     steps = [max(len(normals) // FEWER_PIXELS, 1) for normals, _ in frames]
     thin = [(n[t % k :: k], c[t % k :: k]) for t, ((n, c), k) in enumerate(zip(frames, steps, strict=True))]
+    size, found = min(WINDOW, len(frames)), []
+    last = len(frames) - size
+    for first in sorted({*range(0, last + 1, max(size - 1, 1)), last}):
+        part = thin[first : first + size]
+        if np.mean([len(normals) >= FEWEST_PIXELS for normals, _ in part]) < LEAST_SEEN:
+            continue
+        turns = basis[:, first : first + size - 1].copy()
+        turns[2:] /= turns[2:].sum(1).max()
+        score, numbers = _best_numbers(part, turns)
+        by_chance = float(np.concatenate([colors for _, colors in part]).var(axis=0).sum())
+        found.append((score / max(by_chance, 1e-6), first, integrated(numbers[None], turns)[0]))
+    return [start[1:] for start in sorted(found, key=lambda start: start[:2])[:FOLLOWED]]
+
+
+def _best_numbers(frames: Frames, basis: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the disagreement and the (5,) numbers with which it is least: a grid, then random steps from the best."""
 
     def score(numbers: np.ndarray) -> np.ndarray:
         parts = np.split(numbers, range(64, len(numbers), 64))
-        return np.concatenate([disagreements(thin, integrated(part, basis)) for part in parts])
+        return np.concatenate([disagreements(frames, integrated(part, basis)) for part in parts])
 
     tried: list[tuple[float, np.ndarray]] = []
-    for given in ((0, 0), (1, 0), (-1, 0), (0, 1), (1, 1)):
+    for given in ((0, 0), (1, 0), (-1, 0), (0, 1)):
         free = np.radians(_ball_of(GIVEN_DEG if any(given) else FREE_DEG, STEP_DEG))
         numbers = np.concatenate([np.tile(given, (len(free), 1)), free], axis=1).astype(float)
         scores = score(numbers)
         tried += [(float(scores[i]), numbers[i]) for i in np.argsort(scores, kind="stable")[:3]]
     random, found = np.random.default_rng(0), []
     for best, numbers in sorted(tried, key=lambda x: x[0])[:REFINED]:
-        spread = np.array([0.15, 0.3, 0.6, 0.6, 0.6]) * np.where(np.arange(5) < 2, numbers != 0, True)
+        spread = np.array([0.1, 0.1, 0.3, 0.3, 0.3]) * np.where(np.arange(5) < 2, numbers != 0, True)
         for _ in range(ROUNDS):
             around = numbers + random.normal(size=(SAMPLES, 5)) * spread
             scores = score(around)
@@ -188,7 +212,55 @@ def _best_numbers(frames: Frames, basis: np.ndarray) -> np.ndarray:
                 spread = 0.6 * spread
             spread = 0.85 * spread
         found.append((best, numbers))
-    return min(found, key=lambda x: x[0])[1][None]
+    return min(found, key=lambda x: x[0])
+
+
+def _followed(frames: Frames, first: int, known: np.ndarray) -> np.ndarray:
+    """Return (T, 3, 3) rotations: those ``known`` (W, 3, 3) from image ``first`` on, polished, and followed from there.
+
+    Each image is searched around where the last ones' rate takes it, against the colours of all before it.
+    """
+    from scipy.spatial.transform import Rotation
+
+    reach, step, pull = FOLLOWED_DEG
+    around, high = rotations_by(np.radians(_ball_of(reach, step))), first + len(known) - 1
+    rotations = np.broadcast_to(np.eye(3), (len(frames), 3, 3)).copy()
+    rotations[first : high + 1] = _polished(frames[first : high + 1], known)
+    sums, counts = _total([_sums(frames[t], rotations[t]) for t in range(first, high + 1)])
+    pace = min(PACE, len(known) - 1)
+    ways = ((1, range(high + 1, len(frames))), (-1, range(first - 1, -1, -1)))
+    for t, way in sorted(
+        ((t, way) for way, images in ways for t in images), key=lambda x: abs(2 * x[0] - first - high)
+    ):
+        last = rotations[t - way]
+        rate = Rotation.from_matrix(last @ rotations[t - (1 + pace) * way].T).as_rotvec() / pace
+        expected = rotations_by(rate) @ last
+        rotations[t] = _best_of(frames[t], around, expected, (sums, counts), pull * angles_deg(around) ** 2)
+        own = _sums(frames[t], rotations[t])
+        sums, counts = sums + own[0], counts + own[1]
+    return rotations
+
+
+def _best_of(
+    frame: tuple[np.ndarray, np.ndarray],
+    around: np.ndarray,
+    center: np.ndarray,
+    seen: tuple[np.ndarray, np.ndarray],
+    pull: np.ndarray,
+) -> np.ndarray:
+    """Return the rotation, of ``around`` (H, 3, 3) after ``center``, with which colours agree best with those ``seen``.
+
+    Args:
+        seen: (C, 3) sums of colours and (C,) numbers of pixels.
+        pull: (H,) to be added to the disagreement.
+    """
+    normals, colors = frame
+    if len(normals) < FEWEST_PIXELS:
+        return center
+    tried, (sums, counts) = np.einsum("hij,jk->hik", around, center), seen
+    place = cells(np.einsum("pi,hij->hpj", normals, tried), FINE)
+    apart = np.minimum((((sums / np.maximum(counts, 1)[:, None])[place] - colors) ** 2).sum(-1), CUT)
+    return tried[np.argmin(np.where(counts[place] >= LEAST_PIXELS, apart, UNKNOWN).mean(1) + pull)]
 
 
 def _polished(frames: Frames, rotations: np.ndarray) -> np.ndarray:
@@ -197,26 +269,21 @@ def _polished(frames: Frames, rotations: np.ndarray) -> np.ndarray:
 
     found = rotations.copy()
     for reach, step, pull in ROUNDS_DEG:
-        steps = rotations_by(np.radians(_ball_of(reach, step)))
+        around = rotations_by(np.radians(_ball_of(reach, step)))
         own = [_sums(frame, rotation) for frame, rotation in zip(frames, found, strict=True)]
         sums, counts = _total(own)
-        for t, (normals, colors) in enumerate(frames):
-            between = found[t]
+        for t, frame in enumerate(frames):
+            expected = found[t]
             if 0 < t < len(frames) - 1:
                 half = Rotation.from_matrix(found[t + 1] @ found[t - 1].T).as_rotvec() / 2
-                between = rotations_by(half) @ found[t - 1]
+                expected = rotations_by(half) @ found[t - 1]
             sums, counts = sums - own[t][0], counts - own[t][1]
-            if len(normals) < LEAST_PIXELS:
-                found[t] = between
-                continue
-            tried = np.einsum("hij,jk->hik", steps, found[t])
-            place = cells(np.einsum("pi,hij->hpj", normals, tried), FINE)
-            mean = sums / np.maximum(counts, 1)[:, None]
-            apart = np.minimum(((mean[place] - colors) ** 2).sum(-1), CUT)
-            cost = np.where(counts[place] >= LEAST_PIXELS, apart, UNKNOWN).mean(1)
-            bend = angles_deg(np.einsum("hij,kj->hik", tried, between))
-            found[t] = tried[np.argmin(cost + pull * bend**2)]
-            own[t] = _sums(frames[t], found[t])
+            if len(frame[0]) < FEWEST_PIXELS:
+                found[t] = expected
+            else:
+                bend = angles_deg(np.einsum("hij,jk,lk->hil", around, found[t], expected))
+                found[t] = _best_of(frame, around, found[t], (sums, counts), pull * bend**2)
+            own[t] = _sums(frame, found[t])
             sums, counts = sums + own[t][0], counts + own[t][1]
     return found
 
