@@ -21,7 +21,7 @@ TRIPLES = 1500  # Candidates per middle image
 KEPT, SKIPPED, FOLLOWED = 10, 14, 4
 # Straight paths around an image, and images after which the next may follow
 ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7  # Of looking for the ball around its path, that many radii away
-KINK, REWEIGHTED = 0.1, 4
+KINK, REWEIGHTED = 0.03, 4
 LEAST_SUPPORT = 0.28  # Contrast of a disc with its ring, mean over images, from which it is a thing
 MOST_THINGS = 4
 STIFFNESS = 3.0
@@ -92,7 +92,7 @@ def found_paths(shots: Shots) -> list[Path]:
         followed = [_followed(shots, discs, chain) for chain in chains]
         if not followed or max(path.support for path in followed) < LEAST_SUPPORT:
             break
-        paths.append(max(followed, key=lambda path: path.support))
+        paths.append(max(followed, key=lambda path: path.support - _unsteadiness(shots, discs, path)))
         clear_(maps, shots, paths[-1])
     return paths
 
@@ -102,6 +102,26 @@ def clear_(maps: np.ndarray, shots: Shots, path: Path) -> None:
     for i, center in enumerate(path.centers):
         rows, columns, _ = shots.on_ball(i, center, 1.2 * path.radius, 1.0)
         maps[i, rows, columns] = 0
+
+
+def _colors(shots: Shots, which: np.ndarray, centers: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return the (n, 3) mean colours in the middle of balls with ``centers`` (n, 3) in the images ``which`` (n,)."""
+    height, width = shots.size
+    pixels, depths = shots.projected(which, centers)
+    grid = np.array([-0.5, 0.0, 0.5])
+    around = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    found = pixels[:, None] + around * (radius * shots.focal[which] / depths)[:, None, None]
+    x, y = np.moveaxis(np.clip(found, 0, np.array([width, height]) - 1).astype(int), -1, 0)
+    return shots.images[which[:, None], y, x].mean(1)
+
+
+def _unsteadiness(shots: Shots, discs: Discs, path: Path) -> float:
+    """Return the standard deviation of a path's colours over time: that of what goes on as another thing is large."""
+    which = np.nonzero(_contrast(shots, discs, path.centers, path.radius) > LEAST_PEAK)[0]
+    if len(which) < 2:
+        return 0.0
+    colors = _colors(shots, which, path.centers[which], np.full(len(which), path.radius))
+    return float(np.linalg.norm(colors.std(axis=0)))
 
 
 def _contrast(shots: Shots, discs: Discs, centers: np.ndarray, radius: float) -> np.ndarray:
@@ -119,6 +139,7 @@ class Pieces:
     centers: np.ndarray  # (n, 3) at the middle image
     steps: np.ndarray  # (n, 3) per image
     radii: np.ndarray  # (n,)
+    colors: np.ndarray  # (n, 3) mean
 
 
 @dataclass(frozen=True)
@@ -151,7 +172,10 @@ def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) ->
             if len(kept) < KEPT and all(np.linalg.norm(centers[i] - centers[k]) > radii[k] / 2 for k in kept):
                 kept.append(i)
         if kept:
-            found.append(Pieces(middle, *(x[kept] for x in (scores, centers, steps, radii))))
+            scores, centers, steps, radii = (x[kept] for x in (scores, centers, steps, radii))
+            times = np.arange(middle - HALF, middle + HALF + 1)
+            shown = [_colors(shots, np.full(len(kept), t), centers + (t - middle) * steps, radii) for t in times]
+            found.append(Pieces(middle, scores, centers, steps, radii, np.mean(shown, axis=0)))
     return found
 
 
@@ -213,7 +237,8 @@ def _parting(first: Pieces, later: Pieces) -> np.ndarray:
     radii = np.sqrt(first.radii[:, None] * later.radii)
     bends = np.linalg.norm(first.steps[:, None] - later.steps, axis=-1) / radii
     sizes = np.abs(np.log(first.radii[:, None] / later.radii))
-    return 2 * (apart / radii) ** 2 + 0.3 * np.minimum(bends, 1) + 2 * sizes
+    colors = np.linalg.norm(first.colors[:, None] - later.colors, axis=-1)
+    return 2 * (apart / radii) ** 2 + 0.3 * np.minimum(bends, 1) + 2 * sizes + colors
 
 
 def _through(

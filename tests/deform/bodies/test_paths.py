@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rolling_ball import rolling
+from rolling_ball import hopping, rolling
 
 from dyngs.deform.bodies.paths import Discs, found_paths
 
@@ -16,6 +16,15 @@ def test_a_ball_is_found_at_all_times() -> None:
     (path,) = found_paths(shots)
     assert np.linalg.norm(path.centers - centers, axis=1).max() < 0.25 * 0.28
     assert path.radius == pytest.approx(0.28, rel=0.1)
+
+
+def test_a_ball_that_hops_is_followed_through_its_bounces() -> None:
+    """Smoothness alone would cut the corners where it leaves the plate again."""
+    shots, centers, _ = hopping()
+    path = found_paths(shots)[0]
+    errors = np.linalg.norm(path.centers - centers, axis=1)
+    assert np.median(errors) < 0.1 * 0.28
+    assert errors.max() < 0.6 * 0.28
 
 
 def test_nothing_is_found_where_nothing_moves() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rolling_ball import rolling
+from rolling_ball import hopping, rolling
 from scipy.spatial.transform import Rotation
 
 from dyngs.deform.bodies.paths import Path
@@ -28,6 +28,14 @@ def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
     assert np.median(errors) < 4
     assert errors.max() < 12
     assert turning.disagreement < 0.4 * turning.standing
+
+
+def test_two_turns_about_any_axis_are_followed() -> None:
+    """No rolling and no heading says beforehand how fast."""
+    shots, centers, truth = hopping()
+    errors = errors_deg(found_turning(shots, Path(centers, RADIUS, 1.0)).rotations, truth)
+    assert np.median(errors) < 6
+    assert errors.max() < 20
 
 
 def test_what_slides_does_not_turn() -> None:
