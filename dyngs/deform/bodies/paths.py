@@ -23,7 +23,6 @@ KEPT, SKIPPED, FOLLOWED = 10, 14, 4
 ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7  # Of looking for the ball around its path, that many radii away
 KINK, REWEIGHTED = 0.03, 4
 LEAST_SUPPORT = 0.28  # Contrast of a disc with its ring, mean over images, from which it is a thing
-MOST_THINGS = 4
 STIFFNESS = 3.0
 
 
@@ -34,6 +33,11 @@ class Path:
     centers: np.ndarray  # (T, 3)
     radius: float
     support: float  # mean contrast
+
+    def is_like(self, other: Path) -> bool:
+        """Whether both are of one thing at about one size."""
+        apart = np.median(np.linalg.norm(self.centers - other.centers, axis=1))
+        return bool(apart < 0.5 * min(self.radius, other.radius) and abs(np.log(self.radius / other.radius)) < 0.3)
 
 
 class Discs:
@@ -82,19 +86,21 @@ class Discs:
         return np.stack([x[best] + 0.5, y[best] + 0.5, self.radii[k[best]]], axis=1)
 
 
-def found_paths(shots: Shots) -> list[Path]:
-    """Return the paths of what moves, the most marked first; each is taken out before the next is sought."""
-    maps, paths = shots.differences(), []
-    random = np.random.default_rng(0)
-    while len(shots) > 2 * HALF and len(paths) < MOST_THINGS:
-        discs = Discs(maps)
-        chains = _chains(_straight_pieces(shots, discs, random), len(shots))
-        followed = [_followed(shots, discs, chain) for chain in chains]
-        if not followed or max(path.support for path in followed) < LEAST_SUPPORT:
-            break
-        paths.append(max(followed, key=lambda path: path.support - _unsteadiness(shots, discs, path)))
-        clear_(maps, shots, paths[-1])
-    return paths
+def found_paths(shots: Shots, maps: np.ndarray) -> list[Path]:
+    """Return paths that things may move along where ``maps`` (T, H, W) are marked, the most likely first.
+
+    No two are of the same thing at the same size; which are things is for their turning to tell.
+    """
+    if len(shots) <= 2 * HALF:
+        return []
+    discs = Discs(maps)
+    chains = _chains(_straight_pieces(shots, discs, np.random.default_rng(0)), len(shots))
+    followed = [path for path in (_followed(shots, discs, chain) for chain in chains) if path.support > LEAST_SUPPORT]
+    found: list[Path] = []
+    for path in sorted(followed, key=lambda path: _unsteadiness(shots, discs, path) - path.support):
+        if not any(path.is_like(other) for other in found):
+            found.append(path)
+    return found
 
 
 def clear_(maps: np.ndarray, shots: Shots, path: Path) -> None:

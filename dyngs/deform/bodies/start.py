@@ -23,6 +23,7 @@ AGREES, BY_CHANCE = 0.6, 0.4
 Balls that roll have 0.16 to 0.47 of the former. A die, for which the ball is a poor model, has 0.75, be its rotation 5
 degrees off or 26, where following it cost 1.5 dB."""
 LEAST_MARKS = 0.04  # Disagreement of any of its colours below which these say nothing about how it turns
+MOST_BODIES, MOST_REFUSED = 6, 4  # That are sought, and paths that may prove to be none before the search ends
 INNER, LOGIT, SCALE = 0.7, 0.0, 0.6
 """Of the Gaussians that begin on a body: least distance from its centre in radii, opacity, and size in distances."""
 MARKED, LEFT = 0.35, 0.3
@@ -91,11 +92,30 @@ def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
     A body is taken if the colours of its surface, each compared with other images, agree clearly better than if it did
     not turn, and than by chance: what bends shows other colours in the same direction.
     """
-    found = [Body(path, found_turning(shots, path)) for path in found_paths(shots)]
-    bodies = tuple(body for body in found if _is_rigid(body.turning))
+    bodies = _rigid_bodies(shots)
     if not bodies or limit < len(bodies):
         return None
     return Bodies(shots, bodies, tuple(_seeds(body, shots, limit // len(bodies), num_terms) for body in bodies))
+
+
+def _rigid_bodies(shots: Shots) -> tuple[Body, ...]:
+    """Return what moves rigidly; each is taken out before the next is sought, and what hides others where none is."""
+    maps, bodies, refused = shots.differences(), [], []
+    while len(bodies) < MOST_BODIES and len(refused) < MOST_REFUSED:
+        paths = found_paths(shots, maps)
+        if not paths:
+            break
+        fresh = [path for path in paths if not any(path.is_like(other) for other in refused)]
+        for path in fresh[: MOST_REFUSED - len(refused)]:
+            body = Body(path, found_turning(shots, path))
+            if _is_rigid(body.turning):
+                bodies.append(body)
+                clear_(maps, shots, path)
+                break
+            refused.append(path)
+        else:
+            clear_(maps, shots, paths[0])
+    return tuple(bodies)
 
 
 def _is_rigid(turning: Turning) -> bool:

@@ -13,7 +13,7 @@ from dyngs.deform.bodies.paths import Discs, found_paths
 
 def test_a_ball_is_found_at_all_times() -> None:
     shots, centers, _ = rolling()
-    (path,) = found_paths(shots)
+    (path, *_) = found_paths(shots, shots.differences())
     assert np.linalg.norm(path.centers - centers, axis=1).max() < 0.25 * 0.28
     assert path.radius == pytest.approx(0.28, rel=0.1)
 
@@ -21,7 +21,7 @@ def test_a_ball_is_found_at_all_times() -> None:
 def test_a_ball_that_hops_is_followed_through_its_bounces() -> None:
     """Smoothness alone would cut the corners where it leaves the plate again."""
     shots, centers, _ = hopping()
-    path = found_paths(shots)[0]
+    path = found_paths(shots, shots.differences())[0]
     errors = np.linalg.norm(path.centers - centers, axis=1)
     assert np.median(errors) < 0.1 * 0.28
     assert errors.max() < 0.6 * 0.28
@@ -31,9 +31,11 @@ def test_nothing_is_found_where_nothing_moves() -> None:
     """Noise is no thing; nor are three images enough to follow anything."""
     shots, _, _ = rolling()
     noise = np.random.default_rng(0).normal(0, 0.03, shots.still.shape).astype(np.float32)
-    assert found_paths(replace(shots, images=shots.still + noise)) == []
+    noisy = replace(shots, images=shots.still + noise)
+    assert found_paths(noisy, noisy.differences()) == []
     few = {name: x[:3] for name, x in vars(shots).items() if name != "centers"}
-    assert found_paths(replace(shots, **few)) == []
+    short = replace(shots, **few)
+    assert found_paths(short, short.differences()) == []
 
 
 def test_a_disc_stands_out_most_at_its_own_size() -> None:

@@ -34,7 +34,8 @@ def test_a_rolling_ball_begins_on_its_way() -> None:
         with torch.no_grad():
             moved = (means + field.offsets(means, float(shots.times[t])).means)[others:].numpy()
         expected = arms @ (turns[t] @ turns[middle].T).T + centers[t]
-        assert np.linalg.norm(moved - expected, axis=1).mean() < 0.3 * 0.28
+        # At the ends of the clip, which have neighbours on one side only, more.
+        assert np.linalg.norm(moved - expected, axis=1).mean() < (0.4 if t in (0, len(shots) - 1) else 0.25) * 0.28
 
 
 def test_what_slides_is_not_made_to_turn() -> None:
