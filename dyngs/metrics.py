@@ -60,7 +60,7 @@ def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
     P = mean_a^2 + mean_b^2 + C1 and Q = var_a + var_b + C2 it is (1 - mean_d^2 / P) (1 - var_d / Q).
     """
     a, b = (_clamped(x).permute(2, 0, 1)[:, None] for x in (rendered, truth))
-    offsets = torch.arange(_WINDOW, dtype=a.dtype, device=a.device) - _WINDOW // 2
+    offsets = torch.arange(_WINDOW, dtype=a.dtype, device="cpu") - _WINDOW // 2
     window = torch.exp(-offsets.square() / (2 * _SIGMA**2))
     taps = (window / window.sum()).tolist()
 

@@ -76,15 +76,19 @@ class DynamicScene(GaussianScene):
         return GaussianTimeStep(part.moved(self.field.offsets(part.moving_means, now, part.asked)), now)
 
     def in_training(self, time: float, *, detach: bool) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
-        """Return the Gaussians at ``time``, the offsets of those that move, and the field's penalties.
+        """Return the Gaussians drawn at ``time``, the offsets of those of them that move, and the field's penalties.
 
         Args:
             detach: gradients reach the field alone, not the canonical Gaussians.
         """
-        if self.field is None or self.masks is not None:
-            raise ValueError("nothing moves, or not all is drawn at all times")
-        part = self._selected(self.gaussians.detach() if detach else self.gaussians, 0)
-        offsets, penalties = self.field.in_training(part.moving_means, time)
+        if self.field is None:
+            raise ValueError("nothing moves")
+        interval = 0 if self.masks is None else self.masks.interval(time)
+        part = self._selected(self.gaussians.detach() if detach else self.gaussians, interval)
+        if part.asked is None:
+            offsets, penalties = self.field.in_training(part.moving_means, time)
+        else:
+            offsets, penalties = self.field.offsets(part.moving_means, time, part.asked), self.field.penalties(time)
         return part.moved(offsets), offsets, penalties
 
     def edited(self, edit: TopologyEdit) -> DynamicScene:

@@ -23,6 +23,7 @@ AGREES, BY_CHANCE = 0.6, 0.4
 Balls that roll have 0.16 to 0.47 of the former. A die, for which the ball is a poor model, has 0.75, be its rotation 5
 degrees off or 26, where following it cost 1.5 dB."""
 LEAST_MARKS = 0.04  # Disagreement of any of its colours below which these say nothing about how it turns
+SMALLEST = 32  # Sides of images, in pixels, that may tell how something turns
 MOST_BODIES, MOST_REFUSED = 6, 4  # That are sought, and paths that may prove to be none before the search ends
 INNER, LOGIT, SCALE = 0.7, 0.0, 0.6
 """Of the Gaussians that begin on a body: least distance from its centre in radii, opacity, and size in distances."""
@@ -92,7 +93,7 @@ def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
     A body is taken if the colours of its surface, each compared with other images, agree clearly better than if it did
     not turn, and than by chance: what bends shows other colours in the same direction.
     """
-    bodies = _rigid_bodies(shots)
+    bodies = _rigid_bodies(shots) if min(shots.size) >= SMALLEST else ()
     if not bodies or limit < len(bodies):
         return None
     return Bodies(shots, bodies, tuple(_seeds(body, shots, limit // len(bodies), num_terms) for body in bodies))
