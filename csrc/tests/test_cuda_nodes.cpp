@@ -89,6 +89,7 @@ void test_node_penalties(int64_t count, int64_t near, int64_t points) {
   const Values positions = uniforms(3 * count, -1, 1), radii = uniforms(count, 0.5, 1);
   const Values motion = uniforms(7 * count, -1, 1), paths = uniforms(3 * count * points, -1, 1);
   std::vector<int64_t> neighbours;
+  neighbours.reserve(static_cast<size_t>(count * near));
   for (int64_t i = 0; i < count * near; ++i) neighbours.push_back((i * i + 1) % count);
   Values penalties(2), by_paths(paths.size()), by_motion(motion.size());
   node_penalties<double>(

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dyngs.data.capture import BODY_KINDS, BodyFrames, Capture, Split, Splits, View, all_views, each_view
 from dyngs.errors import DyngsError, reading
@@ -69,8 +70,6 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     body's pelvis if the files say it, else ``pelvis`` (3,), that of the shaped template that is to be posed. Hence the
     root rotates by ``turn * poses[:, 0]``, and ``trans' = trans + scale * (turn(j) - pelvis)``.
     """
-    from scipy.spatial.transform import Rotation
-
     fitted = pelvis if body.pelvis is None else body.pelvis
     poses, turned = body.poses, fitted
     if body.turns is not None:

@@ -137,6 +137,17 @@ class OuterField(DeformationField):
     def __init__(self, others: DeformationField) -> None:
         self.setup, self.others = others.setup, others
 
+    def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
+        """Return the offsets ``found`` by the other field with the changes; arguments as of ``offsets``."""
+        raise NotImplementedError
+
+    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
+        return self.changed(self.others.offsets(means, time, rows), means, time, rows)
+
+    def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
+        found, penalties = self.others.in_training(means, time)
+        return self.changed(found, means, time, None), penalties
+
     @property
     def num_values(self) -> int:
         return self.parameters.num_values + self.others.num_values

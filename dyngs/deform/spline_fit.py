@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from dyngs.ops.nodes import SPAN
+from dyngs.ops.nodes import SPAN, cubic_fractions
 
 _SAMPLES_PER_PIECE = 8  # Places per piece at which two splines are compared; a cubic is determined by four
 
@@ -22,10 +22,7 @@ def spline_basis(places: Tensor, pieces: int) -> Tensor:
     """
     scaled = places.double().clamp(0, 1) * pieces
     piece = scaled.long().clamp_max(pieces - 1)
-    x = scaled - piece
-    rest = 1 - x
-    middle = [(3 * y**3 - 6 * y**2 + 4) / 6 for y in (x, rest)]
-    weights = torch.stack([rest**3 / 6, *middle, x**3 / 6], dim=1)
+    weights = torch.stack(cubic_fractions(scaled - piece), dim=1)
     basis = torch.zeros(len(places), pieces + SPAN - 1, dtype=torch.float64, device=places.device)
     return basis.scatter_(1, piece[:, None] + torch.arange(SPAN, device=places.device), weights)
 

@@ -41,8 +41,7 @@ class WindowedField(OuterField):
     def edges(self) -> Tensor:
         return self.parameters["edges"]
 
-    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        found = self.others.offsets(means, time, rows)
+    def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
         edges = chosen(self.edges, rows)
         window = _window(edges, time) - _window(edges.new_tensor([OPEN]), time)
         logits = window if found.logit_opacities is None else found.logit_opacities + window

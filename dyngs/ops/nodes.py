@@ -6,7 +6,7 @@ S nodes, P control points, B neighbours of a node.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,12 +14,14 @@ from torch import Tensor
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, empty_like, launch, register
 
+T = TypeVar("T", float, Tensor)
+
 SPAN = 4  # Control points that a value depends on
 HEAD_SIZES = (3, 4, 3, 1, 3)
 """Number of values of each head: means, quaternions less the identity, log scales, opacity logits, colours."""
 
 
-def cubic_fractions(place: float) -> tuple[float, float, float, float]:
+def cubic_fractions(place: T) -> tuple[T, T, T, T]:
     """Return the weights of the control points of a piece of a uniform cubic B-spline, at ``place`` in [0, 1]."""
     rest = 1 - place
     return rest**3 / 6, (3 * place**3 - 6 * place**2 + 4) / 6, (3 * rest**3 - 6 * rest**2 + 4) / 6, place**3 / 6

@@ -11,6 +11,7 @@ both. ``torch.library.custom_op`` would do the same, but imports ``torch._dynamo
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -69,9 +70,7 @@ def register(
     op = getattr(getattr(torch.ops, NAMESPACE), name).default
     if gradient is not None:
         formula = _first_order(qualified, gradient.backward)
-        if "[]" in schema.replace("int[]", "").replace(
-            "float[]", ""
-        ):  # lists of tensors, which autograd has no place for
+        if re.search(r"Tensor\??\[\]", schema):  # lists of tensors, which autograd has no place for
             torch.library.register_autograd(qualified, formula, setup_context=gradient.save, lib=_LIBRARY)
         else:
             _LIBRARY.impl(name, _with_gradient(op, gradient.save, formula), "Autograd", with_keyset=True)

@@ -55,14 +55,7 @@ class BodyField(OuterField):
         motion, quats = spline_motion([self.parameters["places"], self.parameters["quats"], None, None, None], time)
         return motion[:, :3], quats
 
-    def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        return self._with_bodies(self.others.offsets(means, time, rows), means, time, rows)
-
-    def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
-        found, penalties = self.others.in_training(means, time)
-        return self._with_bodies(found, means, time, None), penalties
-
-    def _with_bodies(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
+    def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
         labels, means = chosen(self.rest.labels, rows), chosen(means, rows)
         own = torch.nonzero(labels >= 0)[:, 0]
         body = labels[own]

@@ -18,10 +18,10 @@ SIZES, SMALLEST, LARGEST = 9, 3.0, 0.2  # Radii of discs: number, least in pixel
 PEAKS, LEAST_PEAK = 6, 0.08
 HALF = 3  # Images on either side that a straight path is tried on
 TRIPLES = 1500  # Candidates per middle image
-KEPT, SKIPPED, FOLLOWED = 10, 14, 4
-# Straight paths around an image, and images after which the next may follow
+KEPT, SKIPPED = 10, 14  # Straight paths around an image, and images after which the next may follow
+FOLLOWED = 4  # Chains of straight paths
 ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7  # Of looking for the ball around its path, that many radii away
-KINK, REWEIGHTED = 0.03, 4
+KINK, REWEIGHTED = 0.03, 4  # Second difference of a path in radii that counts in full, and rounds of weighting
 LEAST_SUPPORT = 0.28  # Contrast of a disc with its ring, mean over images, from which it is a thing
 STIFFNESS = 3.0
 
@@ -61,20 +61,14 @@ class Discs:
 
     def at(self, which: np.ndarray, pixels: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Return the (n,) values at ``pixels`` (n, 2) for discs of ``radii`` (n,) pixels, -0.2 out of the images."""
+        from scipy.ndimage import map_coordinates
+
         _, sizes, height, width = self.values.shape
-        ratio = self.radii[1] / self.radii[0]
-        level = np.log(np.maximum(radii, 1e-3) / self.radii[0]) / np.log(ratio)
+        level = np.log(np.maximum(radii, 1e-3) / self.radii[0]) / np.log(self.radii[1] / self.radii[0])
         out = (pixels < 0).any(1) | (pixels > [width, height]).any(1) | (level < -1.2) | (level > sizes + 0.2)
-        level = np.clip(level, 0, sizes - 1.001)
-        place = np.clip(pixels - 0.5, 0, np.array([width, height]) - 1.001)
-        (x, y), k = place.astype(int).T, level.astype(int)
-        fx, fy, fk = place[:, 0] - x, place[:, 1] - y, level - k
-        total = np.zeros(len(pixels))
-        for dk, wk in ((0, 1 - fk), (1, fk)):
-            for dy, wy in ((0, 1 - fy), (1, fy)):
-                for dx, wx in ((0, 1 - fx), (1, fx)):
-                    total += wk * wy * wx * self.values[which, k + dk, y + dy, x + dx]
-        return np.where(out, -0.2, total)
+        x, y = pixels.T - 0.5
+        found = map_coordinates(self.values, [which, level, y, x], order=1, mode="nearest", output=np.float64)
+        return np.where(out, -0.2, found)
 
     def peaks(self, index: int) -> np.ndarray:
         """Return the (K, 3) x, y and radius of the most marked discs of one image, in pixels."""
@@ -188,12 +182,12 @@ def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) ->
 def _chains(pieces: list[Pieces], count: int) -> list[Start]:
     """Return where chains of pieces lead, and where their best piece alone does; no two chains share a piece."""
     left, found = [piece.scores.copy() for piece in pieces], []
-    while pieces and len(found) < 2 * FOLLOWED:
+    while len(found) < 2 * FOLLOWED and any(np.isfinite(scores).any() for scores in left):
         chain = _best_chain(pieces, left)
         best = max(chain, key=lambda at: left[at[0]][at[1]])
         found += [_along([(pieces[i], k) for i, k in part], count) for part in (chain, [best])]
         for i, k in chain:
-            left[i][k] = -1.0
+            left[i][k] = -np.inf
     return found
 
 

@@ -36,8 +36,8 @@ class Shots:
     times: np.ndarray  # (T,) ascending, in [0, 1]
     images: np.ndarray  # (T, H, W, 3) float32
     still: np.ndarray  # (T, H, W, 3) float32, as the static model has them
-    alphas: np.ndarray  # (T, H, W) of the images, 0 where they have none
-    still_alphas: np.ndarray  # (T, H, W) of the static model, 0 where images have none
+    alphas: np.ndarray  # (T, H, W) of the images; of the static model where they have none
+    still_alphas: np.ndarray  # (T, H, W) of the static model
     depths: np.ndarray  # (T, H, W) of the static model, ``NEVER`` where it is not solid
     poses: np.ndarray  # (T, 4, 4) world to camera
     intrinsics: np.ndarray  # (T, 3, 3)
@@ -149,11 +149,11 @@ def shots_of(
         assert drawn.depth is not None
         alpha = drawn.alpha.reshape(small.cameras.height, small.cameras.width)
         depth = torch.where(alpha > SOLID, drawn.depth.reshape(alpha.shape), NEVER)
-        rgb = small.composite(background)
-        rgb = rgb if small.mask is None else torch.where(small.mask[..., None] > 0, rgb, drawn.rgb[0])
-        nothing = torch.zeros_like(alpha)
-        alphas = (nothing, nothing) if small.alpha is None else (small.alpha, alpha)
-        shown = {"images": rgb, "still": drawn.rgb[0], "depths": depth, "alphas": alphas[0], "still_alphas": alphas[1]}
+        rgb, own_alpha = small.composite(background), alpha if small.alpha is None else small.alpha
+        if small.mask is not None:
+            rgb = torch.where(small.mask[..., None] > 0, rgb, drawn.rgb[0])
+            own_alpha = torch.where(small.mask > 0, own_alpha, alpha)
+        shown = {"images": rgb, "still": drawn.rgb[0], "depths": depth, "alphas": own_alpha, "still_alphas": alpha}
         camera = {"poses": small.cameras.cam_from_world[0].double(), "intrinsics": small.cameras.intrinsics[0].double()}
         for name, x in (shown | camera).items():
             parts.setdefault(name, []).append(x.cpu().numpy())

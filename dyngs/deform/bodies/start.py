@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -58,7 +59,7 @@ class Bodies:
         clip = "followed at all times at once" if self.explain_all else "other things move, too"
         return f"{things} by {', '.join(f'{turn:.0f}' for turn in turns)} degrees; {clip}"
 
-    @property
+    @cached_property
     def explain_all(self) -> bool:
         """Whether hardly anything else moves."""
         from scipy.ndimage import uniform_filter

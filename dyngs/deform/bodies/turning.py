@@ -21,7 +21,7 @@ from dyngs.deform.bodies.shots import Shots
 
 COARSE, FINE = 6, 8  # Cells along an edge of the cube that the sphere is divided by
 MOST_PIXELS, FEWER_PIXELS = 250, 80  # Of a body in an image that are looked at, and that the first search looks at
-FEWEST_PIXELS = 20  # Of a body in an image, for that image to say how it turns
+FEWEST_PIXELS = 50  # Of a body in an image, for that image to say how it turns
 LEAST_PIXELS = 2  # In a cell, for its mean colour to count
 CUT, UNKNOWN = 0.37, 0.13  # Squared colour differences: the greatest that counts, and that of cells never seen
 WINDOW, FREE_DEG, GIVEN_DEG, STEP_DEG = 14, 200.0, 60.0, 30.0

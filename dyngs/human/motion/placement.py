@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dyngs.human.motion.motion import Motion, MotionClip, frame_chunks
@@ -103,8 +104,6 @@ def place_on_floor(motion: Motion, body: BodyTemplate) -> Motion:
 
 def _lowest_heights(poses: Tensor, body: BodyTemplate) -> Tensor:
     """Return the smallest y (F,) of the vertices in poses (F, J, 3); only row y of the transforms is blended."""
-    from scipy.sparse import csr_array
-
     vertex, joint = body.weights.nonzero(as_tuple=True)
     points = torch.cat([body.vertices, torch.ones_like(body.vertices[:, :1])], dim=1)
     values = (body.weights[vertex, joint][:, None] * points[vertex]).double().cpu().numpy()

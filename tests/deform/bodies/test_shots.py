@@ -78,8 +78,10 @@ def test_masked_pixels_are_as_the_static_model_has_them() -> None:
     gaussians, camera = cloud(), one_camera_of(8)
     rgb, mask = torch.rand(8, 8, 3), torch.zeros(8, 8)
     mask[:4] = 1
-    image = Image("a", camera, rgb, None, mask, 0.5)
+    image = Image("a", camera, rgb, torch.ones(8, 8), mask, 0.5)
     shots = shots_of([image], gaussians, RenderOptions(), torch.ones(3))
+    assert np.array_equal(shots.alphas[0, :4], np.ones((4, 8)))
+    assert np.array_equal(shots.alphas[0, 4:], shots.still_alphas[0, 4:])
     assert np.array_equal(shots.images[0, :4], rgb[:4].numpy())
     assert np.array_equal(shots.images[0, 4:], shots.still[0, 4:])
     assert shots.times.tolist() == [0.5]

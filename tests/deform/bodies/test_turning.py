@@ -38,6 +38,14 @@ def test_two_turns_about_any_axis_are_followed() -> None:
     assert errors.max() < 20
 
 
+def test_what_covers_few_pixels_is_not_asked() -> None:
+    """Three angles an image would explain whatever so few colours are."""
+    shots, centers, _ = rolling()
+    turning = found_turning(shots, Path(centers, 0.05, 1.0))
+    assert angles_deg(turning.rotations).max() == 0
+    assert turning.disagreement == turning.standing
+
+
 def test_what_slides_does_not_turn() -> None:
     shots, centers, _ = rolling(turns=False)
     turning = found_turning(shots, Path(centers, RADIUS, 1.0))
