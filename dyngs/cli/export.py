@@ -36,6 +36,9 @@ _UNFIT: dict[str, dict[str, str]] = {
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
     "tracks": _FOR_SPLATS,
+    "bodies": dict.fromkeys(("times", "motion", "joints", *_PARTS), "the file has the whole clip")
+    | {"sh_degree": "the file has the colours of the run"}
+    | _FOR_DYNGS,
 }
 """Options that do not go with a format, and why."""
 
@@ -46,6 +49,7 @@ examples:
   dyngs export runs/bench --out bench.spz                         the suffix names the format: .glb, .sog, .splat ...
   dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
   dyngs export runs/dance --out dance.4dgs                        all training times in one file
+  dyngs export runs/balls --bodies --out balls.glb                balls that roll as animated nodes
   dyngs export runs/dance --static --out stage.ply                only the Gaussians that never move
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
@@ -85,6 +89,8 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--max-change", type=float, metavar="X", help=about)
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
+    about = "what moves rigidly as animated nodes of a .glb; the rest stands as at --time"
+    parser.add_argument("--bodies", action="store_true", help=about)
     add_axes(parser)
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
@@ -102,6 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
     writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
+    if arguments.bodies:
+        return _export_bodies(arguments)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
@@ -129,8 +137,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
     """Raise for the first option that does not go with a format, with the reason."""
-    format = "--joints" if arguments.joints else f"--format {kind}"
-    for name, reason in _UNFIT.get("mesh" if arguments.joints else kind, {}).items():
+    format = "--bodies" if arguments.bodies else "--joints" if arguments.joints else f"--format {kind}"
+    unfit = "bodies" if arguments.bodies else "mesh" if arguments.joints else kind
+    for name, reason in _UNFIT.get(unfit, {}).items():
         passed = getattr(arguments, name)
         if passed is not None and passed is not False:  # a time may be 0
             raise DyngsError(f"--{name.replace('_', '-')} does not go with {format}{reason and f': {reason}'}")
@@ -306,6 +315,29 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
 
     path = arguments.out or arguments.run_dir / "avatar.safetensors"
     args.print_written(write_avatar(load_run(arguments.run_dir), path))
+    return 0
+
+
+def _export_bodies(arguments: argparse.Namespace) -> int:
+    """Write a moving scene with its bodies as animated nodes."""
+    from dyngs.export.body_nodes import SUFFIX, write_bodies
+    from dyngs.export.redrawn import compare_run
+    from dyngs.export.splat_files import writing_of
+    from dyngs.runs.opened import open_scene
+    from dyngs.splats.formats import format_named, read_splats
+
+    out: Path = arguments.out or arguments.run_dir / f"bodies{SUFFIX}"
+    if out.is_dir() or out.suffix.lower() != SUFFIX:
+        name = out / f"bodies{SUFFIX}" if out.is_dir() else f"{out.stem}{SUFFIX}"
+        raise DyngsError(f"{out}: --bodies writes one file; give --out {name}")
+    opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
+    time = (_times(arguments) or (0.0,))[0]
+    how, line = writing_of(opened, format_named("glb").up, arguments.up, arguments.from_up)
+    written = write_bodies(opened, out, time, how)
+    args.print_notes((line,))
+    found = compare_run(opened, opened.scene, time, written.splat, read_splats(written.path))
+    print_redrawn(written.notes, [found])
+    args.print_written(written.path)
     return 0
 
 

@@ -10,6 +10,7 @@ import base64
 import binascii
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import unquote
@@ -300,6 +301,15 @@ class GlbDocument:
         """Add a buffer view; return its index."""
         return self._add(content, len(content), None)
 
+    def add_animation(self, name: str, seconds: np.ndarray, channels: Sequence[tuple[int, str, np.ndarray]]) -> None:
+        """Add an animation: nodes, each with a path ("translation", ...) and its (F, D) values at (F,) ``seconds``."""
+        times = self.add_numbers(seconds.astype(np.float32), limits=True)
+        samplers = [
+            {"input": times, "output": self.add_numbers(values.astype(np.float32))} for _, _, values in channels
+        ]
+        targets = [{"sampler": i, "target": {"node": node, "path": path}} for i, (node, path, _) in enumerate(channels)]
+        self.json.setdefault("animations", []).append({"name": name, "channels": targets, "samplers": samplers})
+
     def _add(self, content: bytes | np.ndarray, size: int, use: int | None) -> int:
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._size, "byteLength": size}
         self._views.append(view if use is None else view | {"target": use})
@@ -320,3 +330,10 @@ class GlbDocument:
                 if not isinstance(part, bytes):
                     part = part.astype(part.dtype.newbyteorder("<"), copy=False).tobytes()
                 out.write(part + b"\0" * (-len(part) % 4))
+
+
+def shorter_ways(quats: np.ndarray) -> np.ndarray:
+    """Return quaternions (F, ..., 4), their signs so that interpolated numbers go the shorter way."""
+    turned = (quats[1:] * quats[:-1]).sum(-1, keepdims=True) < 0
+    signs = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
+    return np.concatenate([quats[:1], quats[1:] * signs])

@@ -6,7 +6,6 @@ Local letters: M vertices and T triangles of the template, V vertices of the mes
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.files.gltf import VERTICES, GlbDocument
+from dyngs.files.gltf import VERTICES, GlbDocument, shorter_ways
 from dyngs.human.avatar.anchors import Anchors, heaviest_joints
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
@@ -171,9 +170,8 @@ def animation_of(
     root = root - np.array([middle[0], min(lowest), middle[2]])
     poses = clip.poses.double().numpy()
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
-    for before, after in pairwise(quats):
-        after[(before * after).sum(-1) < 0] *= -1  # programs that interpolate the numbers go the shorter way
-    return JointAnimation(name, np.arange(len(root)) / fps, quats, root, clip.scale.double().numpy() / rig.scale)
+    seconds = np.arange(len(root)) / fps
+    return JointAnimation(name, seconds, shorter_ways(quats), root, clip.scale.double().numpy() / rig.scale)
 
 
 def add_skeleton(document: GlbDocument, rig: Rig, nodes: list[dict[str, Any]]) -> tuple[int, int]:
@@ -197,20 +195,13 @@ def add_skeleton(document: GlbDocument, rig: Rig, nodes: list[dict[str, Any]]) -
 
 def add_animation(document: GlbDocument, animation: JointAnimation, first: int) -> None:
     """Add an animation of the joints, whose nodes begin at ``first``; joints that never turn have no channel."""
-    times = document.add_numbers(animation.seconds.astype(np.float32), limits=True)
-    channels, samplers = [], []
-
-    def add(node: int, path: str, values: np.ndarray) -> None:
-        channels.append({"sampler": len(samplers), "target": {"node": node, "path": path}})
-        samplers.append({"input": times, "output": document.add_numbers(values.astype(np.float32))})
-
-    add(first, "translation", animation.root)
+    channels = [(first, "translation", animation.root)]
     if np.abs(animation.root_scale - 1).max() > _STILL:
-        add(first, "scale", np.repeat(animation.root_scale[:, None], 3, axis=1))
+        channels.append((first, "scale", np.repeat(animation.root_scale[:, None], 3, axis=1)))
     for joint in range(animation.quats.shape[1]):
         if np.abs(animation.quats[:, joint, :3]).max() > _STILL:
-            add(first + joint, "rotation", animation.quats[:, joint])
-    document.json["animations"] = [{"name": animation.name, "channels": channels, "samplers": samplers}]
+            channels.append((first + joint, "rotation", animation.quats[:, joint]))
+    document.add_animation(animation.name, animation.seconds, channels)
 
 
 def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:

@@ -1,0 +1,114 @@
+"""Bodies that turn as animated nodes of a ``.glb``; all other Gaussians stand as they are at one time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from dyngs.deform.bodies.field import BodyField
+from dyngs.deform.field import DeformationField, OuterField
+from dyngs.deform.scene import field_scene_of
+from dyngs.errors import DyngsError
+from dyngs.export.splat_files import AS_THEY_ARE, Writing, splats_at
+from dyngs.files.gltf import GlbDocument, shorter_ways
+from dyngs.files.write import atomic_file
+from dyngs.runs.inputs import inputs_of
+from dyngs.runs.opened import Opened
+from dyngs.splats.gltf import EXTENSION, add_gaussians
+from dyngs.splats.splat_file import SplatFile, require_writable, unit_rotations, with_degree
+
+SUFFIX = ".glb"
+_MOST_DEGREE = 3  # of harmonics in the file
+_STEPS_PER_TIME = 2  # poses in the file per training time: rotations are interpolated between them
+
+
+@dataclass(frozen=True)
+class BodiesFile:
+    """A file that was written."""
+
+    path: Path
+    splat: SplatFile  # what it holds at the requested time
+    notes: tuple[str, ...]  # a line about each thing that the format could not hold
+
+
+@torch.no_grad()
+def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY_ARE) -> BodiesFile:
+    """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an animation, one for the rest.
+
+    Without the animation the file shows the scene at ``time``. Raises DyngsError: no body turns in this run, or the
+    file cannot be written.
+    """
+    inputs_of(opened).require_output(path)
+    scene = field_scene_of(opened.scene)
+    field = None if scene is None else _body_field(scene.field)
+    if scene is None or field is None:
+        raise DyngsError("--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N")
+    scene = replace(scene, masks=None)  # the rows of the labels
+    splat = splats_at(opened, scene, time, how)
+    require_writable(path, splat.gaussians)
+    gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
+    gaussians = with_degree(gaussians, min(gaussians.sh_degree, _MOST_DEGREE))
+    labels = torch.full((len(scene),), -1, device=scene.moving.device).index_copy(0, scene.moving, field.rest.labels)
+    moments = np.linspace(0.0, 1.0, _STEPS_PER_TIME * max(len(scene.times) - 1, 1) + 1)
+    here, there = _poses(field, [time], how), _poses(field, moments, how)
+    document, nodes, meshes, channels = GlbDocument(), [], [], []
+    for body in range(-1, len(field.rest.centers)):
+        own = gaussians.picked(torch.nonzero(labels == body)[:, 0])
+        if not len(own):
+            continue
+        node: dict[str, object] = {"name": "rest" if body < 0 else f"body {body}", "mesh": len(meshes)}
+        if body >= 0:
+            place = here.places[0, body]
+            own = own.replace(means=(own.means.double() - torch.from_numpy(place)).float())
+            node["translation"] = place.tolist()
+            turns = there.turns(body) * here.turns(body)[0].inv()
+            channels.append((len(nodes), "translation", there.places[:, body]))
+            channels.append((len(nodes), "rotation", shorter_ways(turns.as_quat())))
+        meshes.append({"name": node["name"], "primitives": [add_gaussians(document, own)]})
+        nodes.append(node)
+    document.add_animation("motion", moments * opened.seconds, channels)
+    document.json |= {
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": meshes,
+    }
+    with atomic_file(path) as temporary:
+        document.write(temporary)
+    notes = [f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}"]
+    if bool((field.rest.labels < 0).any()):
+        notes.append(f"what bends, comes or goes stands as at time {time:g}; a sequence or a page has its motion")
+    return BodiesFile(path, splat, tuple(notes))
+
+
+def _body_field(field: DeformationField | None) -> BodyField | None:
+    """Return the field of bodies among ``field`` and those within it."""
+    while isinstance(field, OuterField) and not isinstance(field, BodyField):
+        field = field.others
+    return field if isinstance(field, BodyField) else None
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Poses of B bodies at T times, in the axes of the file."""
+
+    places: np.ndarray  # (T, B, 3) of their centres
+    quats: np.ndarray  # (T, B, 4) xyzw
+
+    def turns(self, body: int) -> Rotation:
+        return Rotation.from_quat(self.quats[:, body])
+
+
+def _poses(field: BodyField, times: Sequence[float] | np.ndarray, how: Writing) -> _Poses:
+    axes = Rotation.from_quat(np.asarray(how.turn)[[1, 2, 3, 0]])
+    found = [field.poses(float(time)) for time in times]
+    places = torch.stack([place for place, _ in found]).double().numpy()
+    quats = torch.stack([quat for _, quat in found]).double().numpy()[..., [1, 2, 3, 0]]
+    turned = (axes * Rotation.from_quat(quats.reshape(-1, 4))).as_quat()
+    return _Poses(axes.apply(places.reshape(-1, 3)).reshape(places.shape), turned.reshape(quats.shape))
