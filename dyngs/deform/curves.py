@@ -34,7 +34,7 @@ class Curves:
         heads: control points (S, P, size) by attribute of ``Offsets``; always "means".
         pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own, about itself.
         followed: (M, B) drivers of each Gaussian, B = 4; None as above.
-        shares: (M, B) of theirs, rows sum to 1; None as above.
+        fractions: (M, B) of theirs, rows sum to 1; None as above.
         is_steep: control points lie far outside what is drawn, and are to be kept as they are.
         windows: (M, 2) begin and end of each Gaussian's window in time (``WindowedField``); None: all are always there.
         error: of a driver's place: the quantile ``CHECKED``, in world units.
@@ -108,11 +108,6 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
 
 def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
     nodes = field.nodes_for(means)
-    followed, fractions = _padded(nodes.followed, nodes.weights(means))
+    more = 0, FOLLOWED - nodes.followed.shape[1]  # of which a Gaussian follows nothing
+    followed, fractions = (torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means)))
     return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
-
-
-def _padded(followed: Tensor, fractions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both with ``FOLLOWED`` columns; fractions of added ones are 0."""
-    more = FOLLOWED - followed.shape[1]
-    return torch.nn.functional.pad(followed, (0, more)), torch.nn.functional.pad(fractions, (0, more))

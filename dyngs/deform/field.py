@@ -193,11 +193,6 @@ def with_innermost(field: DeformationField, inner: DeformationField) -> Deformat
     return field.around(with_innermost(field.others, inner)) if isinstance(field, OuterField) else inner
 
 
-def key_times(num_times: int) -> int:
-    """Return the number of key times for ``num_times`` training times: half as many, from 2 to ``MAX_KEY_TIMES``."""
-    return min(max(2, (num_times + 1) // 2), MAX_KEY_TIMES)
-
-
 def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
     """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order); differentiable.
 

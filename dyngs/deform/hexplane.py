@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.config import HexplaneField
 from dyngs.deform.decoder import Decoder, head_sizes, split_heads
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen, key_times
+from dyngs.deform.field import MAX_KEY_TIMES, DeformationField, FieldSetup, Offsets, chosen
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
@@ -71,5 +71,5 @@ class Hexplane(DeformationField):
 
 
 def time_rows(options: HexplaneField, num_times: int) -> int:
-    """Return the number of rows of the planes with time: as configured, or by ``key_times``."""
-    return options.time_resolution or key_times(num_times)
+    """Return the number of rows of the planes with time: as configured, or half as many as times, 2 at least."""
+    return options.time_resolution or min(max(2, (num_times + 1) // 2), MAX_KEY_TIMES)

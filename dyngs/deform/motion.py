@@ -68,15 +68,7 @@ def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
 
 
 def _mean(samples: Sequence[Offsets]) -> Offsets:
-    return Offsets(
-        torch.stack([s.means for s in samples]).mean(0),
-        _mean_head([s.quats for s in samples]),
-        _mean_head([s.log_scales for s in samples]),
-        _mean_head([s.logit_opacities for s in samples]),
-        _mean_head([s.colors for s in samples]),
-    )
-
-
-def _mean_head(values: Sequence[Tensor | None]) -> Tensor | None:
-    known = [x for x in values if x is not None]
-    return torch.stack(known).mean(0) if known else None
+    heads = [[x for x in found if x is not None] for found in zip(*(vars(s).values() for s in samples), strict=True)]
+    means, *others = (torch.stack(found).mean(0) if found else None for found in heads)
+    assert means is not None
+    return Offsets(means, *others)

@@ -15,8 +15,9 @@ from dyngs.deform.field import DeformationField, OuterField
 from dyngs.deform.scene import field_scene_of
 from dyngs.errors import DyngsError
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, splats_at
-from dyngs.files.gltf import GlbDocument, shorter_ways
+from dyngs.files.gltf import GlbDocument
 from dyngs.files.write import atomic_file
+from dyngs.ops.quaternions import shorter_ways
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.gltf import EXTENSION, add_gaussians

@@ -330,10 +330,3 @@ class GlbDocument:
                 if not isinstance(part, bytes):
                     part = part.astype(part.dtype.newbyteorder("<"), copy=False).tobytes()
                 out.write(part + b"\0" * (-len(part) % 4))
-
-
-def shorter_ways(quats: np.ndarray) -> np.ndarray:
-    """Return quaternions (F, ..., 4), their signs so that interpolated numbers go the shorter way."""
-    turned = (quats[1:] * quats[:-1]).sum(-1, keepdims=True) < 0
-    signs = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
-    return np.concatenate([quats[:1], quats[1:] * signs])

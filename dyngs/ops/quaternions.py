@@ -8,6 +8,7 @@ Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/q
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -82,3 +83,10 @@ def quats_of(matrices: Tensor) -> Tensor:
     for column, entry in zip(columns[1:], diagonal[1:], strict=True):
         chosen, largest = torch.where(entry > largest, torch.stack(column), chosen), torch.maximum(largest, entry)
     return (chosen / chosen.square().sum(0).sqrt().clamp_min(1e-30)).T.reshape(*matrices.shape[:-2], 4)
+
+
+def shorter_ways(quats: np.ndarray) -> np.ndarray:
+    """Return quaternions (F, ..., 4), their signs so that interpolated numbers go the shorter way."""
+    turned = (quats[1:] * quats[:-1]).sum(-1, keepdims=True) < 0
+    signs = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
+    return np.concatenate([quats[:1], quats[1:] * signs])

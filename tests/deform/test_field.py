@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field, tiny_setup
 from torch import Tensor
 
-from dyngs.deform.field import Offsets, deformed, key_times
+from dyngs.deform.field import Offsets, deformed
 from dyngs.gaussians import Gaussians
 from dyngs.ops.quaternions import identity_quat, quat_product
 
@@ -28,13 +28,6 @@ def some_offsets(count: int, dtype: torch.dtype = torch.float32, seed: int = 1) 
 
 def rotations(quats: Tensor) -> Rotation:
     return Rotation.from_quat(quats.double().roll(-1, 1).numpy())
-
-
-@pytest.mark.parametrize(
-    ("num_times", "keys"), [(0, 2), (1, 2), (2, 2), (5, 3), (48, 24), (511, 256), (513, 256), (10**6, 256)]
-)
-def test_time_is_divided_half_as_finely_but_into_no_more_than_256(num_times: int, keys: int) -> None:
-    assert key_times(num_times) == keys
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -161,3 +161,10 @@ def test_select_changes_nothing() -> None:
     before = {name: x.clone() for name, x in tensors_of(field.parameters.state()).items()}
     field = field.edited(TopologyEdit(torch.tensor([3, 3, 0]), torch.tensor([False, True, False])))
     assert all(torch.equal(x, before[name]) for name, x in tensors_of(field.parameters.state()).items())
+
+
+@pytest.mark.parametrize(
+    ("num_times", "keys"), [(0, 2), (1, 2), (2, 2), (5, 3), (48, 24), (511, 256), (513, 256), (10**6, 256)]
+)
+def test_time_is_divided_half_as_finely_but_into_no_more_than_256(num_times: int, keys: int) -> None:
+    assert time_rows(HexplaneField(), num_times) == keys

@@ -13,10 +13,11 @@ from dyngs.conventions import SH_C0
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.bodies.paths import Path, clear_, found_paths
 from dyngs.deform.bodies.shots import Shots
-from dyngs.deform.bodies.turning import FINE, Turning, angles_deg, cells, found_turning
+from dyngs.deform.bodies.turning import FINE, Turning, cells, found_turning
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField
 from dyngs.deform.spline_fit import spline_basis
 from dyngs.gaussians import Gaussians
+from dyngs.ops.quaternions import shorter_ways
 
 AGREES, BY_CHANCE = 0.6, 0.4
 """Disagreement of a body's colours, as a fraction of that if it did not turn, and of that of any of its colours.
@@ -54,7 +55,10 @@ class Bodies:
     @property
     def finding(self) -> str:
         """A line about them."""
-        turns = [angles_deg(_steps(body.turning.rotations)).sum() for body in self.bodies]
+        from scipy.spatial.transform import Rotation
+
+        turns = [Rotation.from_matrix(body.turning.rotations) for body in self.bodies]
+        turns = [np.degrees((turn[1:] * turn[:-1].inv()).magnitude()).sum() for turn in turns]
         things = "1 body turns" if len(turns) == 1 else f"{len(turns)} bodies turn"
         clip = "followed at all times at once" if self.explain_all else "other things move, too"
         return f"{things} by {', '.join(f'{turn:.0f}' for turn in turns)} degrees; {clip}"
@@ -121,13 +125,8 @@ def _rigid_bodies(shots: Shots) -> tuple[Body, ...]:
 
 
 def _is_rigid(turning: Turning) -> bool:
-    if turning.by_chance < LEAST_MARKS:
-        return False
-    return turning.disagreement < min(AGREES * turning.standing, BY_CHANCE * turning.by_chance)
-
-
-def _steps(rotations: np.ndarray) -> np.ndarray:
-    return np.einsum("tij,tkj->tik", rotations[1:], rotations[:-1])
+    least = min(AGREES * turning.standing, BY_CHANCE * turning.by_chance)
+    return turning.by_chance >= LEAST_MARKS and turning.disagreement < least
 
 
 def _seeds(body: Body, shots: Shots, limit: int, num_terms: int) -> Gaussians:
@@ -157,9 +156,7 @@ def _quats(rotations: np.ndarray) -> np.ndarray:
     """Return (T, 4) quaternions wxyz of ``rotations`` (T, 3, 3), each on the side of the one before."""
     from scipy.spatial.transform import Rotation
 
-    quats = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
-    signs = np.where((quats[1:] * quats[:-1]).sum(1) < 0, -1.0, 1.0)
-    return quats * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
+    return shorter_ways(Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]])
 
 
 def _fitted(basis: np.ndarray, values: np.ndarray) -> np.ndarray:

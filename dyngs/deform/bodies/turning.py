@@ -228,10 +228,9 @@ def _followed(frames: Frames, first: int, known: np.ndarray) -> np.ndarray:
     rotations[first : high + 1] = _polished(frames[first : high + 1], known)
     sums, counts = _total([_sums(frames[t], rotations[t]) for t in range(first, high + 1)])
     pace = min(PACE, len(known) - 1)
-    ways = ((1, range(high + 1, len(frames))), (-1, range(first - 1, -1, -1)))
-    for t, way in sorted(
-        ((t, way) for way, images in ways for t in images), key=lambda x: abs(2 * x[0] - first - high)
-    ):
+    outside = [t for t in range(len(frames)) if not first <= t <= high]
+    for t in sorted(outside, key=lambda t: (abs(2 * t - first - high), -t)):
+        way = 1 if t > high else -1
         last = rotations[t - way]
         rate = Rotation.from_matrix(last @ rotations[t - (1 + pace) * way].T).as_rotvec() / pace
         expected = rotations_by(rate) @ last

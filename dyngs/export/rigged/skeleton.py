@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.errors import DyngsError
-from dyngs.files.gltf import VERTICES, GlbDocument, shorter_ways
+from dyngs.files.gltf import VERTICES, GlbDocument
 from dyngs.human.avatar.anchors import Anchors, heaviest_joints
 from dyngs.human.avatar.posing import Skeleton
 from dyngs.human.avatar.scene import HumanScene
@@ -22,6 +22,7 @@ from dyngs.human.motion.placement import upright
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, blend_transforms, joint_transforms
 from dyngs.human.template.body import BodyTemplate, apply_shape
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.ops.quaternions import shorter_ways
 
 _MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
 
