@@ -102,6 +102,9 @@ class DeformationField:
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
 
+    def rest_outside_(self, window: tuple[float, float]) -> None:
+        """Drop the gradients of what times in ``window`` hardly show: Adam would take them for as much as any."""
+
     def edited(self: F, edit: TopologyEdit) -> F:
         """Return the field after an edit of the moving Gaussians."""
         return self
@@ -164,6 +167,9 @@ class OuterField(DeformationField):
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         self.others.extend(seen, soon)
+
+    def rest_outside_(self, window: tuple[float, float]) -> None:
+        self.others.rest_outside_(window)
 
     def regroup(self) -> None:
         self.others.regroup()

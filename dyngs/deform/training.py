@@ -115,6 +115,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         if scene.field is None:
             return 0
+        scene.field.rest_outside_(self._window.bounds(step))
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
         return scene.field.step(step - self.schedule.fine, progress)
 

@@ -5,6 +5,7 @@ Local letters: M moving Gaussians, B bodies, P control points.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -72,6 +73,14 @@ class BodyField(OuterField):
             found.logit_opacities,
             found.colors,
         )
+
+    def rest_outside_(self, window: tuple[float, float]) -> None:
+        super().rest_outside_(window)
+        for points in self.parameters.leaves:
+            pieces = points.shape[1] - SPAN + 1
+            first, last = math.ceil(window[0] * pieces) + 1, math.floor(window[1] * pieces) + 1  # by where they peak
+            if points.grad is not None and window != (0.0, 1.0):
+                points.grad[:, :first], points.grad[:, last + 1 :] = 0, 0
 
     def edited(self, edit: TopologyEdit) -> BodyField:
         field = super().edited(edit)

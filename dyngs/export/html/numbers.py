@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyngs.deform.curves import Curves, curves_of, fitted_curves
 from dyngs.deform.field import Offsets
 from dyngs.deform.scene import DynamicScene, field_scene_of
 from dyngs.deform.windows import EDGE, OPEN
+from dyngs.export.html.curves import Curves, curves_of, fitted_curves
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.order import storage_order

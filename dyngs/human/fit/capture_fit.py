@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -112,10 +113,10 @@ class Seen:
         }
         return replace(self, used=used, judged=used if self.judged is self.used else self.judged)
 
-    def halved(self, row: int) -> ObservedFrame | None:
-        """Return the frame of a row at half the size."""
-        found = self.used[row]
-        return None if found is None else found.shrunk(2)
+    @cached_property
+    def halves(self) -> dict[int, ObservedFrame | None]:
+        """The frames to fit to at half the size."""
+        return {row: None if frame is None else frame.shrunk(2) for row, frame in self.used.items()}
 
 
 def fit_capture(
@@ -250,12 +251,13 @@ def _from_given(
     fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[TriedFit, ...]:
     start = new_fit(fitting.clip, fitting.surface)
-    tick, full = ticker("shape", report, 4 * effort.steps), seen.used.__getitem__
+    tick = ticker("shape", report, 4 * effort.steps)
+    half, full = seen.halves.__getitem__, seen.used.__getitem__
     # Clothes and hair are no sign of wrong poses.
-    dressed = fitting.run(start, ("padding",), effort.steps, seen.halved, tick)
+    dressed = fitting.run(start, ("padding",), effort.steps, half, tick)
     tried = [measured("the poses as given", dressed, fitting, seen)]
     shape = start
-    for look in (seen.halved, full):
+    for look in (half, full):
         shape = fitting.run(shape, shared, effort.steps, look, tick)
     tried.append(measured("one shape", shape, fitting, seen))
     turns = fitting.run(shape, (*shared, "turns"), effort.steps, full, tick)
@@ -272,7 +274,7 @@ def _from_silhouettes(
     start, steps = new_fit(fitting.clip, fitting.surface), effort.steps_for(fitting.clip)
     tick, found = ticker("shape", report, 2 * steps), start
     first = measured("poses found frame by frame", start, fitting, seen)
-    for look in (seen.halved, seen.used.__getitem__):
+    for look in (seen.halves.__getitem__, seen.used.__getitem__):
         found = fitting.run(found, (*shape, "poses", "trans"), steps, look, tick)
     return first, measured("one shape, and poses of every frame", found, fitting, seen)
 

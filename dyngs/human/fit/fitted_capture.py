@@ -178,7 +178,7 @@ def overlay(
     """
     sheet = image.composite(torch.ones_like(image.rgb_premultiplied[0, 0])).clamp(0, 1).clone()
     for betas, pose, colour in bodies:
-        discs = surface.in_pose(betas, torch.zeros_like(surface.weights[:, 0]), pose)
+        discs = surface.in_shape(betas, torch.zeros_like(surface.weights[:, 0])).in_pose(pose)
         inside = drawn_silhouettes(discs, image.cameras)[0] > 0.5
         grown = torch.nn.functional.max_pool2d((~inside).float()[None, None], 3, 1, 1)[0, 0] > 0
         sheet[inside & grown] = sheet.new_tensor(colour)

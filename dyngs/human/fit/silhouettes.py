@@ -51,13 +51,26 @@ class Surface:
         joints = self.body.joints if dirs is None else self.body.joints + dirs @ betas
         return Skeleton(joints, self.body.parents)
 
-    def in_pose(self, betas: Tensor, padding: Tensor, pose: BodyPose) -> Gaussians:
-        """Return the discs in a pose, in the world; differentiable.
+    def in_shape(self, betas: Tensor, padding: Tensor) -> ShapedSurface:
+        """Return the surface of one person at rest; differentiable.
 
         ``betas`` (B,) are shape parameters; ``padding`` (P,) m, by how much clothes and hair lie outside the skin.
         """
         means = self.discs.means + self.shape_dirs @ betas + padding[:, None] * self.normals
-        return pose_gaussians(self.discs.replace(means=means), self.weights, self.skeleton(betas), pose)
+        return ShapedSurface(self.discs.replace(means=means), self.weights, self.skeleton(betas))
+
+
+@dataclass(frozen=True)
+class ShapedSurface:
+    """The surface of one person."""
+
+    discs: Gaussians  # P at rest, m
+    weights: Tensor  # (P, J) skinning weights
+    skeleton: Skeleton
+
+    def in_pose(self, pose: BodyPose) -> Gaussians:
+        """Return the discs in a pose, in the world; differentiable."""
+        return pose_gaussians(self.discs, self.weights, self.skeleton, pose)
 
 
 def surface_of(body: BodyTemplate, resolution: int) -> Surface:

@@ -7,7 +7,7 @@ shape parameters, P discs, V views, K key points.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,8 +16,8 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
-from dyngs.human.avatar.posing import BodyPose
-from dyngs.human.fit.silhouettes import ObservedFrame, Surface, drawn_silhouettes
+from dyngs.human.avatar.posing import BodyPose, Skeleton
+from dyngs.human.fit.silhouettes import ObservedFrame, ShapedSurface, Surface, drawn_silhouettes
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import NUM_BONE_SHAPES
@@ -171,9 +171,8 @@ def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
     return BodyPose(torch.cat([turned, given[len(own) :]]), clip.trans[row] + away, scale)
 
 
-def posed_joints(learned: Parameters, clip: MotionClip, surface: Surface, row: int) -> Tensor:
-    """Return the joints (J, 3) of frame ``row`` in the world."""
-    skeleton, pose = surface.skeleton(learned["betas"]), frame_pose_of(learned, clip, row)
+def posed_joints(skeleton: Skeleton, pose: BodyPose) -> Tensor:
+    """Return the joints (J, 3) in the world."""
     moves = joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
     return pose.scale * apply_transforms(moves, skeleton.joints) + pose.trans
 
@@ -247,38 +246,46 @@ class Fitting:
         """
         # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
         found = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
+        for name in found.values():
+            found[name].requires_grad_(name in learned)
         order = spread_order(len(self.clip))
         for step in range(1, steps + 1):
             rows = {order[((step - 1) * FRAMES + i) % len(order)] for i in range(FRAMES)}
+            seen = {row: frame for row in sorted(rows) if (frame := observed(row)) is not None}
             loss = prior(found, self.expected)
-            for row in sorted(rows):
-                seen = observed(row)
-                if seen is not None:
-                    loss = loss + frame_error(found, self.clip, self.surface, row, seen) / len(rows)
-            loss.backward()
-            for name in found.values():
-                if name not in learned:
-                    found[name].grad = None
+            if seen:
+                loss = loss + mean_error(found, self.clip, self.surface, seen) * (len(seen) / len(rows))
+            if loss.requires_grad:  # else nothing is to be learned
+                loss.backward()
             found.step(step, step / steps)
             tick()
         return found
 
 
-def frame_error(learned: Parameters, clip: MotionClip, surface: Surface, row: int, seen: ObservedFrame) -> Tensor:
-    """Return the error of frame ``row``: of its silhouettes, and of its joints where they are marked."""
-    error = silhouette_error(drawn_frame(learned, clip, surface, row, seen.cameras), seen)
-    if seen.joints is not None:
-        positions, cameras = posed_joints(learned, clip, surface, row), refined(seen.cameras, learned)
-        error = error + KEYPOINT_WEIGHT * keypoint_error(positions, seen.joints, cameras)
-    if seen.positions is not None:
-        unit = clip.scale[row] * learned["log_scale"][0].detach().exp()
-        error = error + PLACE_WEIGHT * place_error(posed_joints(learned, clip, surface, row), seen.positions, unit)
-    return error
+def mean_error(learned: Parameters, clip: MotionClip, surface: Surface, seen: Mapping[int, ObservedFrame]) -> Tensor:
+    """Return the error of the frames ``seen``, by row: of silhouettes, and of joints where they are marked."""
+    body, errors = shaped(learned, surface), []
+    for row, frame in seen.items():
+        pose, cameras = frame_pose_of(learned, clip, row), refined(frame.cameras, learned)
+        error = silhouette_error(drawn_silhouettes(body.in_pose(pose), cameras), frame)
+        if frame.joints is not None:
+            joints = posed_joints(body.skeleton, pose)
+            error = error + KEYPOINT_WEIGHT * keypoint_error(joints, frame.joints, cameras)
+        if frame.positions is not None:
+            joints = posed_joints(body.skeleton, pose)
+            error = error + PLACE_WEIGHT * place_error(joints, frame.positions, pose.scale.detach())
+        errors.append(error)
+    return torch.stack(errors).mean()
+
+
+def shaped(learned: Parameters, surface: Surface) -> ShapedSurface:
+    """Return the surface in the fitted shape."""
+    return surface.in_shape(learned["betas"], learned["padding"])
 
 
 def drawn_frame(learned: Parameters, clip: MotionClip, surface: Surface, row: int, cameras: Cameras) -> Tensor:
     """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
-    discs = surface.in_pose(learned["betas"], learned["padding"], frame_pose_of(learned, clip, row))
+    discs = shaped(learned, surface).in_pose(frame_pose_of(learned, clip, row))
     return drawn_silhouettes(discs, refined(cameras, learned))
 
 
@@ -385,6 +392,5 @@ def fit_lens(
 
 @torch.no_grad()
 def _mean_error(fitting: Fitting, learned: Parameters, observed: Observations, rows: Sequence[int]) -> float:
-    shown = [(row, seen) for row in rows if (seen := observed(row)) is not None]
-    errors = [float(frame_error(learned, fitting.clip, fitting.surface, row, seen)) for row, seen in shown]
-    return sum(errors) / max(len(errors), 1)
+    seen = {row: frame for row in rows if (frame := observed(row)) is not None}
+    return float(mean_error(learned, fitting.clip, fitting.surface, seen)) if seen else 0.0

@@ -15,7 +15,7 @@ from dyngs.camera import Cameras
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.times import evenly_spaced
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface
-from dyngs.human.fit.solve import NUM_TURNED, Fitting, Observations, frame_error, new_fit, prior, usual, usual_pose
+from dyngs.human.fit.solve import NUM_TURNED, Fitting, Observations, mean_error, new_fit, prior, usual, usual_pose
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 
@@ -263,7 +263,7 @@ def _found_from(
         shown = seen.shrunk(level)
         learned = fitting.run(learned, ("poses", "trans"), STEPS, lambda _, at=shown: at)
     with torch.no_grad():
-        error = float(frame_error(learned, one, surface, 0, seen) + prior(learned, fitting.expected))
+        error = float(mean_error(learned, one, surface, {0: seen}) + prior(learned, fitting.expected))
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())
     given = Rotation.from_rotvec(pose[:NUM_TURNED].numpy())
     found = pose.clone()

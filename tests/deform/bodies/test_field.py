@@ -115,3 +115,26 @@ def test_a_forged_state_is_refused(name: str, change: Callable[[Tensor], Tensor 
         tensors[name] = forged
     with pytest.raises((KeyError, ValueError)):
         restored_field(tiny_options("control_nodes"), tensors, 9)
+
+
+@pytest.mark.parametrize(("window", "learned"), [((0.3, 0.7), (3, 4)), ((0.35, 0.45), (3,)), ((0.0, 1.0), range(8))])
+def test_what_the_window_of_times_hardly_shows_stays_as_it_was_found(
+    window: tuple[float, float], learned: tuple[int, ...] | range
+) -> None:
+    """Of 8 control points, that is 5 pieces, those that peak in the window are learned.
+
+    Adam, which makes steps of one size however weak the gradients are, once took paths a ball's width away.
+    """
+    field, means = field_of(points=8), cloud().means
+    before = {name: x.detach().clone() for name, x in field.parameters.values().items()}
+    for step in range(1, 4):
+        for time in torch.linspace(*window, 7).tolist():
+            field.offsets(means, time).means.square().sum().backward()
+        field.rest_outside_(window)
+        field.step(step, 0.0)
+    for name, x in field.parameters.values().items():
+        moved = (x - before[name]).abs().amax(dim=(0, 2)) > 0
+        if name == "places":
+            assert torch.nonzero(moved)[:, 0].tolist() == list(learned)
+        else:
+            assert set(torch.nonzero(moved)[:, 0].tolist()) <= set(learned)

@@ -19,6 +19,7 @@ from dyngs.human.fit.solve import (
     PosePrior,
     drawn_frame,
     fit_lens,
+    frame_pose_of,
     keypoint_error,
     near_given,
     new_fit,
@@ -58,6 +59,11 @@ def clip(elbow: float = 0.0) -> MotionClip:
     return MotionClip(torch.zeros(1, dtype=torch.float64), poses, torch.zeros(1, 3), torch.ones(1))
 
 
+def joints_at(learned: Parameters, clip: MotionClip, surface: Surface) -> torch.Tensor:
+    """The joints (J, 3) of the first frame of a fit."""
+    return posed_joints(surface.skeleton(learned["betas"]), frame_pose_of(learned, clip, 0))
+
+
 def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
     joints = torch.tensor([[0.0, 0.0, 0.0], [0.5, 1.0, 0.0]])
     positions = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])[None]
@@ -83,7 +89,7 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> No
     """The given arm is bent by 2 rad; the image shows it straight."""
     given, straight, view = clip(2.0), clip(), camera()
     with torch.no_grad():
-        truth = posed_joints(new_fit(straight, surface), straight, surface, 0)
+        truth = joints_at(new_fit(straight, surface), straight, surface)
         alpha = drawn_frame(new_fit(straight, surface), straight, surface, 0, view)
     marked = torch.zeros(1, 55, 3)
     wrist = JOINT_NAMES.index("left_wrist")
@@ -95,7 +101,7 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> No
         seen = ObservedFrame(view, alpha, torch.ones_like(alpha), joints)
         fitting = Fitting(given, surface, near_given(given))
         found = fitting.run(new_fit(given, surface), ("poses",), 120, lambda _, seen=seen: seen)
-        errors.append(float((posed_joints(found, given, surface, 0) - truth)[wrist].detach().norm()))
+        errors.append(float((joints_at(found, given, surface) - truth)[wrist].detach().norm()))
     assert errors[1] < 0.2, "the prior of given poses still pulls"
     assert errors[1] < 0.5 * errors[0]
 

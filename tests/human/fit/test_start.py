@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.camera import Cameras
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
-from dyngs.human.fit.solve import drawn_frame, new_fit, posed_joints, usual_pose
+from dyngs.human.fit.solve import drawn_frame, frame_pose_of, new_fit, posed_joints, usual_pose
 from dyngs.human.fit.start import (
     NUM_HEADINGS,
     PELVIS_FRACTION,
@@ -176,7 +176,8 @@ def test_who_turns_before_one_camera_is_followed(surface: Surface, monkeypatch: 
 
 def with_joints(surface: Surface, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
     """What is seen, and the joints as key points."""
-    seen, joints = seen_by(surface, clip, cameras), posed_joints(new_fit(clip, surface), clip, surface, 0)
+    seen, blank = seen_by(surface, clip, cameras), new_fit(clip, surface)
+    joints = posed_joints(surface.skeleton(blank["betas"]), frame_pose_of(blank, clip, 0))
     local = joints @ cameras.cam_from_world[0, :3, :3].T + cameras.cam_from_world[0, :3, 3]
     pixels = local @ cameras.intrinsics[0].T
     marked = torch.cat([pixels[:, :2] / pixels[:, 2:] / SIZE, torch.ones(len(joints), 1)], 1)
