@@ -46,7 +46,7 @@ def track_scores(
     """Return the errors of a scene's motion in the images of a split, of which each view has its camera.
 
     Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of those at which any of
-    ``views``, of all splits, shows it; from there their mean displacement carries it. Where Gaussians are there for a
+    ``views``, of all splits, shows it; from there they carry it as they move and turn. Where Gaussians are there for a
     while only, others take over at each time. Distances are at most the diagonal of the image.
     """
     if tracks is None:
@@ -86,12 +86,43 @@ class _Bound:
     times: np.ndarray  # (P,) when they were bound, NaN where they were not
     carriers: np.ndarray  # (P, K) rows of Gaussians
     weights: np.ndarray  # (P, K), each row sums to 1
-    positions: np.ndarray  # (P, K, 3) of the carriers when they were bound
+    poses: _Poses  # (P, K) of the carriers when they were bound
 
     def carried(self, scene: GaussianScene, time: float) -> np.ndarray:
         """Return the (P, 3) points at ``time``."""
-        means = scene.at(time).means.detach().cpu().double().numpy()
-        return self.points + (self.weights[..., None] * (means[self.carriers] - self.positions)).sum(axis=1)
+        return _carried(self.points, self.poses, _poses(scene, time).of(self.carriers), self.weights)
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Where Gaussians are, and how they are turned."""
+
+    means: np.ndarray  # (..., 3)
+    quats: np.ndarray  # (..., 4) wxyz, of any length
+
+    def of(self, rows: np.ndarray) -> _Poses:
+        return _Poses(self.means[rows], self.quats[rows])
+
+
+def _poses(scene: GaussianScene, time: float) -> _Poses:
+    gaussians = scene.at(time)
+    return _Poses(*(x.detach().cpu().double().numpy() for x in (gaussians.means, gaussians.quats)))
+
+
+def _carried(points: np.ndarray, before: _Poses, after: _Poses, weights: np.ndarray) -> np.ndarray:
+    """Return ``points`` (P, 3) as (P, K) Gaussians carry them, which move and turn, with ``weights`` (P, K).
+
+    What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone would not do.
+    """
+    from scipy.spatial.transform import Rotation
+
+    there = np.isfinite(points).all(1)
+    found = np.full(points.shape, np.nan)
+    arms = points[there, None] - before.means[there]
+    first, last = (Rotation.from_quat(x.quats[there].reshape(-1, 4)[:, [1, 2, 3, 0]]) for x in (before, after))
+    arms = (last * first.inv()).apply(arms.reshape(-1, 3)).reshape(arms.shape)
+    found[there] = (weights[there, :, None] * (after.means[there] + arms)).sum(axis=1)
+    return found
 
 
 def _handed_on(scene: GaussianScene, bound: _Bound, times: Sequence[float]) -> dict[float, np.ndarray]:
@@ -103,15 +134,15 @@ def _handed_on(scene: GaussianScene, bound: _Bound, times: Sequence[float]) -> d
     if moved is None or moved.field is None or not moved.field.momentary:
         return {}
     steps = sorted({*scene.times, *times, *bound.times[np.isfinite(bound.times)].tolist()})
-    means = {time: scene.at(time).means.detach().cpu().double().numpy() for time in steps}
+    poses = {time: _poses(scene, time) for time in steps}
     found = {time: np.where((bound.times == time)[:, None], bound.points, np.nan) for time in steps}
     for order in (steps, steps[::-1]):
         for now, then in pairwise(order):
             rows = np.flatnonzero(np.isfinite(found[now]).all(1) & ~np.isfinite(found[then]).all(1))
             if len(rows):
-                carriers, weights = _nearest(scene, now, means[now], found[now][rows], bound.weights.shape[1])
-                apart = means[then][carriers] - means[now][carriers]
-                found[then][rows] = found[now][rows] + (weights[..., None] * apart).sum(axis=1)
+                carriers, weights = _nearest(scene, now, poses[now].means, found[now][rows], bound.weights.shape[1])
+                before, after = poses[now].of(carriers), poses[then].of(carriers)
+                found[then][rows] = _carried(found[now][rows], before, after, weights)
     return found
 
 
@@ -147,15 +178,15 @@ def _bind(scene: GaussianScene, tracks: TrueTracks, times: np.ndarray) -> _Bound
         np.full(count, np.nan),
         np.zeros((count, carriers_each), np.int64),
         np.full((count, carriers_each), 1.0 / carriers_each),
-        np.zeros((count, carriers_each, 3)),
+        _Poses(np.zeros((count, carriers_each, 3)), np.ones((count, carriers_each, 4))),
     )
     for row, members in _binding_rows(tracks, times).items():
         time = float(times[row])
-        means = scene.at(time).means.detach().cpu().double().numpy()
+        poses = _poses(scene, time)
         points = tracks.points[row, members].astype(np.float64)
-        chosen, weights = _nearest(scene, time, means, points, carriers_each)
-        bound.points[members], bound.times[members] = points, time
-        bound.carriers[members], bound.positions[members] = chosen, means[chosen]
+        chosen, weights = _nearest(scene, time, poses.means, points, carriers_each)
+        bound.points[members], bound.times[members], bound.carriers[members] = points, time, chosen
+        bound.poses.means[members], bound.poses.quats[members] = poses.means[chosen], poses.quats[chosen]
         bound.weights[members] = weights
     return bound
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import Sliding, camera, moving_scene, row_of_balls, still_scene
+from scipy.spatial.transform import Rotation
 
 from dyngs.camera import Cameras
 from dyngs.config import FreeField
@@ -22,6 +23,7 @@ from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.scenes import SceneName
 from dyngs.data.tracks import TrueTracks, read_true_tracks
+from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.free import FreePrimitives, FreeStart
 from dyngs.deform.scene import DynamicScene
@@ -90,6 +92,23 @@ def test_motion_that_is_too_slow_is_off_by_the_rest() -> None:
     fast = track_scores(only_movers(moving_scene(Sliding(speed=1000.0))), sliding_truth(), split(), views())
     assert fast.error_px == pytest.approx(np.hypot(20, 14)), "no more than the diagonal of the image"
     assert fast.within_5px == 0.0
+
+
+def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
+    """Half a turn about y: the Gaussians alone, 0.5 from each point, would leave them up to 1 away."""
+    rows, center, away = [1, 3], torch.zeros(1, 3), np.array([[0.3, 0.2, 0.4], [-0.3, 0.2, -0.4]])
+    angles = torch.linspace(0, torch.pi / 2, 9)
+    quats = torch.stack([angles.cos(), 0 * angles, angles.sin(), 0 * angles], dim=1)
+    splines = {"places": torch.zeros(1, 9, 3), "quats": quats[None]}
+    body = BodyField(Sliding(speed=0.0), BodyRest(center, torch.zeros(2, dtype=torch.long)), splines)
+    scene = moving_scene(body)
+    turns = [Rotation.from_quat(body.poses(t)[1][0].detach().numpy()[[1, 2, 3, 0]]) for t in TIMES]
+    points = np.stack([turn.apply(row_of_balls().means[rows].numpy() + away) for turn in turns])
+    truth = replace(sliding_truth(), points=points)
+    found = track_scores(only_movers(scene), truth, split(), views())
+    assert found.motion_px is not None
+    assert found.motion_px > 0.8
+    assert found.error_px == pytest.approx(0.0, abs=1e-4)
 
 
 def test_points_are_bound_when_they_are_seen() -> None:
