@@ -75,7 +75,7 @@ MUTATIONS = (
     ("deform/scene.py", "rows = torch.nonzero(descent >= 0)", "rows = torch.nonzero(descent > 0)", "deform/test_scene.py"),
     ("human/avatar/anchors.py", "kept / kept.sum(1, keepdim=True)", "kept", "human/avatar/test_anchors.py"),
     ("human/avatar/anchors.py", "height == min(heights)", "height == max(heights)", "human/avatar/test_anchors.py"),
-    ("human/avatar/posing.py", "3 * z * z - 1", "3 * z * z", "human/avatar/test_posing.py human/avatar/test_scene.py"),
+    ("ops/harmonics.py", "3 * z * z - 1", "3 * z * z", "human/avatar/test_posing.py human/avatar/test_scene.py"),
     ("human/avatar/posing.py", "features[1:].flatten()", "rotations[1:].flatten()", "human/avatar/test_posing.py human/avatar/test_scene.py"),
     ("training/trainer.py", "self._position += 1", "self._position += 2", "training/test_trainer.py"),
     ("models/schedule.py", "step / options.steps >= fraction", "step / options.steps > fraction", "gaussians/test_schedule.py training/test_clock.py"),

@@ -55,6 +55,15 @@ def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor
     return harmonics_op(means, centers, sh, radii, degree)
 
 
+def light_harmonics(directions: Tensor) -> Tensor:
+    """Return the harmonics (N, 8) of degree 1 and 2, not normalised, in unit directions (N, 3).
+
+    Diffuse light on what faces these directions has hardly any finer detail (Ramamoorthi and Hanrahan 2001).
+    """
+    x, y, z = directions.unbind(1)
+    return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], dim=1)
+
+
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
     """Return (..., K) real spherical harmonics of unit directions (..., 3), from the associated Legendre recursion.
 

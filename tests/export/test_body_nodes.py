@@ -31,7 +31,7 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     quats = torch.stack([angles.cos(), angles.sin() * 0.6, 0 * angles, angles.sin() * 0.8], dim=1)
     places = torch.stack([torch.linspace(-1, 1, 9), torch.linspace(0, 0.5, 9) ** 2, torch.zeros(9)], dim=1)
     rest = BodyRest(torch.tensor([[0.1, 0.2, 0.0]]), torch.zeros(len(MOVING_ROWS), dtype=torch.long))
-    field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]})
+    field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]}, torch.ones(2, 3))
     assert isinstance(opened.scene, DynamicScene)
     return opened.showing(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
 

@@ -15,13 +15,14 @@ from torch import Tensor
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.parameters import Parameters
+from dyngs.ops.harmonics import light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
 from dyngs.tensor_checks import require_indices, require_tensor
 
-RATES = {"places": 3e-4, "quats": 3e-3}
-"""Learning rates of the bodies' splines; that of places times the scene extent."""
+RATES = {"places": 3e-4, "quats": 3e-3, "light": 1e-2, "albedo": 5e-3}
+"""Learning rates; that of places times the scene extent."""
 LR_DECAY = 0.05
 
 
@@ -37,15 +38,21 @@ class BodyField(OuterField):
     """The offsets of ``others``, but for the Gaussians of bodies: these move rigidly, and take colours alone from it.
 
     A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of the place p and of
-    the quaternion of R; the Gaussians turn with it.
+    the quaternion of R; the Gaussians turn with it, into the light and out of it: their colours change by their albedo
+    times the light on what faces the way that they lie from the centre (``light_harmonics``).
     """
 
-    def __init__(self, others: DeformationField, rest: BodyRest, splines: Mapping[str, Tensor]) -> None:
-        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies' ``splines``."""
+    def __init__(self, others: DeformationField, rest: BodyRest, splines: Mapping[str, Tensor], albedo: Tensor) -> None:
+        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of ``splines``, and (M, 3) ``albedo``.
+
+        ``albedo``: in units of the harmonic of degree 0; of what is not a body's, anything.
+        """
         super().__init__(others)
         self.rest = rest
         rates = RATES | {"places": RATES["places"] * self.setup.extent}
-        self.parameters = Parameters(splines, rates, LR_DECAY)
+        learned = {**splines, "light": albedo.new_zeros(8, 3), "albedo": albedo}
+        roles = dict.fromkeys(learned, Role.SHARED) | {"albedo": Role.PER_MOVING}
+        self.parameters = Parameters(learned, rates, LR_DECAY, roles)
 
     @property
     def num_values(self) -> int:
@@ -61,9 +68,11 @@ class BodyField(OuterField):
         own = torch.nonzero(labels >= 0)[:, 0]
         body = labels[own]
         places, quats = (x.index_select(0, body) for x in self.poses(time))
-        arms = means[own] - self.rest.centers[body]
         quats = torch.nn.functional.normalize(quats, dim=1)
-        moved = rotate(quats, arms) + places - means[own]
+        arms = rotate(quats, means[own] - self.rest.centers[body])
+        moved = arms + places - means[own]
+        facing = torch.nn.functional.normalize(arms.detach(), dim=1)
+        lit = (light_harmonics(facing) @ self.parameters["light"]) * chosen(self.parameters["albedo"], rows)[own]
         turned = found.quats if found.quats is not None else means.new_zeros(len(means), 4)
         scales = found.log_scales
         return Offsets(
@@ -71,12 +80,12 @@ class BodyField(OuterField):
             turned.index_copy(0, own, quats - identity_quat(quats)),
             None if scales is None else scales.index_fill(0, own, 0.0),
             found.logit_opacities,
-            found.colors,
+            (means.new_zeros(len(means), 3) if found.colors is None else found.colors).index_add(0, own, lit),
         )
 
     def rest_outside_(self, window: tuple[float, float]) -> None:
         super().rest_outside_(window)
-        for points in self.parameters.leaves:
+        for points in (self.parameters["places"], self.parameters["quats"]):
             pieces = points.shape[1] - SPAN + 1
             first, last = math.ceil(window[0] * pieces) + 1, math.floor(window[1] * pieces) + 1  # by where they peak
             if points.grad is not None and window != (0.0, 1.0):
@@ -85,7 +94,7 @@ class BodyField(OuterField):
     def edited(self, edit: TopologyEdit) -> BodyField:
         field = super().edited(edit)
         field.rest = replace(self.rest, labels=self.rest.labels[edit.source])
-        return field
+        return field.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
 
     def state(self) -> State:
         rest = {name: StateTensor(x, Role.SHARED) for name, x in vars(self.rest).items()}
@@ -103,7 +112,7 @@ class BodyField(OuterField):
         if points < SPAN:
             raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
         like = {name: centers.new_zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
-        field = BodyField(others, BodyRest(centers, labels), like)
+        field = BodyField(others, BodyRest(centers, labels), like, centers.new_zeros(len(labels), 3))
         field.parameters = field.parameters.restored(learned)
         return field
 

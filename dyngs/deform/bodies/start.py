@@ -89,7 +89,9 @@ class Bodies:
         device = others.setup.center.device
         points = {name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()}
         rest = BodyRest(torch.from_numpy(centers).float().to(device), (labels - 1).to(device))
-        return BodyField(others, rest, points)
+        albedo = torch.cat([seeds.sh[:, 0] + 0.5 / SH_C0 for seeds in self.seeds]).to(device)
+        albedo = torch.cat([albedo.new_zeros(len(labels) - len(albedo), 3), albedo])
+        return BodyField(others, rest, points, albedo)
 
 
 def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:

@@ -17,6 +17,7 @@ from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import BodyTemplate
+from dyngs.ops.harmonics import light_harmonics
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_of, rotation_matrices
 from dyngs.state import fields_moved_to
@@ -35,15 +36,9 @@ class Light:
     def on(self, sh: Tensor, linear: Tensor) -> Tensor:
         """Return harmonics (N, K, 3) with their colours times the light, of Gaussians moved by (N, 3, 3)."""
         facing = torch.nn.functional.normalize((linear * self.normals[:, None]).sum(-1), dim=1)
-        factor = (1 + harmonics(facing) @ self.factors)[:, None]
+        factor = (1 + light_harmonics(facing) @ self.factors)[:, None]
         lit = sh * factor
         return torch.cat([lit[:, :1] + (factor - 1) * (0.5 / SH_C0), lit[:, 1:]], dim=1)
-
-
-def harmonics(directions: Tensor) -> Tensor:
-    """Return the harmonics (N, 8) of degree 1 and 2, not normalised, in unit directions (N, 3)."""
-    x, y, z = directions.unbind(1)
-    return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], dim=1)
 
 
 def rest_normals(gaussians: Gaussians) -> Tensor:

@@ -25,7 +25,6 @@ from dyngs.human.avatar.posing import (
     Skeleton,
     blended_rotations,
     difference_of_sides,
-    harmonics,
     pose_blend_shapes,
     pose_gaussians,
     rest_normals,
@@ -37,7 +36,7 @@ from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate, posed_vertices
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.harmonics import evaluate_harmonics, light_harmonics
 from dyngs.ops.quaternions import rotation_matrices
 from tests.bare_person import atlas, bare_scene
 
@@ -72,14 +71,14 @@ def test_colours_follow_where_the_surface_faces() -> None:
 def test_no_harmonic_brightens_a_person_as_a_whole() -> None:
     """Each is 0 in the mean over all directions, for which that over the six along axes stands."""
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
-    torch.testing.assert_close(harmonics(axes).mean(0), torch.zeros(8))
+    torch.testing.assert_close(light_harmonics(axes).mean(0), torch.zeros(8))
 
 
 def test_higher_harmonics_are_dimmed_with_the_colour() -> None:
     sh = torch.randn(5, 4, 3, generator=torch.Generator().manual_seed(0))
     light = Light(torch.tensor([[0.0, 1, 0]]).expand(5, 3), 0.3 * torch.ones(TERMS, 3))
     found = light.on(sh, torch.eye(3).expand(5, 3, 3))
-    factor = 1 + 0.3 * harmonics(torch.tensor([[0.0, 1, 0]])).sum()
+    factor = 1 + 0.3 * light_harmonics(torch.tensor([[0.0, 1, 0]])).sum()
     torch.testing.assert_close(found[:, 1:], factor * sh[:, 1:])
     torch.testing.assert_close(colours(found), factor * colours(sh))
 
