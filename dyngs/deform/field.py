@@ -102,6 +102,13 @@ class DeformationField:
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
 
+    def shaded(self, gaussians: Gaussians, rows: Tensor, which: Tensor | None, time: float) -> Gaussians:
+        """Return the Gaussians drawn at ``time`` in the light that what moves leaves to them.
+
+        Of those that move, ``which`` (None: all) are at ``rows``.
+        """
+        return gaussians
+
     def rest_outside_(self, window: tuple[float, float]) -> None:
         """Drop the gradients of what times in ``window`` hardly show: Adam would take them for as much as any."""
 
@@ -167,6 +174,9 @@ class OuterField(DeformationField):
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         self.others.extend(seen, soon)
+
+    def shaded(self, gaussians: Gaussians, rows: Tensor, which: Tensor | None, time: float) -> Gaussians:
+        return self.others.shaded(gaussians, rows, which, time)
 
     def rest_outside_(self, window: tuple[float, float]) -> None:
         self.others.rest_outside_(window)

@@ -73,7 +73,8 @@ class DynamicScene(GaussianScene):
         if self.field is None or self.is_static:
             return GaussianTimeStep(filtered(self.gaussians, self.filter_std), now)
         part = self._drawn_around(now)
-        return GaussianTimeStep(part.moved(self.field.offsets(part.moving_means, now, part.asked)), now)
+        offsets = self.field.offsets(part.moving_means, now, part.asked)
+        return GaussianTimeStep(part.moved(offsets, self.field, now), now)
 
     def in_training(self, time: float, *, detach: bool) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
         """Return the Gaussians drawn at ``time``, the offsets of those of them that move, and the field's penalties.
@@ -89,7 +90,7 @@ class DynamicScene(GaussianScene):
             offsets, penalties = self.field.in_training(part.moving_means, time)
         else:
             offsets, penalties = self.field.offsets(part.moving_means, time, part.asked), self.field.penalties(time)
-        return part.moved(offsets), offsets, penalties
+        return part.moved(offsets, self.field, time), offsets, penalties
 
     def edited(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
@@ -151,5 +152,7 @@ class _Part:
     asked: Tensor | None  # which of the M are drawn; None: all
     rows: Tensor | None  # their places among the A; None: all of them, in order
 
-    def moved(self, offsets: Offsets) -> Gaussians:
-        return filtered(deformed(self.gaussians, offsets, self.rows), self.filter_std)
+    def moved(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
+        now = filtered(deformed(self.gaussians, offsets, self.rows), self.filter_std)
+        rows = torch.arange(len(now), device=now.means.device) if self.rows is None else self.rows
+        return field.shaded(now, rows, self.asked, time)

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.deform.bodies.field import BodyField
-from dyngs.deform.field import DeformationField, OuterField
+from dyngs.deform.bodies.field import BodyField, bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.errors import DyngsError
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, splats_at
@@ -46,7 +45,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     """
     inputs_of(opened).require_output(path)
     scene = field_scene_of(opened.scene)
-    field = None if scene is None else _body_field(scene.field)
+    field = None if scene is None else bodies_of(scene.field)
     if scene is None or field is None:
         raise DyngsError("--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N")
     scene = replace(scene, masks=None)  # the rows of the labels
@@ -83,16 +82,8 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     with atomic_file(path) as temporary:
         document.write(temporary)
     notes = [f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}"]
-    if bool((field.rest.labels < 0).any()):
-        notes.append(f"what bends, comes or goes stands as at time {time:g}; a sequence or a page has its motion")
+    notes.append(f"all else and shadows stand as at time {time:g}; a sequence has their motion")
     return BodiesFile(path, splat, tuple(notes))
-
-
-def _body_field(field: DeformationField | None) -> BodyField | None:
-    """Return the field of bodies among ``field`` and those within it."""
-    while isinstance(field, OuterField) and not isinstance(field, BodyField):
-        field = field.others
-    return field if isinstance(field, BodyField) else None
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
     angles = torch.linspace(0, torch.pi / 2, 9)
     quats = torch.stack([angles.cos(), 0 * angles, angles.sin(), 0 * angles], dim=1)
     splines = {"places": torch.zeros(1, 9, 3), "quats": quats[None]}
-    body = BodyField(Sliding(speed=0.0), BodyRest(center, torch.zeros(2, dtype=torch.long)), splines, torch.ones(2, 3))
+    body = BodyField(Sliding(speed=0.0), BodyRest(center, torch.ones(1), torch.zeros(2, dtype=torch.long)), splines)
     scene = moving_scene(body)
     turns = [Rotation.from_quat(body.poses(t)[1][0].detach().numpy()[[1, 2, 3, 0]]) for t in TIMES]
     points = np.stack([turn.apply(row_of_balls().means[rows].numpy() + away) for turn in turns])

@@ -68,7 +68,9 @@ def test_nodes_around_bodies_are_cut_as_without_them(trainer: Trainer) -> None:
     assert scene.field is not None
     labels = torch.full((len(scene.moving),), -1)
     splines = {"places": torch.zeros(1, 5, 3), "quats": torch.ones(1, 5, 4)}
-    with_body = replace(scene, field=BodyField(scene.field, BodyRest(torch.zeros(1, 3), labels), splines))
+    with_body = replace(
+        scene, field=BodyField(scene.field, BodyRest(torch.zeros(1, 3), torch.ones(1), labels), splines)
+    )
     cut = with_field(with_body, FieldSize(2, 1))
     assert field_size(cut) == FieldSize(2, 1)
     assert torch.equal(cut.at(0.4).means, with_field(scene, FieldSize(2, 1)).at(0.4).means)

@@ -12,16 +12,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyngs.deform.bodies.shadows import START, light_left, shaded
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
-from dyngs.gaussians import TopologyEdit
+from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
 from dyngs.ops.harmonics import light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
-from dyngs.tensor_checks import require_indices, require_tensor
+from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
-RATES = {"places": 3e-4, "quats": 3e-3, "light": 1e-2, "albedo": 5e-3}
+RATES = {"places": 3e-4, "quats": 3e-3, "light": 1e-2, "albedo": 5e-3, "sun": 1e-2, "shade": 1e-2}
 """Learning rates; that of places times the scene extent."""
 LR_DECAY = 0.05
 
@@ -31,6 +32,7 @@ class BodyRest:
     """Where bodies lie when they are at rest, and which Gaussians are theirs."""
 
     centers: Tensor  # (B, 3)
+    radii: Tensor  # (B,)
     labels: Tensor  # (M,) body of each Gaussian, -1 for none
 
 
@@ -39,20 +41,24 @@ class BodyField(OuterField):
 
     A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of the place p and of
     the quaternion of R; the Gaussians turn with it, into the light and out of it: their colours change by their albedo
-    times the light on what faces the way that they lie from the centre (``light_harmonics``).
+    times the light on what faces the way that they lie from the centre (``light_harmonics``). All else is in their
+    shadow (``light_left``).
     """
 
-    def __init__(self, others: DeformationField, rest: BodyRest, splines: Mapping[str, Tensor], albedo: Tensor) -> None:
-        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of ``splines``, and (M, 3) ``albedo``.
+    def __init__(self, others: DeformationField, rest: BodyRest, learned: Mapping[str, Tensor]) -> None:
+        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies' splines, and others.
 
-        ``albedo``: in units of the harmonic of degree 0; of what is not a body's, anything.
+        These may be missing: ``albedo`` (M, 3), in units of the harmonic of degree 0; ``light`` (8, 3); ``sun`` (3,)
+        and ``shade`` (4,), see ``light_left``.
         """
         super().__init__(others)
         self.rest = rest
+        like = rest.centers
+        blank = {"albedo": like.new_zeros(len(rest.labels), 3), "light": like.new_zeros(8, 3)}
+        blank |= {"sun": like.new_tensor([0.0, 0.0, 1.0]), "shade": like.new_tensor(START)}
         rates = RATES | {"places": RATES["places"] * self.setup.extent}
-        learned = {**splines, "light": albedo.new_zeros(8, 3), "albedo": albedo}
-        roles = dict.fromkeys(learned, Role.SHARED) | {"albedo": Role.PER_MOVING}
-        self.parameters = Parameters(learned, rates, LR_DECAY, roles)
+        roles = dict.fromkeys(RATES, Role.SHARED) | {"albedo": Role.PER_MOVING}
+        self.parameters = Parameters(blank | dict(learned), rates, LR_DECAY, roles)
 
     @property
     def num_values(self) -> int:
@@ -83,6 +89,13 @@ class BodyField(OuterField):
             (means.new_zeros(len(means), 3) if found.colors is None else found.colors).index_add(0, own, lit),
         )
 
+    def shaded(self, gaussians: Gaussians, rows: Tensor, which: Tensor | None, time: float) -> Gaussians:
+        labels = torch.full((len(gaussians),), -1, device=rows.device)
+        labels = labels.index_copy(0, rows, chosen(self.rest.labels, which))
+        places, light = self.poses(time)[0].detach(), (self.parameters["sun"], self.parameters["shade"])
+        left = light_left(gaussians.means.detach(), labels, places, self.rest.radii, *light)
+        return shaded(super().shaded(gaussians, rows, which, time), left)
+
     def rest_outside_(self, window: tuple[float, float]) -> None:
         super().rest_outside_(window)
         for points in (self.parameters["places"], self.parameters["quats"]):
@@ -105,6 +118,7 @@ class BodyField(OuterField):
     def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
         """Return the field of a state within the restored ``others``; raises as ``restored``."""
         centers = require_tensor("centers", tensors["centers"], (None, 3))
+        radii = require_positive("radii", require_tensor("radii", tensors["radii"], (len(centers),)))
         labels = require_tensor("labels", tensors["labels"], (others.setup.num_moving,), torch.long)
         require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
         learned = part_of(tensors, "learned")
@@ -112,7 +126,7 @@ class BodyField(OuterField):
         if points < SPAN:
             raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
         like = {name: centers.new_zeros(len(centers), points, size) for name, size in (("places", 3), ("quats", 4))}
-        field = BodyField(others, BodyRest(centers, labels), like, centers.new_zeros(len(labels), 3))
+        field = BodyField(others, BodyRest(centers, radii, labels), like)
         field.parameters = field.parameters.restored(learned)
         return field
 
@@ -120,3 +134,10 @@ class BodyField(OuterField):
         field = super().to(device)
         field.rest = fields_moved_to(self.rest, device)
         return field
+
+
+def bodies_of(field: DeformationField | None) -> BodyField | None:
+    """Return the field of bodies among ``field`` and those within it; None where there is none."""
+    while isinstance(field, OuterField) and not isinstance(field, BodyField):
+        field = field.others
+    return field if isinstance(field, BodyField) else None

@@ -88,10 +88,12 @@ class Bodies:
         labels = torch.repeat_interleave(torch.tensor([others.setup.num_moving - sum(counts), *counts], device="cpu"))
         device = others.setup.center.device
         points = {name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()}
-        rest = BodyRest(torch.from_numpy(centers).float().to(device), (labels - 1).to(device))
+        radii = torch.tensor([body.path.radius for body in self.bodies], device=device)
+        rest = BodyRest(torch.from_numpy(centers).float().to(device), radii, (labels - 1).to(device))
         albedo = torch.cat([seeds.sh[:, 0] + 0.5 / SH_C0 for seeds in self.seeds]).to(device)
         albedo = torch.cat([albedo.new_zeros(len(labels) - len(albedo), 3), albedo])
-        return BodyField(others, rest, points, albedo)
+        up = torch.from_numpy(-self.shots.poses[:, 1, :3].mean(0)).float().to(device)  # of the cameras
+        return BodyField(others, rest, points | {"albedo": albedo, "sun": up})
 
 
 def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:

@@ -17,6 +17,8 @@ from dyngs.camera import Cameras
 from dyngs.camera_paths.aim import look_at_point
 from dyngs.conventions import RasterizeMode
 from dyngs.data.capture import Capture, View
+from dyngs.deform.bodies.field import bodies_of
+from dyngs.deform.scene import field_scene_of
 from dyngs.errors import counted
 from dyngs.export.chosen_path import front_of, orbit_around, view_to_show
 from dyngs.export.html.numbers import Lists, add_scene
@@ -77,6 +79,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     if curves.get("error"):
         fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {curves['error']:.2g}"
         notes.append(f"splines are fitted to the motion ({fit} world units)")
+    moved = field_scene_of(opened.scene)
+    if moved is not None and bodies_of(moved.field) is not None:
+        notes.append("shadows of bodies that turn are left out")
     return tuple(notes)
 
 

@@ -18,6 +18,7 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.state import tensors_of
 
 CENTERS = torch.tensor([[0.2, -0.1, 0.3], [-0.4, 0.0, 0.1]])
+RADII = torch.tensor([0.2, 0.3])
 LABELS = torch.tensor([-1, 0, 0, 1, -1, 1, 0, -1, 1])
 
 
@@ -25,8 +26,10 @@ def field_of(kind: str = "control_nodes", points: int = 7) -> BodyField:
     generator = torch.Generator().manual_seed(0)
     places = CENTERS[:, None] + 0.3 * torch.randn(2, points, 3, generator=generator)
     quats = torch.tensor([1.0, 0, 0, 0]) + 0.5 * torch.randn(2, points, 4, generator=generator)
-    rest = BodyRest(CENTERS, LABELS)
-    return BodyField(stirred_field(kind), rest, {"places": places, "quats": quats}, torch.ones(len(LABELS), 3))
+    rest = BodyRest(CENTERS, RADII, LABELS)
+    return BodyField(
+        stirred_field(kind), rest, {"places": places, "quats": quats, "albedo": torch.ones(len(LABELS), 3)}
+    )
 
 
 @pytest.mark.parametrize("kind", ["control_nodes", "hexplane"])
@@ -84,7 +87,10 @@ def test_gradients_reach_the_motion_and_the_gaussians() -> None:
     out = field.offsets(means, 0.37)
     assert out.quats is not None
     assert out.colors is not None
-    (out.means.square().sum() + out.quats.sum() + out.colors.sum() + sum(field.penalties(0.37).values())).backward()
+    lit = field.shaded(cloud(), torch.arange(len(LABELS)), None, 0.37).sh.sum()
+    (
+        lit + out.means.square().sum() + out.quats.sum() + out.colors.sum() + sum(field.penalties(0.37).values())
+    ).backward()
     assert all(x.grad is not None and bool(x.grad.any()) for x in field.parameters.leaves)
     assert means.grad is not None
     assert len(field.leaves) == len(field.parameters.leaves) + len(field.others.leaves)

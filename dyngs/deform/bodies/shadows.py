@@ -1,0 +1,47 @@
+"""Shadows that balls throw: seven numbers for all of them, learned as the images show them.
+
+Local letters: N Gaussians, B balls.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyngs.conventions import SH_C0
+from dyngs.gaussians import Gaussians
+
+START = 0.15, 0.1, 0.0, 0.0
+"""Parts of direct light and of that from all around that a ball takes; logarithms of the shadow's size and softness."""
+PENUMBRA, GRAZING = 0.2, 0.3  # Radii in which the edge of a shadow, and its beginning at the ball, fall by e
+
+
+def light_left(points: Tensor, labels: Tensor, places: Tensor, radii: Tensor, sun: Tensor, shade: Tensor) -> Tensor:
+    """Return the (N,) parts of the light that reach ``points`` (N, 3) around balls; differentiable in the last two.
+
+    A ball hides direct light from what lies behind it, near its axis, and of that from all around as much as it fills
+    of the view: the square of its radius over the distance.
+
+    Args:
+        labels: (N,) ball that each is a part of, which throws no shadow on it; -1 for none.
+        places: (B, 3) of the balls; ``radii``: (B,).
+        sun: (3,) where direct light comes from, of any length.
+        shade: (4,) as ``START``.
+    """
+    direct, around = shade[:2].clamp(0.0, 0.95)
+    size, softness = shade[2:].exp()
+    way, left = torch.nn.functional.normalize(sun, dim=0), points.new_ones(len(points))
+    for ball in range(len(places)):
+        to = (places[ball] - points) / radii[ball]
+        along = to @ way
+        away = (to - along[:, None] * way).norm(dim=1)
+        hidden = torch.sigmoid((size - away) / (PENUMBRA * softness)) * torch.sigmoid(along / GRAZING)
+        view = to.square().sum(1).clamp_min(1.0).reciprocal()
+        left = left * torch.where(labels == ball, 1.0, (1 - direct * hidden) * (1 - around * view))
+    return left
+
+
+def shaded(gaussians: Gaussians, left: Tensor) -> Gaussians:
+    """Return N Gaussians whose colours are the parts ``left`` (N,) of what they were."""
+    sh, factor = gaussians.sh * left[:, None, None], left[:, None, None]
+    return gaussians.replace(sh=torch.cat([sh[:, :1] + (factor - 1) * (0.5 / SH_C0), sh[:, 1:]], dim=1))
