@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from dyngs.conventions import SH_C0
 from dyngs.ops.native import num_threads
 from dyngs.ops.registration import Gradient, empty_like, launch, register
 
@@ -53,6 +55,34 @@ def evaluate_harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor
     ``sh``.
     """
     return harmonics_op(means, centers, sh, radii, degree)
+
+
+class _Dimmed(torch.autograd.Function):
+    """See ``dimmed``."""
+
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
+        ctx.save_for_backward(sh, left)
+        ctx.every = every
+        found = sh * left[:, None, None]
+        found[:, 0] += (left - 1)[:, None] * (0.5 / SH_C0)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        sh, left = ctx.saved_tensors
+        part = grad[:: ctx.every]
+        by_few = (part * sh[:: ctx.every]).sum((1, 2)) + part[:, 0].sum(1) * (0.5 / SH_C0)
+        return grad * left[:, None, None], None, by_few, None
+
+
+def dimmed(sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
+    """Return harmonics (N, K, 3) whose colours are the parts ``left`` (N,) of those of ``sh``.
+
+    Differentiable once, in ``sh`` and in ``few``, which is every so many-th of ``left``: enough to learn few numbers.
+    """
+    return cast(Any, _Dimmed).apply(sh, left, few, every)
 
 
 def light_harmonics(directions: Tensor) -> Tensor:

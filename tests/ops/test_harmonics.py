@@ -10,7 +10,8 @@ import torch
 from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
-from dyngs.ops.harmonics import evaluate_harmonics, harmonics_backward_op, harmonics_op
+from dyngs.conventions import SH_C0
+from dyngs.ops.harmonics import dimmed, evaluate_harmonics, harmonics_backward_op, harmonics_op
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -127,3 +128,28 @@ def test_opcheck_backward(scene: Scene) -> None:
     colors = colours(scene, 1)
     args = ([scene.means, scene.cameras.centers, scene.sh, all_visible(scene)], colors, weights(colors), 1, True)
     torch.library.opcheck(harmonics_backward_op, args)
+
+
+def test_dimmed_colours_are_that_part_of_what_they_were_and_a_few_teach() -> None:
+    generator = torch.Generator().manual_seed(0)
+    sh = torch.randn(5, 4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    left = torch.tensor([1.0, 0.5, 0.25, 0.0, 0.75], dtype=torch.float64)
+    found = dimmed(sh, left, left[::2], 2)
+    torch.testing.assert_close(found[:, 0] * SH_C0 + 0.5, (sh[:, 0] * SH_C0 + 0.5) * left[:, None])
+    torch.testing.assert_close(found[:, 1:], sh[:, 1:] * left[:, None, None])
+
+    def all_teach(sh: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+        return dimmed(sh, left.detach(), left, 1)
+
+    def directly(sh: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+        shift = (left - 1)[:, None] * (0.5 / SH_C0)
+        return torch.cat([(sh * left[:, None, None])[:, :1] + shift[:, None], sh[:, 1:] * left[:, None, None]], dim=1)
+
+    weights = torch.randn(5, 4, 3, generator=generator, dtype=torch.float64)
+    leaf = left.requires_grad_()
+    ours, theirs = (torch.autograd.grad((f(sh, leaf) * weights).sum(), (sh, leaf)) for f in (all_teach, directly))
+    for x, y in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(x, y)
+    few = left.detach()[::2].clone().requires_grad_()
+    (by_few,) = torch.autograd.grad((dimmed(sh, left.detach(), few, 2) * weights).sum(), few)
+    torch.testing.assert_close(by_few, ours[1][::2])

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.deform.bodies.shadows import START, light_left, shaded
+from dyngs.deform.bodies.shadows import START, light_left
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.parameters import Parameters
-from dyngs.ops.harmonics import light_harmonics
+from dyngs.ops.harmonics import dimmed, light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 from dyngs.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
@@ -25,6 +25,7 @@ from dyngs.tensor_checks import require_indices, require_positive, require_tenso
 RATES = {"places": 3e-4, "quats": 3e-3, "light": 1e-2, "albedo": 5e-3, "sun": 1e-2, "shade": 1e-2}
 """Learning rates; that of places times the scene extent."""
 LR_DECAY = 0.05
+TEACHES = 8  # Every so many-th Gaussian says what the few numbers of shadows should be
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,12 @@ class BodyField(OuterField):
     def shaded(self, gaussians: Gaussians, rows: Tensor, which: Tensor | None, time: float) -> Gaussians:
         labels = torch.full((len(gaussians),), -1, device=rows.device)
         labels = labels.index_copy(0, rows, chosen(self.rest.labels, which))
-        places, light = self.poses(time)[0].detach(), (self.parameters["sun"], self.parameters["shade"])
-        left = light_left(gaussians.means.detach(), labels, places, self.rest.radii, *light)
-        return shaded(super().shaded(gaussians, rows, which, time), left)
+        means, places = gaussians.means.detach(), self.poses(time)[0].detach()
+        balls = places, self.rest.radii, self.parameters["sun"], self.parameters["shade"]
+        with torch.no_grad():
+            left = light_left(means, labels, *balls)
+        few = light_left(means[::TEACHES], labels[::TEACHES], *balls)
+        return super().shaded(gaussians.replace(sh=dimmed(gaussians.sh, left, few, TEACHES)), rows, which, time)
 
     def rest_outside_(self, window: tuple[float, float]) -> None:
         super().rest_outside_(window)

@@ -8,9 +8,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyngs.conventions import SH_C0
-from dyngs.gaussians import Gaussians
-
 START = 0.15, 0.1, 0.0, 0.0
 """Parts of direct light and of that from all around that a ball takes; logarithms of the shadow's size and softness."""
 PENUMBRA, GRAZING = 0.2, 0.3  # Radii in which the edge of a shadow, and its beginning at the ball, fall by e
@@ -39,9 +36,3 @@ def light_left(points: Tensor, labels: Tensor, places: Tensor, radii: Tensor, su
         view = to.square().sum(1).clamp_min(1.0).reciprocal()
         left = left * torch.where(labels == ball, 1.0, (1 - direct * hidden) * (1 - around * view))
     return left
-
-
-def shaded(gaussians: Gaussians, left: Tensor) -> Gaussians:
-    """Return N Gaussians whose colours are the parts ``left`` (N,) of what they were."""
-    sh, factor = gaussians.sh * left[:, None, None], left[:, None, None]
-    return gaussians.replace(sh=torch.cat([sh[:, :1] + (factor - 1) * (0.5 / SH_C0), sh[:, 1:]], dim=1))

@@ -7,9 +7,7 @@ import math
 import pytest
 import torch
 
-from dyngs.conventions import SH_C0
-from dyngs.deform.bodies.shadows import light_left, shaded
-from dyngs.gaussians import Gaussians
+from dyngs.deform.bodies.shadows import light_left
 
 SUN = torch.tensor([0.0, 0.0, 2.0])
 BALL, RADIUS = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([0.5])
@@ -56,14 +54,3 @@ def test_the_direction_of_the_light_is_learned_from_a_shadow() -> None:
     found = torch.nn.functional.normalize(sun.detach(), dim=0)
     assert float(found @ torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 1.0]), dim=0)) > 0.99
     torch.testing.assert_close(shade.detach()[0], true[0], atol=0.1, rtol=0)
-
-
-def test_colours_are_that_part_of_what_they_were() -> None:
-    generator = torch.Generator().manual_seed(0)
-    sh = torch.randn(4, 4, 3, generator=generator)
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1)
-    gaussians = Gaussians(torch.zeros(4, 3), quats, torch.zeros(4, 3), torch.zeros(4), sh)
-    left = torch.tensor([1.0, 0.5, 0.25, 0.0])
-    found = shaded(gaussians, left)
-    torch.testing.assert_close(found.sh[:, 0] * SH_C0 + 0.5, (sh[:, 0] * SH_C0 + 0.5) * left[:, None])
-    torch.testing.assert_close(found.sh[:, 1:], sh[:, 1:] * left[:, None, None])
