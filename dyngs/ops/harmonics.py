@@ -69,9 +69,9 @@ class _Dimmed(torch.autograd.Function):
         return found
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        sh, left = ctx.saved_tensors
+    @once_differentiable  # whose type hides the name of ctx
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (sh, left), (grad,) = ctx.saved_tensors, grads
         part = grad[:: ctx.every]
         by_few = (part * sh[:: ctx.every]).sum((1, 2)) + part[:, 0].sum(1) * (0.5 / SH_C0)
         return grad * left[:, None, None], None, by_few, None
