@@ -106,10 +106,10 @@ def run(arguments: argparse.Namespace) -> int:
     kind = _kind(arguments)
     _require_fitting(arguments, kind)
     writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
-    if kind == "mesh" or arguments.joints:
-        return _export_rigged(arguments, kind)
     if arguments.bodies:
         return _export_bodies(arguments)
+    if kind == "mesh" or arguments.joints:
+        return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
     if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
@@ -326,6 +326,8 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
     from dyngs.runs.opened import open_scene
     from dyngs.splats.formats import format_named, read_splats
 
+    if arguments.format not in (None, "glb"):
+        raise DyngsError(f"--bodies goes with --format glb, not with {arguments.format}")
     out: Path = arguments.out or arguments.run_dir / f"bodies{SUFFIX}"
     if out.is_dir() or out.suffix.lower() != SUFFIX:
         name = out / f"bodies{SUFFIX}" if out.is_dir() else f"{out.stem}{SUFFIX}"

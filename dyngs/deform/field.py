@@ -102,10 +102,10 @@ class DeformationField:
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         """Continue what was learned for the times in ``seen`` to those in ``soon``, which are trained on next."""
 
-    def shaded(self, gaussians: Gaussians, rows: Tensor, which: Tensor | None, time: float) -> Gaussians:
+    def shaded(self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float) -> Gaussians:
         """Return the Gaussians drawn at ``time`` in the light that what moves leaves to them.
 
-        Of those that move, ``which`` (None: all) are at ``rows``.
+        Of those that move, ``which`` (None: all) are drawn, at ``rows`` (None: in order, and nothing else is).
         """
         return gaussians
 
@@ -175,7 +175,7 @@ class OuterField(DeformationField):
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
         self.others.extend(seen, soon)
 
-    def shaded(self, gaussians: Gaussians, rows: Tensor, which: Tensor | None, time: float) -> Gaussians:
+    def shaded(self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float) -> Gaussians:
         return self.others.shaded(gaussians, rows, which, time)
 
     def rest_outside_(self, window: tuple[float, float]) -> None:

@@ -154,5 +154,4 @@ class _Part:
 
     def moved(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
         now = filtered(deformed(self.gaussians, offsets, self.rows), self.filter_std)
-        rows = torch.arange(len(now), device=now.means.device) if self.rows is None else self.rows
-        return field.shaded(now, rows, self.asked, time)
+        return field.shaded(now, self.rows, self.asked, time)

@@ -19,6 +19,7 @@ from dyngs.data.times import SAME_TIME
 from dyngs.data.tracks import TRACKS_FILE, TrueTracks
 from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.ops.quaternions import unit_quats
 
 CARRIERS = 4  # K, nearest Gaussians that carry a point, weighted by opacity
 MIN_OPACITY = 0.3  # fainter Gaussians carry nothing
@@ -98,7 +99,7 @@ class _Poses:
     """Where Gaussians are, and how they are turned."""
 
     means: np.ndarray  # (..., 3)
-    quats: np.ndarray  # (..., 4) wxyz, of any length
+    quats: np.ndarray  # (..., 4) unit, wxyz
 
     def of(self, rows: np.ndarray) -> _Poses:
         return _Poses(self.means[rows], self.quats[rows])
@@ -106,7 +107,7 @@ class _Poses:
 
 def _poses(scene: GaussianScene, time: float) -> _Poses:
     gaussians = scene.at(time)
-    return _Poses(*(x.detach().cpu().double().numpy() for x in (gaussians.means, gaussians.quats)))
+    return _Poses(*(x.detach().cpu().double().numpy() for x in (gaussians.means, unit_quats(gaussians.quats))))
 
 
 def _carried(points: np.ndarray, before: _Poses, after: _Poses, weights: np.ndarray) -> np.ndarray:

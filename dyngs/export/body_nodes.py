@@ -16,7 +16,7 @@ from dyngs.errors import DyngsError
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, splats_at
 from dyngs.files.gltf import GlbDocument
 from dyngs.files.write import atomic_file
-from dyngs.ops.quaternions import shorter_ways
+from dyngs.ops.quaternions import shorter_ways, unit_quats
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.gltf import EXTENSION, add_gaussians
@@ -101,6 +101,6 @@ def _poses(field: BodyField, times: Sequence[float] | np.ndarray, how: Writing) 
     axes = Rotation.from_quat(np.asarray(how.turn)[[1, 2, 3, 0]])
     found = [field.poses(float(time)) for time in times]
     places = torch.stack([place for place, _ in found]).double().numpy()
-    quats = torch.stack([quat for _, quat in found]).double().numpy()[..., [1, 2, 3, 0]]
+    quats = unit_quats(torch.stack([quat for _, quat in found])).double().numpy()[..., [1, 2, 3, 0]]
     turned = (axes * Rotation.from_quat(quats.reshape(-1, 4))).as_quat()
     return _Poses(axes.apply(places.reshape(-1, 3)).reshape(places.shape), turned.reshape(quats.shape))

@@ -12,7 +12,7 @@ from moving_scene import MOVING_ROWS, sliding_nodes, write_moving_run
 from scipy.spatial.transform import Rotation, Slerp
 
 from dyngs.cli import main
-from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.bodies.field import BodyField, BodyRest, bodies_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.windows import WindowedField
 from dyngs.errors import DyngsError
@@ -77,11 +77,21 @@ def test_without_the_animation_it_is_the_scene_at_that_time(tmp_path: Path, roll
     assert any("bodies: 1" in note for note in written.notes)
 
 
+def test_a_body_without_a_rotation_stands(tmp_path: Path, rolling: Opened) -> None:
+    """Splines of zeros, from a damaged or forged run."""
+    assert isinstance(rolling.scene, DynamicScene)
+    body = bodies_of(rolling.scene.field)
+    assert body is not None
+    blank = {name: torch.zeros_like(body.parameters[name].detach()) for name in ("places", "quats")}
+    damaged = rolling.showing(replace(rolling.scene, field=BodyField(body.others, body.rest, blank)))
+    assert len(read_splats(write_bodies(damaged, tmp_path / "a.glb", 0.0).path).gaussians) == 5
+
+
 def test_a_run_without_bodies_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_moving_run(tmp_path)
     with pytest.raises(DyngsError, match="no body that turns"):
         write_bodies(open_run(run), tmp_path / "a.glb", 0.0)
-    for wrong in (["--out", "a.ply"], ["--times", "0:1:3"], ["--static"], ["--sh-degree", "1"]):
+    for wrong in (["--out", "a.ply"], ["--times", "0:1:3"], ["--static"], ["--sh-degree", "1"], ["--format", "ply"]):
         assert main(["export", str(run), "--bodies", *wrong]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert not list(tmp_path.glob("**/*.glb"))

@@ -90,9 +90,10 @@ class BodyField(OuterField):
             (means.new_zeros(len(means), 3) if found.colors is None else found.colors).index_add(0, own, lit),
         )
 
-    def shaded(self, gaussians: Gaussians, rows: Tensor, which: Tensor | None, time: float) -> Gaussians:
-        labels = torch.full((len(gaussians),), -1, device=rows.device)
-        labels = labels.index_copy(0, rows, chosen(self.rest.labels, which))
+    def shaded(self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float) -> Gaussians:
+        labels = chosen(self.rest.labels, which)
+        if rows is not None:
+            labels = labels.new_full((len(gaussians),), -1).index_copy(0, rows, labels)
         means, places = gaussians.means.detach(), self.poses(time)[0].detach()
         balls = places, self.rest.radii, self.parameters["sun"], self.parameters["shade"]
         with torch.no_grad():

@@ -15,9 +15,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from dyngs.deform.bodies.paths import Path
 from dyngs.deform.bodies.shots import Shots
+from dyngs.ops.harmonics import light_harmonics
 
 COARSE, FINE = 6, 8  # Cells along an edge of the cube that the sphere is divided by
 MOST_PIXELS, FEWER_PIXELS = 250, 80  # Of a body in an image that are looked at, and that the first search looks at
@@ -306,7 +308,6 @@ def _ball_of(reach: float, step: float) -> np.ndarray:
     return grid[np.linalg.norm(grid, axis=1) <= reach + 1e-6]
 
 
-def _harmonics(n: np.ndarray) -> np.ndarray:
+def _harmonics(normals: np.ndarray) -> np.ndarray:
     """Return (n, 9) polynomials of unit vectors that span the harmonics up to order 2."""
-    x, y, z = n.T
-    return np.stack([np.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1], axis=1)
+    return torch.nn.functional.pad(light_harmonics(torch.from_numpy(normals)), (1, 0), value=1.0).numpy()
