@@ -144,7 +144,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
     if config.model.begins_with_points:
         init = config.init
         if isinstance(init, PointsInit):
-            capture, lines = with_first_points(capture, config.data, init.triangulate, init.half_extent)
+            capture, lines = with_first_points(capture, config.data, init)
         else:
             why = outside_of_cube(capture.splits["train"], init.half_extent)
             lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]

@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from dyngs.capture.looks import colours_at, small_image
 from dyngs.capture.sfm_work import ColmapError, feature_options, match_listed, matching_options, quiet_colmap
-from dyngs.config import DataConfig
+from dyngs.capture.silhouettes import points_in_silhouettes
+from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import camera_center, projected, times_seen
 from dyngs.data.loader import Image, ImageLoader
@@ -188,18 +190,13 @@ def checked_points(capture: Capture, options: DataConfig) -> tuple[Capture, str 
     return capture.replace(points=None, points_file=None), f"{what}, not used: {fault}"
 
 
-def with_first_points(
-    capture: Capture, options: DataConfig, triangulate: int, half_extent: float
-) -> tuple[Capture, list[str]]:
+def with_first_points(capture: Capture, options: DataConfig, init: PointsInit) -> tuple[Capture, list[str]]:
     """Return the capture with the points that a scene begins with, None for random ones, and lines on the choice.
 
     Points are triangulated where there are none: from the images of a time step that several cameras show, else from
     those of a moving camera over the full clip. Not where it is published custom to begin with random points: in the
     cube around the origin of Blender scenes that are still or show each time step from one side, if they lie there.
-
-    Args:
-        triangulate: images of one time step at most; 0: nothing is triangulated.
-        half_extent: half the side of the cube.
+    Those of still ones are drawn in the silhouettes, if there are any.
     """
     capture, line = checked_points(capture, options)
     lines = [] if line is None else [line]
@@ -207,13 +204,18 @@ def with_first_points(
         return capture, lines
     views = capture.splits["train"]
     is_by_custom = capture.format in AROUND_ORIGIN
-    why = outside_of_cube(views, half_extent) if is_by_custom else None
+    why = outside_of_cube(views, init.half_extent) if is_by_custom else None
     is_in_cube = is_by_custom and why is None
     if why is not None:
         lines.append(f"the scene does not lie around the origin, where Blender scenes do by custom: {why}")
-    if triangulate == 0 or (is_in_cube and views[0].time is None):
+    if is_in_cube and views[0].time is None:
+        points = points_in_silhouettes(views, options, init)
+        if points is not None:
+            lines.append(f"{len(points.xyz):,} first points were drawn at random in the silhouettes of the images")
+        return capture.replace(points=points), lines
+    if init.triangulate == 0:
         return capture, lines
-    moment = views_of_a_time_step(views, triangulate)
+    moment = views_of_a_time_step(views, init.triangulate)
     points: PointCloud | None = None
     if views[0].time is None or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES:
         points = triangulated_points(moment, options)
@@ -225,8 +227,6 @@ def with_first_points(
 
 
 SAMPLE = 2000  # points that are looked at
-LOOK_SIDE = 240
-"""Of the images that they are looked at in, px."""
 GROUPS, GROUP = 3, 5  # groups of images from about the same time step, and images of each
 MIN_SEEN = 0.1  # points of which a smaller fraction lies in any image do not belong to the cameras
 COLOURS_FIT, PLACES_FIT = 0.85, 0.9  # points fit if their error is smaller than that of chance by this factor
@@ -252,12 +252,12 @@ def points_fault(points: PointCloud, views: Sequence[View], options: DataConfig)
     if seen.mean() < MIN_SEEN:
         return f"{seen.mean():.0%} of them are in any camera's view"
     groups = [[views[i] for i in group] for group in groups_of(views)]
-    shown = [(view, _image(view, options)) for group in groups for view in group]
-    colours = _colours_at(xyz, shown)
+    shown = [(view, small_image(view, options)) for group in groups for view in group]
+    colours = colours_at(xyz, shown)
     if _colour_ratio(colours[..., :3], rgb, rng) < COLOURS_FIT:
         return None
     low, high = np.percentile(xyz, _INNER, axis=0)
-    at_random = _colours_at(low + (high - low) * rng.random(xyz.shape), shown)
+    at_random = colours_at(low + (high - low) * rng.random(xyz.shape), shown)
     for sizes in ([len(group) for group in groups], [len(shown)]):
         if _place_ratio(colours, sizes, rng) < PLACES_FIT * _place_ratio(at_random, sizes, rng):
             return None
@@ -278,26 +278,6 @@ def groups_of(views: Sequence[View]) -> list[list[int]]:
     count = min(GROUPS, len(order) // size)
     starts = [(len(order) - size) * k // max(count - 1, 1) for k in range(count)]
     return [order[start : start + size] for start in starts]
-
-
-def _image(view: View, options: DataConfig) -> np.ndarray:
-    """Return the small image of a view, (H, W, 4): colours on white, and alpha."""
-    small = options.model_copy(update={"downscale": 1.0, "longest_side": LOOK_SIDE, "cache_mb": 0.0})
-    image = ImageLoader([view], small)[0]
-    rgb = image.composite(image.rgb_premultiplied.new_ones(3)).numpy()
-    alpha = np.ones(rgb.shape[:2], rgb.dtype) if image.alpha is None else image.alpha.numpy()
-    return np.concatenate([rgb, alpha[..., None]], axis=2)
-
-
-def _colours_at(xyz: np.ndarray, shown: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
-    """Return (V, P, 4) colours and alpha of the images at the points, NaN where they lie outside."""
-    found = np.full((len(shown), len(xyz), 4), np.nan)
-    for i, (view, image) in enumerate(shown):
-        positions, inside = projected(xyz, view)
-        size = np.array(image.shape[1::-1])
-        column, row = np.minimum((positions[inside] * size).astype(int), size - 1).T
-        found[i, inside] = image[row, column]
-    return found
 
 
 def _colour_ratio(colours: np.ndarray, rgb: np.ndarray, rng: np.random.Generator) -> float:

@@ -1,28 +1,73 @@
-"""Training of a static scene: on every image, with its 3D filter kept up to date."""
+"""Training of a static scene: on every image, with its 3D filter kept up to date, and rid of what no image shows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
-from dyngs.config import StaticModel
-from dyngs.gaussians import Gaussians
+from dyngs.camera import Cameras
+from dyngs.config import DefaultStrategy, StaticModel
+from dyngs.data.times import evenly_spaced
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.model import GaussianModel, SceneTraining
+from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
+from dyngs.models.schedule import scaled
+from dyngs.models.views import training_cameras
 from dyngs.static.scene import StaticScene
+
+SURVEYED = 200  # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
+
+
+@dataclass(frozen=True)
+class SmallRemoval:
+    """Removal, once, of Gaussians that amount to less than ``pixels`` in every one of some views.
+
+    What a Gaussian amounts to is its blending weight, summed over an image: 1 for a pixel that shows nothing else.
+    """
+
+    step: int = 0  # after which that happens; 0: it does not
+    pixels: float = 0.0
+    cameras: Sequence[Cameras] = ()
+
+    def edit(self, scene: StaticScene) -> EditResult | None:
+        """Return the removal; None where all Gaussians, or none, amount to that much."""
+        drawn, most = scene.time_step(None).gaussians, torch.zeros(len(scene), device=scene.device)
+        for cameras in self.cameras:
+            found = contributions(drawn, cameras.to(device=scene.device), scene.options)
+            most = torch.maximum(most, found.amax(0))
+        kept = most >= self.pixels
+        if bool(kept.all()) or not bool(kept.any()):
+            return None
+        text = (
+            f"{len(scene) - int(kept.sum()):,} of {len(scene):,} Gaussians are removed: each makes up less than "
+            f"{self.pixels:g} px of every training view (strategy.prune_pixels)"
+        )
+        return EditResult(TopologyEdit.select(kept), finding=text)
+
+
+def small_removal(run: RunStart) -> SmallRemoval:
+    """Return when and by which views Gaussians of a run are removed: when no more are added."""
+    config, strategy = run.config, run.config.strategy
+    if not (isinstance(strategy, DefaultStrategy) and strategy.prune_pixels > 0):
+        return SmallRemoval()
+    views = run.capture.splits["train"]
+    cameras = training_cameras([views[i] for i in evenly_spaced(len(views), SURVEYED)], config.data)
+    return SmallRemoval(scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras)
 
 
 class StaticTraining(SceneTraining[StaticScene]):
     """See ``SceneTraining``; nothing is learned next to the Gaussians and their colours."""
 
-    def __init__(self, update: FilterUpdate) -> None:
-        self._update = update
+    def __init__(self, update: FilterUpdate, removal: SmallRemoval = SmallRemoval()) -> None:
+        self._update, self._removal = update, removal
 
     def first_scene(self, gaussians: Gaussians) -> StaticScene:
         return StaticScene(gaussians=gaussians, filter_std=self._update.of(gaussians))
@@ -32,6 +77,12 @@ class StaticTraining(SceneTraining[StaticScene]):
             return replace(scene, filter_std=self._update.of(scene.gaussians))
         return scene
 
+    def revised(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
+        result = self._removal.edit(scene) if step == self._removal.step else None
+        if result is None or result.edit is None:
+            return None
+        return scene.edited(result.edit), result
+
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
         return StaticScene.restored(gaussians, tensors)
 
@@ -39,7 +90,8 @@ class StaticTraining(SceneTraining[StaticScene]):
 def start(run: RunStart) -> GaussianModel:
     """Return the model of a static scene before its first step."""
     gaussians = first_gaussians(run)
-    colours, training = colours_of(run, gaussians, sees_time=False), StaticTraining(filter_update(run))
+    colours = colours_of(run, gaussians, sees_time=False)
+    training = StaticTraining(filter_update(run), small_removal(run))
     return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
 
 

@@ -23,7 +23,7 @@ from dyngs.capture.first_points import (
     with_first_points,
 )
 from dyngs.capture.inspection.report import report_on
-from dyngs.config import DataConfig
+from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import projected
 from dyngs.data.loader import ImageLoader
@@ -41,7 +41,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def begin(capture: Capture, triangulate: int = 24) -> tuple[Capture, list[str]]:
-    return with_first_points(capture, DataConfig(root=capture.root), triangulate, 1.3)
+    return with_first_points(capture, DataConfig(root=capture.root), PointsInit(triangulate=triangulate))
 
 
 def shifted(root: Path, out: Path) -> Path:
@@ -83,7 +83,7 @@ def test_noise_is_not_used_and_the_scene_is_elsewhere(root: Path, tmp_path: Path
     options = DataConfig(root=elsewhere, follow_links=True)
     capture = read_capture(options)
     assert capture.warnings == ("times run from 0 to 0.055 and were scaled to [0, 1]",)
-    begun, lines = with_first_points(capture, options, 0, 1.3)
+    begun, lines = with_first_points(capture, options, PointsInit(triangulate=0))
     assert (begun.points, begun.points_file) == (None, None)
     assert lines[0].startswith("points3d.ply: 500 points, not used: ")
     assert lines[1:] == [

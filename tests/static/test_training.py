@@ -1,6 +1,8 @@
-"""How a static scene is trained: on every image, and its 3D filter is kept until it is due."""
+"""How a static scene is trained: on every image, with its 3D filter kept until it is due, and rid of what is small."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 
@@ -10,7 +12,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
 from dyngs.state import part_of, tensors_of
 from dyngs.static.scene import StaticScene
-from dyngs.static.training import StaticTraining
+from dyngs.static.training import SmallRemoval, StaticTraining
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
 
@@ -55,6 +57,33 @@ def test_nothing_depends_on_time() -> None:
 def test_the_set_is_left_to_the_strategy() -> None:
     training = StaticTraining(FilterUpdate())
     assert all(training.revised(training.first_scene(_gaussians(2.0)), step) is None for step in (1, 2, 100))
+
+
+def _sized(pixels: list[float]) -> Gaussians:
+    """Faint Gaussians side by side at depth 2 that make up so many pixels, 2 pi o s^2 (50 px are a unit there)."""
+    n, std = len(pixels), 3.0
+    means = torch.stack([torch.linspace(-0.6, 0.6, n), torch.zeros(n), torch.full((n,), 2.0)], 1)
+    opacities = torch.tensor(pixels) / (2 * torch.pi * std**2)
+    scales = torch.full((n, 3), ((std**2 - 0.3) ** 0.5 / 50))
+    return Gaussians(means, torch.ones(n, 4), scales.log(), torch.logit(opacities), torch.zeros(n, 1, 3))
+
+
+def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
+    elsewhere = replace(_camera(), cam_from_world=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None])
+    training = StaticTraining(FilterUpdate(), SmallRemoval(7, 2.0, [elsewhere, _camera()]))
+    scene = training.first_scene(_sized([1.5, 4.0, 1.0, 3.0]))
+    assert training.revised(scene, 6) is None
+    assert training.revised(scene, 8) is None
+    found = training.revised(scene, 7)
+    assert found is not None
+    edited, result = found
+    assert torch.equal(edited.gaussians.means, scene.gaussians.means[[1, 3]])
+    assert result.edit is not None
+    assert torch.equal(result.edit.apply(scene.gaussians.means), edited.gaussians.means)
+    assert result.finding is not None
+    assert result.finding.startswith("2 of 4 Gaussians are removed: each makes up less than 2 px of every")
+    assert training.revised(edited, 7) is None, "all that is left is large enough"
+    assert training.revised(training.first_scene(_sized([1.0, 1.5])), 7) is None, "something is left of every scene"
 
 
 def test_the_filter_is_kept_until_it_is_due() -> None:

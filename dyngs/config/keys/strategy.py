@@ -36,6 +36,12 @@ class DefaultStrategy(Section):
         description=f"steps, {_OF_30000}, between resets of opacity to 0.01, 400 steps of this run at least; "
         "null: never",
     )
+    prune_pixels: float = Field(
+        default=0.0,
+        ge=0,
+        description="when no more Gaussians are added, those are removed that make up less than so many pixels of "
+        "every training view; static scenes only; 0: none",
+    )
     grow: bool = Field(default=True, description="clone and split Gaussians; false: they are only removed")
     max_gaussians: int = Field(default=3_000_000, ge=1, description="no Gaussians are added beyond so many")
 
