@@ -205,7 +205,7 @@ def test_motion_is_looked_for_in_images_from_all_over_the_clip(capture: Path, tm
 
 
 def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: Path) -> None:
-    """As many Gaussians as points, of the room and not of a cube; a still Blender scene begins with random ones."""
+    """As many Gaussians as points, of the room and not of a cube; without, random ones."""
     options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_val=0, num_test=0, samples=1)
     root = write_dynamic_capture("room", tmp_path / "room", options)
     config = _dynamic(root, init=PointsInit(num_random=7))
@@ -248,9 +248,13 @@ def test_what_spoils_a_training_is_said_before_it(
     assert capsys.readouterr().err == ""
 
 
-def test_a_still_blender_scene_begins_with_random_points(capture: Path) -> None:
+def test_a_still_blender_scene_begins_in_its_silhouettes_or_anywhere(capture: Path) -> None:
     config = Config(data=DataConfig(root=capture), init=PointsInit(num_random=7))
-    assert with_points(read_capture(config.data), config).points is None
+    found = with_points(read_capture(config.data), config).points
+    assert found is not None
+    assert len(found.xyz) == 7
+    anywhere = config.model_copy(update={"init": RandomInit(num_random=7)})
+    assert with_points(read_capture(config.data), anywhere).points is None
 
 
 def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> None:

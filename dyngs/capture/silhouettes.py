@@ -24,7 +24,7 @@ MOST = 0.5  # fraction of the points inside above which the silhouettes say noth
 def points_in_silhouettes(views: Sequence[View], options: DataConfig, init: PointsInit) -> PointCloud | None:
     """Return random points of the cube around the origin that lie in the silhouettes, in the images' median colours.
 
-    ``init.num_random`` are drawn, and more where few of them lie inside. None where images have no silhouettes, where
+    ``init.num_random`` are drawn, and as many again where few of them lie inside. None where images have no silhouettes, where
     those hold no points, or most.
     """
     shown = [(views[i], small_image(views[i], options)) for i in evenly_spaced(len(views), SILHOUETTES)]
@@ -42,4 +42,4 @@ def points_in_silhouettes(views: Sequence[View], options: DataConfig, init: Poin
         xyz, rgb = np.concatenate([xyz, points[inside]]), np.concatenate([rgb, np.rint(255 * median).astype(np.uint8)])
         if len(xyz) >= min(ENOUGH, init.num_random) or (drawn == 1 and not len(xyz)):
             break
-    return PointCloud(xyz, rgb) if len(xyz) else None
+    return PointCloud(xyz[: init.num_random], rgb[: init.num_random]) if len(xyz) else None
