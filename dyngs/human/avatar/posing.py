@@ -15,9 +15,9 @@ from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.pose.skinning import joint_transforms
 from dyngs.human.template.body import BodyTemplate
-from dyngs.ops.harmonics import light_harmonics
+from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_of, rotation_matrices
 from dyngs.state import fields_moved_to
@@ -35,10 +35,7 @@ class Light:
 
     def on(self, sh: Tensor, linear: Tensor) -> Tensor:
         """Return harmonics (N, K, 3) with their colours times the light, of Gaussians moved by (N, 3, 3)."""
-        facing = torch.nn.functional.normalize((linear * self.normals[:, None]).sum(-1), dim=1)
-        factor = (1 + light_harmonics(facing) @ self.factors)[:, None]
-        lit = sh * factor
-        return torch.cat([lit[:, :1] + (factor - 1) * (0.5 / SH_C0), lit[:, 1:]], dim=1)
+        return lit(sh, linear, self.normals, self.factors)
 
 
 def rest_normals(gaussians: Gaussians) -> Tensor:
@@ -166,4 +163,4 @@ def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
 
 def frame_pose(clip: MotionClip, row: int) -> BodyPose:
     """Return the pose of one frame of a clip."""
-    return BodyPose(axis_angle_to_matrix(clip.poses[row]), clip.trans[row], clip.scale[row])
+    return BodyPose(clip.rotations[row], clip.trans[row], clip.scale[row])
