@@ -50,7 +50,8 @@ def difference_of_sides(gaussians: Gaussians, images: Tensor, is_image: Tensor) 
     ``images`` (N,) are rows of the mirror images, ``is_image`` (N,) says where there is one.
     """
     colours = gaussians.sh[:, 0] * SH_C0
-    return ((colours - colours.index_select(0, images)).square().sum(1) * is_image).mean()
+    unlike = (colours - colours.index_select(0, images)) * is_image[:, None]
+    return unlike.square().sum() / len(colours)
 
 
 @dataclass(frozen=True)
