@@ -90,8 +90,64 @@ def light_harmonics(directions: Tensor) -> Tensor:
 
     Diffuse light on what faces these directions has hardly any finer detail (Ramamoorthi and Hanrahan 2001).
     """
-    x, y, z = directions.unbind(1)
-    return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], dim=1)
+    return torch.stack(_light_terms(directions.T), dim=1)
+
+
+def _light_terms(directions: Tensor) -> list[Tensor]:
+    """Return the eight harmonics (N,) each in unit directions (3, N)."""
+    x, y, z = directions.unbind(0)
+    return [x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
+
+
+def _light_terms_vjp(directions: Tensor, by_terms: Tensor) -> Tensor:
+    """Return the gradient (3, N) by the directions, of that by the harmonics (8, N)."""
+    x, y, z = directions.unbind(0)
+    products = by_terms[3:6]  # of each coordinate with the next
+    by_directions = by_terms[:3] + products * directions.roll(-1, 0) + (products * directions).roll(1, 0)
+    by_directions[0].addcmul_(by_terms[6], x, value=2)
+    by_directions[1].addcmul_(by_terms[6], y, value=-2)
+    by_directions[2].addcmul_(by_terms[7], z, value=6)
+    return by_directions
+
+
+class _Lit(torch.autograd.Function):
+    """See ``lit``. Numbers of one kind lie side by side: sums over rows of three are slow in torch."""
+
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor, linear: Tensor, normals: Tensor, factors: Tensor) -> Tensor:
+        moves, rest = linear.permute(1, 2, 0).contiguous(), normals.T.contiguous()
+        moved = (moves * rest).sum(1)
+        lengths = moved.square().sum(0).sqrt().clamp_min(_SHORTEST)
+        facing = moved / lengths
+        terms = torch.stack(_light_terms(facing))
+        light = (factors.T @ terms).add_(1).T.contiguous()
+        found = sh * light[:, None]
+        found[:, 0].add_(light - 1, alpha=0.5 / SH_C0)
+        ctx.save_for_backward(sh, moves, rest, factors, lengths, facing, terms, light)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (sh, moves, rest, factors, lengths, facing, terms, light), (grad,) = ctx.saved_tensors, grads
+        by_light = (grad * sh).sum(1).add_(grad[:, 0], alpha=0.5 / SH_C0).T.contiguous()
+        by_facing = _light_terms_vjp(facing, factors @ by_light)
+        by_moved = (by_facing - facing * (facing * by_facing).sum(0)) / lengths
+        by_linear = (by_moved[:, None] * rest).permute(2, 0, 1)
+        by_normals = (moves * by_moved[:, None]).sum(0).T
+        return grad * light[:, None], by_linear, by_normals, terms @ by_light.T
+
+
+_SHORTEST = 1e-12  # length below which a normal has no direction
+
+
+def lit(sh: Tensor, linear: Tensor, normals: Tensor, factors: Tensor) -> Tensor:
+    """Return harmonics (N, K, 3) with their colours times 1 + y A, differentiable once in everything.
+
+    y are the ``light_harmonics`` of the normals (N, 3), of any length, as the maps ``linear`` (N, 3, 3) move them;
+    ``factors`` A (8, 3) are those of red, green and blue.
+    """
+    return cast(Any, _Lit).apply(sh, linear, normals, factors)
 
 
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:

@@ -147,11 +147,9 @@ def empty_like(x: Tensor) -> Tensor:
 
 
 def _passed(core: ModuleType, value: Any) -> Any:
+    if isinstance(value, Tensor):  # most are
+        return array(value)
     match value:
-        case None | int() | float():
-            return value
-        case Tensor():
-            return array(value)
         case InPlace():
             return writable(value.tensor)
         case Struct():

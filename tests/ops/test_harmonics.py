@@ -11,7 +11,14 @@ from scenes import Scene, random_scene, relative_error, weights
 from torch import Tensor
 
 from dyngs.conventions import SH_C0
-from dyngs.ops.harmonics import dimmed, evaluate_harmonics, harmonics_backward_op, harmonics_op
+from dyngs.ops.harmonics import (
+    dimmed,
+    evaluate_harmonics,
+    harmonics_backward_op,
+    harmonics_op,
+    light_harmonics,
+    lit,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -153,3 +160,26 @@ def test_dimmed_colours_are_that_part_of_what_they_were_and_a_few_teach() -> Non
     few = left.detach()[::2].clone().requires_grad_()
     (by_few,) = torch.autograd.grad((dimmed(sh, left.detach(), few, 2) * weights).sum(), few)
     torch.testing.assert_close(by_few, ours[1][::2])
+
+
+@pytest.mark.parametrize("terms", [1, 4])
+def test_lit_colours_are_those_of_the_formula_and_so_are_gradients(terms: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    shapes = (6, terms, 3), (6, 3, 3), (6, 3), (8, 3)
+    inputs = [torch.randn(x, generator=generator, dtype=torch.float64, requires_grad=True) for x in shapes]
+    sh, linear, normals, factors = (x.detach() for x in inputs)
+    facing = torch.nn.functional.normalize((linear @ normals[..., None])[..., 0], dim=1)
+    light = 1 + light_harmonics(facing) @ factors
+    found = lit(sh, linear, normals, factors)
+    torch.testing.assert_close(found[:, 0] * SH_C0 + 0.5, (sh[:, 0] * SH_C0 + 0.5) * light)
+    torch.testing.assert_close(found[:, 1:], sh[:, 1:] * light[:, None])
+    assert torch.autograd.gradcheck(lit, inputs)
+
+
+def test_what_has_no_normal_stays_finite() -> None:
+    inputs = [
+        x.requires_grad_() for x in (torch.ones(1, 1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.ones(8, 3))
+    ]
+    found = lit(*inputs)
+    assert bool(found.isfinite().all())
+    assert all(bool(x.isfinite().all()) for x in torch.autograd.grad(found.sum(), inputs))

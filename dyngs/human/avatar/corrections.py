@@ -89,7 +89,7 @@ def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
     """Return the corrected pose of frame ``row`` of the clip of training."""
     own = axis_angle_to_matrix(learned["turns"] + learned["poses"][row])
     return BodyPose(
-        axis_angle_to_matrix(clip.poses[row]) @ own,
+        clip.rotations[row] @ own,
         clip.trans[row] + learned["trans"][row],
         clip.scale[row] * learned["log_scale"][0].exp(),
     )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
@@ -54,6 +56,42 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
     own = torch.arange(len(points), device=near.device)[:, None]
     order = others.int().sort(dim=1, stable=True).indices[:, :count]
     return torch.where(others, own, near).gather(1, order)
+
+
+class _Strains(torch.autograd.Function):
+    """See ``strains``. Numbers of one kind lie side by side: sums over rows of three are slow in torch."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        columns = (x.T.contiguous() for x in (means, moved, means - points))
+        rest, posed, uneven = (x - x.index_select(1, near) for x in columns)
+        before, after = (x.square().sum(0).add_(_SHORTEST**2).sqrt_() for x in (rest, posed))
+        strain = after / scale - before
+        ctx.save_for_backward(rest.mul_(strain / before), posed.mul_(strain / after), uneven, near, scale)
+        return strain.square().mean(), uneven.square().sum() / len(near)
+
+    @staticmethod
+    @once_differentiable  # whose type hides the name of ctx
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        rest, posed, uneven, near, scale = ctx.saved_tensors
+        by_strain, by_uneven = (2 / len(near) * x for x in grads)
+        by_rest, by_posed = by_uneven * uneven - by_strain * rest, by_strain / scale * posed
+        by_means, by_moved = (x.index_add(1, near, x, alpha=-1).T for x in (by_rest, by_posed))
+        return by_means, by_moved, None, None, None
+
+
+_SHORTEST = 1e-6  # added to all distances, squared: points that coincide pull each other nowhere
+
+
+def strains(means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean squares () of changes of the distance to a neighbour, and of unlike offsets; differentiable once.
+
+    ``means`` (N, 3) at rest, which are offset from ``points`` (N, 3), are ``moved`` (N, 3) to a pose, in a world with
+    ``scale`` () units per unit of theirs; ``near`` (N,) are rows of their neighbours.
+    """
+    return cast(Any, _Strains).apply(means, moved, points, near, scale)
 
 
 ENOUGH = 1.0  # sightings (see sightings) at which a Gaussian's own values count as much as what is around it

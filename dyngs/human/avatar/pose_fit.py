@@ -202,7 +202,7 @@ class _Fit:
         """Return the loss () of a correction: the mean over ``images``, compared after shrinking, and its size."""
         start, how = self.start, self.comparison
         posing = BodyPose(
-            axis_angle_to_matrix(start.poses[0]) @ axis_angle_to_matrix(correction.turns),
+            start.rotations[0] @ axis_angle_to_matrix(correction.turns),
             start.trans[0] + correction.shift * start.scale[0],
             start.scale[0],
         )

@@ -15,9 +15,9 @@ from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
+from dyngs.human.pose.skinning import joint_transforms
 from dyngs.human.template.body import BodyTemplate
-from dyngs.ops.harmonics import light_harmonics
+from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_of, rotation_matrices
 from dyngs.state import fields_moved_to
@@ -35,10 +35,7 @@ class Light:
 
     def on(self, sh: Tensor, linear: Tensor) -> Tensor:
         """Return harmonics (N, K, 3) with their colours times the light, of Gaussians moved by (N, 3, 3)."""
-        facing = torch.nn.functional.normalize((linear * self.normals[:, None]).sum(-1), dim=1)
-        factor = (1 + light_harmonics(facing) @ self.factors)[:, None]
-        lit = sh * factor
-        return torch.cat([lit[:, :1] + (factor - 1) * (0.5 / SH_C0), lit[:, 1:]], dim=1)
+        return lit(sh, linear, self.normals, self.factors)
 
 
 def rest_normals(gaussians: Gaussians) -> Tensor:
@@ -53,7 +50,8 @@ def difference_of_sides(gaussians: Gaussians, images: Tensor, is_image: Tensor) 
     ``images`` (N,) are rows of the mirror images, ``is_image`` (N,) says where there is one.
     """
     colours = gaussians.sh[:, 0] * SH_C0
-    return ((colours - colours.index_select(0, images)).square().sum(1) * is_image).mean()
+    unlike = (colours - colours.index_select(0, images)) * is_image[:, None]
+    return unlike.square().sum() / len(colours)
 
 
 @dataclass(frozen=True)
@@ -166,4 +164,4 @@ def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
 
 def frame_pose(clip: MotionClip, row: int) -> BodyPose:
     """Return the pose of one frame of a clip."""
-    return BodyPose(axis_angle_to_matrix(clip.poses[row]), clip.trans[row], clip.scale[row])
+    return BodyPose(clip.rotations[row], clip.trans[row], clip.scale[row])

@@ -18,7 +18,7 @@ from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
-from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, trust_in
+from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
@@ -154,10 +154,10 @@ class HumanTraining(SceneTraining[HumanScene]):
         terms, options, now = {}, self.options, scene.gaussians
         if options.offset_weight > 0:
             away = (now.means - scene.anchors.points) / CENTIMETRE
-            terms["offset"] = options.offset_weight * away.square().sum(1).mean()
+            terms["offset"] = options.offset_weight * away.square().sum() / len(away)
         if options.scale_weight > 0:
             longer = now.log_scales - scene.anchors.size.log()[:, None]
-            terms["scale"] = options.scale_weight * longer.clamp_min(0).square().sum(1).mean()
+            terms["scale"] = options.scale_weight * longer.clamp_min(0).square().sum() / len(longer)
         return terms
 
     def _between_neighbours(self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int) -> dict[str, Tensor]:
@@ -173,17 +173,6 @@ class HumanTraining(SceneTraining[HumanScene]):
         if not self._near.shape[1]:
             return {}
         near = self._near[:, step % self._near.shape[1]]
-        terms = {}
-        if options.rigidity > 0:
-            before, after = (_lengths(x - x.index_select(0, near)) for x in (means, moved.means))
-            strain = (after / scale - before) / CENTIMETRE
-            terms["rigidity"] = options.rigidity * strain.square().mean()
-        if options.smoothness > 0:
-            away = (means - scene.anchors.points) / CENTIMETRE
-            terms["smoothness"] = options.smoothness * (away - away.index_select(0, near)).square().sum(1).mean()
-        return terms
-
-
-def _lengths(vectors: Tensor) -> Tensor:
-    """Return (N,) lengths, with a gradient of 0 at 0."""
-    return (vectors.square().sum(1) + 1e-12).sqrt()
+        strain, uneven = strains(means, moved.means, scene.anchors.points, near, scale)
+        terms = {"rigidity": options.rigidity * strain, "smoothness": options.smoothness * uneven}
+        return {name: x / CENTIMETRE**2 for name, x in terms.items() if getattr(options, name) > 0}

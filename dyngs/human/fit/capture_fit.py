@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -43,6 +44,11 @@ GAIN, GAIN_OF_SHAPE = 0.01, 0.03
 Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another shape explains thick
 clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
+PLACING = 40  # most steps of Adam in which a clip is moved to its silhouettes: three numbers are learned
+VIEWS = 3  # views of a frame, other ones each time, that are drawn while images are small
+TRIAL, PROMISING = 4, 0.75
+"""What is tried next is learned in the last of so many parts of its steps at first, when rates are low, and in all of
+them where that gains this fraction of ``GAIN``. Where a limb is off, it gains several times that."""
 SHAPE = ("log_scale", "betas", "padding", "offset", "shift")  # what is the same in all frames
 
 
@@ -117,6 +123,18 @@ class Seen:
     def halves(self) -> dict[int, ObservedFrame | None]:
         """The frames to fit to at half the size."""
         return {row: None if frame is None else frame.shrunk(2) for row, frame in self.used.items()}
+
+
+class InTurn:
+    """Observations of a few views of each frame, other ones each time; ``frames`` are all views, by row of the clip."""
+
+    def __init__(self, frames: Mapping[int, ObservedFrame | None]) -> None:
+        self._frames, self._turns = frames, Counter[int]()
+
+    def __call__(self, row: int) -> ObservedFrame | None:
+        frame = self._frames[row]
+        self._turns[row] += 1
+        return None if frame is None else frame.part(self._turns[row], VIEWS)
 
 
 def fit_capture(
@@ -251,8 +269,8 @@ def _from_given(
     fitting: Fitting, seen: Seen, shared: tuple[str, ...], report: ReportProgress, effort: FitEffort
 ) -> tuple[TriedFit, ...]:
     start = new_fit(fitting.clip, fitting.surface)
-    tick = ticker("shape", report, 4 * effort.steps)
-    half, full = seen.halves.__getitem__, seen.used.__getitem__
+    tick = ticker("shape", report, 3 * effort.steps)
+    half, full = InTurn(seen.halves), seen.used.__getitem__
     # Clothes and hair are no sign of wrong poses.
     dressed = fitting.run(start, ("padding",), effort.steps, half, tick)
     tried = [measured("the poses as given", dressed, fitting, seen)]
@@ -260,12 +278,20 @@ def _from_given(
     for look in (half, full):
         shape = fitting.run(shape, shared, effort.steps, look, tick)
     tried.append(measured("one shape", shape, fitting, seen))
-    turns = fitting.run(shape, (*shared, "turns"), effort.steps, full, tick)
-    tried.append(measured("turns that are the same in all frames as well", turns, fitting, seen))
-    steps = effort.steps_for(fitting.clip)
-    tick = ticker("poses", report, steps)
-    poses = fitting.run(turns, (*shared, "turns", "poses", "trans"), steps, full, tick)
-    return (*tried, measured("turns of every frame as well", poses, fitting, seen))
+    more = (
+        ("turns that are the same in all frames as well", (*shared, "turns"), effort.steps),
+        ("turns of every frame as well", (*shared, "turns", "poses", "trans"), effort.steps_for(fitting.clip)),
+    )
+    for name, learned, steps in more:
+        few = -(-steps // TRIAL)
+        tick = ticker("poses", report, few)
+        found = fitting.run(tried[-1].learned, learned, few, full, tick, fallen=1 - 1 / TRIAL)
+        candidate = measured(name, found, fitting, seen)
+        if candidate.iou > max(x.iou for x in tried) + PROMISING * GAIN:
+            found = fitting.run(found, learned, steps, full, ticker("poses", report, steps))
+            candidate = max(candidate, measured(name, found, fitting, seen), key=lambda x: x.iou)
+        tried.append(candidate)
+    return tuple(tried)
 
 
 def _from_silhouettes(
@@ -349,9 +375,10 @@ def placed_clip(
             if name not in ("poses", "trans"):
                 start[name].copy_(value)
     name = "place of new poses"
-    tick = ticker(name, report, effort.steps)
+    steps = min(effort.steps, PLACING)
+    tick = ticker(name, report, steps)
     fitting = Fitting(motion.clip, surface, near_given(motion.clip))
-    moved = fitting.run(start, ("shift",), effort.steps, seen.used.__getitem__, tick)
+    moved = fitting.run(start, ("shift",), steps, seen.used.__getitem__, tick)
     before, after = (measured(name, x, fitting, seen) for x in (start, moved))
     better = after.iou > before.iou + _CLEARLY
     shift = (moved if better else start)["shift"].detach()

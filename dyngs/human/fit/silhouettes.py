@@ -6,7 +6,7 @@ Local letters: P discs, B shape parameters, V views of one frame, S side of a sq
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -99,7 +99,12 @@ def surface_of(body: BodyTemplate, resolution: int) -> Surface:
 
 def drawn_silhouettes(discs: Gaussians, cameras: Cameras) -> Tensor:
     """Return coverage (V, H, W) in [0, 1] of posed discs in the images of V cameras; differentiable."""
-    return render(discs, cameras, _OPTIONS).alpha
+    return render(discs, cameras, _OPTIONS, shader=_black).alpha
+
+
+def _black(discs: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+    """Return the colours (V, P, 1) of discs of which only the coverage counts: one channel, without a gradient."""
+    return discs.means.new_zeros(len(cameras), len(discs), 1)
 
 
 _MARGIN = 1.25  # side of the square over the longest side of the person's box
@@ -121,6 +126,16 @@ class ObservedFrame:
 
     def __len__(self) -> int:
         return len(self.alpha)
+
+    def part(self, turn: int, count: int) -> ObservedFrame:
+        """Return ``count`` of the V views, far apart in their order; V turns show each as often. All if V <= count."""
+        if len(self) <= count:
+            return self
+        rows = [(turn + i * len(self) // count) % len(self) for i in range(count)]
+        picked = {name: x[rows] for name in ("alpha", "known", "joints") if (x := getattr(self, name)) is not None}
+        cameras = self.cameras
+        cameras = Cameras(cameras.cam_from_world[rows], cameras.intrinsics[rows], cameras.width, cameras.height)
+        return replace(self, cameras=cameras, **picked)
 
     def shrunk(self, factor: int) -> ObservedFrame:
         """Return the squares with sides divided by ``factor``."""

@@ -164,7 +164,7 @@ def refined(cameras: Cameras, learned: Parameters) -> Cameras:
 def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
     """Return the fitted pose of frame ``row``."""
     own = learned["turns"] + learned["poses"][row]
-    given = axis_angle_to_matrix(clip.poses[row])
+    given = clip.rotations[row]
     turned = given[: len(own)] @ axis_angle_to_matrix(own)
     scale = clip.scale[row] * learned["log_scale"][0].exp()
     away = learned["shift"] + learned["trans"][row] + scale * (turned[0] @ learned["offset"])
@@ -239,10 +239,12 @@ class Fitting:
         steps: int,
         observed: Observations,
         tick: Callable[[], None] = lambda: None,
+        fallen: float = 0.0,
     ) -> Parameters:
         """Return the fit ``start`` after ``steps`` of Adam on what is named; ``tick`` is called after each.
 
-        Frames are taken in a fixed order that covers the clip evenly.
+        Frames are taken in a fixed order that covers the clip evenly. Rates begin where they are after the fraction
+        ``fallen`` of a run.
         """
         # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
         found = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)
@@ -257,7 +259,7 @@ class Fitting:
                 loss = loss + mean_error(found, self.clip, self.surface, seen) * (len(seen) / len(rows))
             if loss.requires_grad:  # else nothing is to be learned
                 loss.backward()
-            found.step(step, step / steps)
+            found.step(step, fallen + (1 - fallen) * step / steps)
             tick()
         return found
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.errors import DyngsError
 from dyngs.files.limits import VARIABLE, allowed
+from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.state import fields_moved_to
 
@@ -175,6 +177,11 @@ class MotionClip:
 
     def __len__(self) -> int:
         return len(self.times)
+
+    @cached_property
+    def rotations(self) -> Tensor:
+        """Return the rotations (F, J, 3, 3) relative to the parent joints."""
+        return axis_angle_to_matrix(self.poses)
 
     def to(self, *, device: torch.device | str) -> MotionClip:
         """Return the clip with its poses, translations and scales on ``device``."""

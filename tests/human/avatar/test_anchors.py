@@ -58,6 +58,20 @@ def test_corrections_act_only_where_parts_meet() -> None:
     assert float((found - weights)[~alone].abs().max()) > 0.1
 
 
+def test_gradients_by_corrections_are_those_of_the_formula() -> None:
+    """A joint may be named twice, as files may have it: its weights add up."""
+    points = torch.zeros(2, 3, dtype=torch.float64)
+    joints = torch.tensor([[2, 0, 1], [1, 1, 3]])
+    weights = torch.tensor([[0.5, 0.3, 0.2], [0.7, 0.3, 0.0]], dtype=torch.float64)
+    anchors = Anchors(points, points[:, 0], joints, weights, joints[:, 0], points, points[:, :2], points[:, 0])
+    corrections = torch.tensor([[0.3, -1.0, 0.2], [0.5, 0.0, 2.0]], dtype=torch.float64, requires_grad=True)
+    found = skinning_weights(anchors, 4, corrections).detach()
+    parts = torch.softmax(weights.log() + corrections.detach(), 1)
+    torch.testing.assert_close(found[0], torch.stack([parts[0, 1], parts[0, 2], parts[0, 0], torch.zeros(())]))
+    torch.testing.assert_close(found[1].tolist(), [0.0, 1.0, 0.0, 0.0])
+    assert torch.autograd.gradcheck(lambda c: skinning_weights(anchors, 4, c), corrections)
+
+
 def test_the_heaviest_joints_are_kept_and_normalised() -> None:
     weights = torch.tensor([[0.05] * 8 + [0.3, 0.3], [0.0] * 9 + [1.0]])
     joints, fractions = heaviest_joints(weights)

@@ -25,6 +25,7 @@ from dyngs.human.avatar.neighbours import (
     nearest_neighbours,
     sightings,
     smoothed,
+    strains,
     trust_in,
 )
 from dyngs.human.template.atlas import atlas_texels
@@ -193,3 +194,28 @@ def test_without_a_seen_mirror_image_a_gap_is_filled_smoothly_and_from_its_own_p
     new = filled(gaussians.replace(sh=noisy[:, None]), anchors, weights, 0.5, (~gap).float())
     torch.testing.assert_close(new["sh"][:, 0], colours, atol=1e-3, rtol=0)
     torch.testing.assert_close(new["means"], gaussians.means)
+
+
+def test_strains_are_those_of_a_loop_and_so_are_their_gradients() -> None:
+    generator = torch.Generator().manual_seed(0)
+    means, moved, points = torch.randn(3, 7, 3, generator=generator, dtype=torch.float64).unbind(0)
+    near, scale = torch.tensor([1, 2, 0, 0, 5, 4, 6]), torch.tensor(1.5, dtype=torch.float64)  # the last is alone
+    found = strains(means, moved, points, near, scale)
+    changes, unlike = [], []
+    for i, j in enumerate(near.tolist()):
+        changes.append(float((moved[i] - moved[j]).norm() / 1.5 - (means[i] - means[j]).norm()) ** 2)
+        unlike.append(float(((means - points)[i] - (means - points)[j]).square().sum()))
+    torch.testing.assert_close(found[0].item(), sum(changes) / 7, rtol=1e-6, atol=0)
+    torch.testing.assert_close(found[1].item(), sum(unlike) / 7)
+    leaves = means.requires_grad_(), moved.requires_grad_()
+    assert torch.autograd.gradcheck(lambda a, b: strains(a, b, points, near, scale), leaves)
+
+
+def test_a_rigid_motion_strains_nothing() -> None:
+    generator = torch.Generator().manual_seed(1)
+    points, near = torch.randn(9, 3, generator=generator, dtype=torch.float64), torch.arange(9).roll(1)
+    turned = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    moved, offset = 2 * (points + 0.1) @ turned.T + 5, points + torch.tensor([0.1, 0.1, 0.1])
+    strain, uneven = strains(offset, moved, points, near, torch.tensor(2.0, dtype=torch.float64))
+    assert strain < 1e-20
+    assert uneven < 1e-20

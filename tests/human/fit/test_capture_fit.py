@@ -14,15 +14,19 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.human.fit import start
+from dyngs.human.fit import capture_fit, start
 from dyngs.human.fit.capture_fit import (
     GAIN,
     RESOLUTION,
+    TRIAL,
+    VIEWS,
     CaptureFit,
     FitEffort,
+    InTurn,
     TriedFit,
     fit_capture,
     fitted_clips,
+    look_at,
     placed_clip,
     simplest_of_the_best,
     split_views,
@@ -91,6 +95,35 @@ def test_the_same_capture_gives_the_same_fit(wrong: tuple[Capture, Capture]) -> 
     )
     assert torch.equal(first["betas"], again["betas"])
     assert torch.equal(first["trans"], again["trans"])
+
+
+def test_small_images_are_looked_at_by_a_few_cameras_in_turn(wrong: tuple[Capture, Capture]) -> None:
+    capture, body = wrong[1], default_template()
+    assert capture.body is not None
+    motion = captured_motion(capture.root, capture.body["train"], capture.splits["train"], body.joints)
+    seen = look_at(capture, motion, DataConfig(root=capture.root), FitEffort(side=32), {})
+    look, whole = InTurn(seen.halves), seen.halves[2]
+    assert whole is not None
+    shown = [part for _ in range(len(whole)) if (part := look(2)) is not None]
+    assert [len(part) for part in shown] == [VIEWS] * len(whole)
+    alphas = torch.cat([part.alpha for part in shown])
+    assert all(int((alphas == own).all(2).all(1).sum()) == VIEWS for own in whole.alpha), "each as often"
+    assert InTurn({0: None})(0) is None
+
+
+@pytest.mark.parametrize(("gain", "steps"), [(2.0, 1 + 1), (-2.0, 1 + TRIAL + 1 + TRIAL)])
+def test_more_gets_all_its_steps_only_where_a_trial_gains(
+    wrong: tuple[Capture, Capture], monkeypatch: pytest.MonkeyPatch, gain: float, steps: int
+) -> None:
+    monkeypatch.setattr(capture_fit, "GAIN", gain)
+    told, effort = [], FitEffort(side=32, steps=TRIAL, visits=0)
+
+    def report(name: str, done: int, total: int) -> None:
+        told.append(name)
+
+    fit_capture(wrong[1], DataConfig(root=wrong[1].root), default_template(), report, effort=effort)
+    assert told.count("poses") == steps
+    assert told.count("shape") == 3 * TRIAL
 
 
 @pytest.mark.parametrize(("ious", "wanted"), [((0.8, 0.9, 0.905), 1), ((0.8, 0.9, 0.92), 2), ((0.8, 0.82, 0.81), 0)])

@@ -7,7 +7,10 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.human.fit.silhouettes import longest_box_side, observed_frame
+from dyngs.gaussians.rendering import render
+from dyngs.human.fit.silhouettes import _OPTIONS as OPTIONS
+from dyngs.human.fit.silhouettes import drawn_silhouettes, longest_box_side, observed_frame, surface_of
+from dyngs.human.template.body_reader import default_template
 
 
 def image(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Image:
@@ -57,3 +60,28 @@ def test_images_without_anybody_are_left_out() -> None:
     found = observed_frame([nobody, image(slice(10, 30), slice(20, 28))], 20, 10)
     assert found is not None
     assert len(found) == 1
+
+
+def test_turns_show_each_view_as_often_and_views_that_are_far_apart() -> None:
+    shown = [image(slice(10, 30), slice(20, 21 + i)) for i in range(7)]
+    frame = observed_frame(shown, 20, 10)
+    assert frame is not None
+    parts = [frame.part(turn, 3) for turn in range(7)]
+    areas = frame.alpha.sum((1, 2)).tolist()
+    rows = [[areas.index(x) for x in part.alpha.sum((1, 2)).tolist()] for part in parts]
+    assert sorted(x for part in rows for x in part) == sorted(3 * list(range(7)))
+    assert all(min(abs(a - b) % 7, 7 - abs(a - b) % 7) >= 2 for part in rows for a in part for b in part if a != b)
+    for part, own in zip(parts, rows, strict=True):
+        torch.testing.assert_close(part.cameras.intrinsics, frame.cameras.intrinsics[own])
+        torch.testing.assert_close(part.known, frame.known[own])
+    assert frame.part(3, 7) is frame
+
+
+def test_the_coverage_is_that_of_a_render_and_needs_no_colours() -> None:
+    surface = surface_of(default_template(), 16)
+    pose = torch.eye(4)[None].clone()
+    pose[0, :3] = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 3]])  # 3 m in front of a standing person
+    camera = Cameras(pose, torch.tensor([[[40.0, 0, 24], [0, 40, 24], [0, 0, 1]]]), 48, 48)
+    found, coloured = drawn_silhouettes(surface.discs, camera), render(surface.discs, camera, OPTIONS).alpha
+    assert found.sum() > 50
+    torch.testing.assert_close(found, coloured, rtol=0, atol=1e-6)

@@ -14,6 +14,8 @@ from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import (
     KEYPOINT,
     LIMIT_WEIGHT,
+    LR,
+    LR_DECAY,
     PLACE,
     Fitting,
     PosePrior,
@@ -121,6 +123,19 @@ def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     assert not any(value.any() for value in start.values().values()), "what was learned before stays as it is"
     changed = {name for name, value in found.values().items() if value.any()}
     assert changed == {"betas"}
+
+
+def test_rates_begin_where_they_have_fallen_to(surface: Surface) -> None:
+    """Nobody is seen: the person shrinks all the time, by the rate of each step."""
+    given, view = clip(), camera()
+    alpha = torch.zeros(1, SIZE, SIZE)
+    seen, start = ObservedFrame(view, alpha, alpha + 1), new_fit(given, surface)
+    fitting, sums = Fitting(given, surface, near_given(given)), []
+    for fallen in (0.0, 0.75):
+        moved = fitting.run(start, ("log_scale",), 4, lambda _: seen, fallen=fallen)["log_scale"]
+        sums.append(-float(moved.detach()) / LR["log_scale"])
+    assert sums[0] == pytest.approx(sum(LR_DECAY ** (i / 4) for i in range(1, 5)), rel=0.02)
+    assert sums[1] == pytest.approx(sum(LR_DECAY ** (0.75 + i / 16) for i in range(1, 5)), rel=0.02)
 
 
 def test_joints_given_in_3d_are_robust_distances() -> None:

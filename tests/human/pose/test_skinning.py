@@ -135,6 +135,14 @@ def test_gradients_of_the_chain() -> None:
         )
 
 
+def test_gradients_of_two_trees_of_persons_in_frames() -> None:
+    """Leading sizes broadcast, and gradients are summed over them."""
+    joints, pose = normal(2, 1, 5, 3).requires_grad_(), normal(3, 5, 3, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda j, p: joint_transforms(j, (-1, 0, -1, 2, 2), axis_angle_to_matrix(p)), (joints, pose)
+    )
+
+
 @pytest.mark.parametrize("parents", [(0,), (-1, 1), (-1, 2, 1), (-1, 0, -2), (-1, 5)])
 def test_a_tree_out_of_order_is_refused_and_never_followed(parents: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="parents must come before their children"):
