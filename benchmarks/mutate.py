@@ -87,7 +87,7 @@ MUTATIONS = (
     ("evaluate/regions.py", "kept = 1 - grown", "kept = (shown)[None, None].float()", "evaluate/test_regions.py"),
     ("evaluate/regions.py", "~moves & inside", "~moves", "evaluate/test_regions.py"),
     ("evaluate/temporal.py", "(after - now) / (after - before)", "(now - before) / (after - before)", "evaluate/test_temporal.py"),
-    ("evaluate/view_scores.py", "psnr(rendering.rgb[0], truth, weights[1])", "psnr(rendering.rgb[0], truth, weights[0])", "evaluate/test_view_scores.py"),
+    ("evaluate/view_scores.py", "psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask)", "psnr(rendering.rgb[0][:, :middle], truth[:, :middle], mask)", "evaluate/test_view_scores.py"),
     ("evaluate/view_scores.py", "rendering.transmittance[0][..., None] * background", "0 * background", "evaluate/test_view_scores.py"),
     ("evaluate/tracks.py", "MIN_OPACITY = 0.3", "MIN_OPACITY = 0.0", "evaluate/test_tracks.py"),
     ("evaluate/tracks.py", "np.minimum(np.nan_to_num(distance, nan=limit), limit)", "np.nan_to_num(distance, nan=limit)", "evaluate/test_tracks.py"),
