@@ -67,7 +67,7 @@ def test_channels_that_are_brighter_than_white_are_left_out_one_by_one() -> None
     image, rendering = image_and_rendering()
     target = (1.5 * rendering.rgb[0] * torch.tensor([1.0, 1.2, 0.9])).clamp_max(1.0)
     seen = torch.cat([rendering.rgb[0], torch.ones(60, 80, 1)], -1).reshape(-1, 4).double()
-    affine = torch.eye(3, 4, dtype=torch.float64)
+    affine, kept = torch.eye(3, 4, dtype=torch.float64), torch.zeros(0)
     for _ in range(3):
         kept, rows = ~((target.reshape(-1, 3) >= 254.5 / 255) & (seen @ affine.T > 1)), []
         for channel in range(3):
