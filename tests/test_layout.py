@@ -238,3 +238,12 @@ def test_import_leaves_heavy_packages_alone() -> None:
         f"print([m for m in {HEAVY!r} if m in sys.modules and m not in before])"
     )
     assert run_python(code).strip() == "[]"
+
+
+def test_drawing_and_evaluating_leave_packages_alone_that_few_scenes_need() -> None:
+    absent = ("scipy", "skimage", "trimesh", "av", "pycolmap", "kornia", "sympy", "torch._dynamo")
+    code = (
+        "import sys, dyngs.evaluate.report, dyngs.export.images, dyngs.export.chosen_path\n"
+        f"print([m for m in {absent!r} if m in sys.modules])"
+    )
+    assert run_python(code).strip() == "[]"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.aim import look_at_point, unit, with_poses, world_from_cam
@@ -62,6 +61,8 @@ def _features(poses: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def _walk(features: np.ndarray) -> np.ndarray:
     """Return the order (V,) in which to visit ``features`` (V, D): as they are if that is a walk, else a short way."""
+    from scipy.spatial.distance import cdist  # late: importing it takes a tenth of a second
+
     between = cdist(features, features)
     given = np.arange(len(features))
     short = _short_way(between)

@@ -7,6 +7,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
+from dyngs.cli.imports import heavy_imports
 from dyngs.errors import counted
 
 if TYPE_CHECKING:
@@ -37,10 +38,11 @@ def add_parser(commands: args.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate and print a table."""
-    from rich.console import Console
+    with heavy_imports():
+        from rich.console import Console
 
-    from dyngs.config.io import load_resolved
-    from dyngs.evaluate.report import evaluate_run, report_path
+        from dyngs.config.io import load_resolved
+        from dyngs.evaluate.report import evaluate_run, report_path
 
     if arguments.refine and arguments.split != "train":
         load_resolved(arguments.run_dir)  # what is no run is refused before anything is announced

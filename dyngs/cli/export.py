@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
+from dyngs.cli.imports import heavy_imports
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_redrawn
 from dyngs.errors import DyngsError, as_word, counted
 
@@ -100,7 +101,8 @@ def add_parser(commands: args.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print where they are and how large."""
-    from dyngs.runs.opened import open_scene
+    with heavy_imports():
+        from dyngs.runs.opened import open_scene
 
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
+from dyngs.cli.imports import heavy_imports
 from dyngs.cli.progress_bar import ProgressBar
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
@@ -119,11 +120,12 @@ def _has_fixed_camera(arguments: argparse.Namespace) -> bool:
 
 
 def _render(arguments: argparse.Namespace) -> list[Path]:
-    import torch
+    with heavy_imports():
+        import torch
 
-    from dyngs.export.chosen_path import choose_path
-    from dyngs.export.images import OutputOptions, write_path_images, write_split_images
-    from dyngs.runs.opened import open_run
+        from dyngs.export.chosen_path import choose_path
+        from dyngs.export.images import OutputOptions, write_path_images, write_split_images
+        from dyngs.runs.opened import open_run
 
     device = args.computing_device(arguments.device)
     if arguments.threads > 0:

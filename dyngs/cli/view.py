@@ -6,6 +6,7 @@ import argparse
 import threading
 
 from dyngs.cli import arguments as args
+from dyngs.cli.imports import heavy_imports
 from dyngs.errors import DyngsError
 
 _EPILOG = """\
@@ -49,11 +50,12 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.view.server import require_viser
 
     require_viser()
-    import torch
+    with heavy_imports():
+        import torch
 
-    from dyngs.view.people import motion_files
-    from dyngs.view.server import Serving, Viewer
-    from dyngs.view.source import first_of, open_source
+        from dyngs.view.people import motion_files
+        from dyngs.view.server import Serving, Viewer
+        from dyngs.view.source import first_of, open_source
 
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)

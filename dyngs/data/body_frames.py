@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dyngs.data.capture import BODY_KINDS, BodyFrames, Capture, Split, Splits, View, all_views, each_view
 from dyngs.errors import DyngsError, reading
@@ -73,6 +72,8 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     fitted = pelvis if body.pelvis is None else body.pelvis
     poses, turned = body.poses, fitted
     if body.turns is not None:
+        from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
+
         turns = Rotation.from_rotvec(body.turns)
         turned = turns.apply(fitted)
         roots = (turns * Rotation.from_rotvec(poses[:, 0])).as_rotvec()

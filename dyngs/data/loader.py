@@ -146,6 +146,7 @@ class ImageLoader:
             decoding_threads: decode what is to be expected in so many threads; none if ``cache_mb`` is 0.
         """
         self._views = tuple(views)
+        self._times = tuple(view.time for view in self._views)
         self._options = options = options or DataConfig(root=Path())
         self._with_maps = with_maps
         self._device, self._gpu_room = CPU, 0.0
@@ -183,7 +184,7 @@ class ImageLoader:
     @property
     def times(self) -> tuple[float | None, ...]:
         """Times of the views in [0, 1], None where a view has none."""
-        return tuple(view.time for view in self._views)
+        return self._times
 
     @property
     def views(self) -> tuple[View, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 MIN_VIEWS = 6
 MIDDLE = 0.5
@@ -25,6 +25,7 @@ class TimeWindow:
     begins: int
     opens: int
     full: int
+    _limits: dict[int, tuple[float, float]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @staticmethod
     def around_middle(times: Sequence[float], first: float, begins: int, opens: int, full: int) -> TimeWindow:
@@ -50,9 +51,12 @@ class TimeWindow:
         # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
         if step <= self.begins:
             return True
-        stray = abs(time - MIDDLE)
-        oldest = self.strays[max(self.num_views(step) - FRONTIER_VIEWS, 0)] if self.tracks(step) else 0.0
-        return oldest <= stray <= self.reach(step)
+        if step not in self._limits:  # once, though all views ask
+            oldest = self.strays[max(self.num_views(step) - FRONTIER_VIEWS, 0)] if self.tracks(step) else 0.0
+            self._limits.clear()
+            self._limits[step] = oldest, self.reach(step)
+        oldest, newest = self._limits[step]
+        return oldest <= abs(time - MIDDLE) <= newest
 
     def tracks(self, step: int) -> bool:
         """Return whether ``step`` is for the newest views only: every other one while the window grows."""

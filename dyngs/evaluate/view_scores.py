@@ -190,15 +190,17 @@ def right_half_scores(image: Image, rendering: Rendering, background: Tensor) ->
     """
     truth = image.composite(background)
     left = torch.zeros_like(truth[..., 0])
-    left[:, : left.shape[1] // 2] = 1
-    weights = [part if image.mask is None else part * image.mask for part in (left, 1 - left)]
-    if not all(bool((weight > 0).any()) for weight in weights):
+    middle = left.shape[1] // 2
+    left[:, :middle] = 1
+    counts = left + 1 if image.mask is None else image.mask
+    if not all(bool((half > 0).any()) for half in (counts[:, :middle], counts[:, middle:])):
         return {"psnr_right": None, "psnr_right_fitted": None}
     affine = fitted_affine([(image, rendering)], background, left)
     fitted = recoloured(affine, image, rendering, background)
+    mask = None if image.mask is None else image.mask[:, middle:]
     return {
-        "psnr_right": psnr(rendering.rgb[0], truth, weights[1]),
-        "psnr_right_fitted": psnr(fitted, truth, weights[1]),
+        "psnr_right": psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask),
+        "psnr_right_fitted": psnr(fitted[:, middle:], truth[:, middle:], mask),
     }
 
 

@@ -138,7 +138,7 @@ def launch(like: Tensor, name: str, *arguments: object) -> Any:
     if _mode.shapes_only:
         return None
     core = core_for(like)
-    return getattr(core, name)(*(_passed(core, x) for x in arguments))
+    return getattr(core, name)(*[_passed(core, x) for x in arguments])
 
 
 def empty_like(x: Tensor) -> Tensor:
@@ -147,17 +147,15 @@ def empty_like(x: Tensor) -> Tensor:
 
 
 def _passed(core: ModuleType, value: Any) -> Any:
-    if isinstance(value, Tensor):  # most are
+    if isinstance(value, Tensor):  # the most frequent kind first: a training step passes two hundred values
         return array(value)
-    match value:
-        case InPlace():
-            return writable(value.tensor)
-        case Struct():
-            return getattr(core, value.name)(*(_passed(core, x) for x in value.fields))
-        case list() | tuple():
-            return tuple(_passed(core, x) for x in cast(Iterable[object], value))
-        case _:
-            return value
+    if isinstance(value, (list, tuple)):
+        return tuple([_passed(core, x) for x in cast(Iterable[object], value)])
+    if isinstance(value, InPlace):
+        return writable(value.tensor)
+    if isinstance(value, Struct):
+        return getattr(core, value.name)(*[_passed(core, x) for x in value.fields])
+    return value
 
 
 def _shapes_of(kernel: Callable[P, R]) -> Callable[P, R]:

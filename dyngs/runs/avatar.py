@@ -25,7 +25,6 @@ from dyngs.human.avatar.corrections import new_corrections
 from dyngs.human.avatar.posing import TERMS, PoseBlendShapes, Skeleton
 from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.motion.placement import rest_clip
 from dyngs.human.template.body_reader import template_path
 from dyngs.models.views import background_colour
 from dyngs.runs.checkpoint import LoadedRun, info_of
@@ -59,6 +58,8 @@ def write_avatar(run: LoadedRun, path: Path) -> Path:
 
     Raises DyngsError: the run is not that of a person, its template is missing, or the file cannot be written.
     """
+    from dyngs.human.motion.placement import rest_clip  # late: scipy, which reading an avatar does without
+
     scene, model = avatar_of(run.scene), run.config.model
     if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(

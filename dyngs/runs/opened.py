@@ -20,7 +20,6 @@ from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.human.motion import placement
 from dyngs.human.motion.motion import captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import CheckpointInfo
@@ -147,7 +146,9 @@ class Opened(LoadedRun):
         if self.stated_up is not None:
             return np.array(AXES[self.stated_up]), "the file"
         if self.person is not None:
-            return placement.up_direction(self.person.clip).double().cpu().numpy(), "the body at rest"
+            from dyngs.human.motion.placement import up_direction as up_of_body  # late: scipy, as below
+
+            return up_of_body(self.person.clip).double().cpu().numpy(), "the body at rest"
         cameras = self.cameras
         return None if cameras is None else (up_direction(cameras), "the mean camera")
 
@@ -193,7 +194,8 @@ class Opened(LoadedRun):
         Raises:
             DyngsError: it is no person, or the file cannot be read.
         """
-        from dyngs.human.motion.retarget import read_motion  # late: scipy's rotations, which no other drawing needs
+        from dyngs.human.motion.placement import place_like  # late: they need scipy, which no other drawing does
+        from dyngs.human.motion.retarget import read_motion
 
         person, model = self._person_for(f"--motion {path}")
         scene = person.to("cpu")
@@ -204,14 +206,16 @@ class Opened(LoadedRun):
         if bool((motion.scale != 1).any()):
             clip = replace(clip, trans=clip.trans - clip.trans.new_tensor(self.info.world_offset))
         else:
-            clip = placement.place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
+            clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         playing = scene.playing(clip).to(person.gaussians.means.device)
         return replace(self, renderable=playing, fps=motion.fps, as_captured=False)
 
     def at_rest(self) -> Opened:
         """Return the same with its person in the rest pose of the template, upright on the floor. Raises DyngsError."""
+        from dyngs.human.motion.placement import rest_clip  # late: scipy, as above
+
         scene, _ = self._person_for("--pose rest")
-        rest = placement.rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
+        rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         return replace(self, renderable=scene.playing(rest), as_captured=False)
 
     def _person_for(self, wanted: str) -> tuple[HumanScene, HumanModel]:

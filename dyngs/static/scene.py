@@ -41,6 +41,10 @@ class StaticScene(GaussianScene):
     def rows(self) -> Tensor:
         return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
 
+    @property
+    def num_moving(self) -> int:
+        return 0  # asked for at every step
+
     def time_step(self, time: float | None) -> GaussianTimeStep:
         """Return the Gaussians, fused with their 3D filter if there is one."""
         return GaussianTimeStep(filtered(self.gaussians, self.filter_std), clamped_time(time))

@@ -224,6 +224,9 @@ def _as_colours(
     if not colour_channels:
         raise DyngsError(f"{path}: the image has no colour channel; use an RGB or RGBA image")
     colour_channels = colour_channels[:3] if len(colour_channels) >= 3 else colour_channels[:1] * 3
+    as_stored = [*colour_channels, *([] if alpha_channel is None else [alpha_channel])] == list(range(spec.nchannels))
+    if as_stored and not is_linear:  # of most files, which need no copy
+        return torch.as_tensor(np.ascontiguousarray(pixels), device="cpu")
     rgb = pixels[..., colour_channels]
     if is_linear:
         rgb, alpha = _encode_linear(rgb, alpha)
@@ -354,6 +357,10 @@ def _shrink_axis(
         return pixels
     if size > old:
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
+    if old % size == 0:  # all taps of all outputs alike: no gathers, the same sums
+        taps = pixels.narrow(axis, begin_at * old // size - first_input, (end_at - begin_at) * old // size)
+        taps, share = taps.unflatten(axis, (-1, old // size)), pixels.new_tensor(size / old)
+        return sum((tap * share for tap in taps.unbind(axis + 1)), pixels.new_zeros(1))
     # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the fractions exact.
     starts = torch.arange(begin_at, end_at + 1, device=pixels.device) * old
     first = starts[:-1] // size

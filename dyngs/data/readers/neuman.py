@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
@@ -66,6 +65,8 @@ def _aligned(root: Path, numbers: list[int]) -> BodyFrames:
 
 def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
     """SMPL fitted in a frame of its own, mapped to the world by the similarity transform of each image."""
+    from scipy.spatial.transform import Rotation  # late: other captures need none of scipy
+
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
     fits = read_pickle(inside(path))
     if not isinstance(fits, dict) or len(fits) != 1:

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette
@@ -67,6 +66,8 @@ def _video(root: Path) -> Path:
 
 
 def _calibration(path: Path) -> dict[str, object]:
+    from scipy.spatial.transform import Rotation  # late: other captures need none of scipy
+
     fields = read_pickle(inside(path))
 
     def numbers(key: str, count: int) -> np.ndarray:

@@ -222,8 +222,9 @@ def _image_path(root: Path, frame: FrameEntry) -> Path:
     path = _below(root, written, frame.where)
     if path.suffix.lower() in SUFFIXES or path.is_file():
         return path
-    candidates = [path.with_name(path.name + ending) for suffix in SUFFIXES for ending in (suffix, suffix.upper())]
-    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
+    endings = (ending for suffix in SUFFIXES for ending in (suffix, suffix.upper()))
+    candidates = (path.with_name(path.name + ending) for ending in endings)
+    return next((candidate for candidate in candidates if candidate.is_file()), path.with_name(path.name + SUFFIXES[0]))
 
 
 def _described_size(frame: FrameEntry) -> tuple[int, int] | None:

@@ -6,6 +6,7 @@ Local letters: M (3, 4), a matrix next to an offset; colours c are shown as M[:,
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -54,36 +55,53 @@ def fitted_affine(shown: Sequence[Shown], background: Tensor, counts: Tensor | N
     """
     background = background.to(shown[0][1].rgb.device)
     identity = torch.eye(3, 4, dtype=torch.float64, device=background.device)
-    affine, equations = identity, [_equations(image, rendering, background, counts) for image, rendering in shown]
-    used: list[Tensor] = []
+    affine, sums = identity, [_sums(image, rendering, background, counts) for image, rendering in shown]
+    is_gain = torch.nn.functional.pad(identity[:, :3], (0, 1))
+    total = torch.stack([one.weight for one in sums]).sum()
+    ridge = total.clamp_min(1) * torch.diag_embed(MIXING_RIDGE + (GAIN_RIDGE - MIXING_RIDGE) * is_gain)
+    left_out: list[Tensor] = []
     for _ in range(ROUNDS):
-        before, used = used, [weight * ~((target >= SATURATED) & (x @ affine.T > 1)) for x, target, weight in equations]
-        if before and all(torch.equal(x, y) for x, y in zip(used, before, strict=True)):
+        before, left_out = (
+            left_out,
+            [one.edge_weight * (one.saturated & (one.edge[:, :4] @ affine.T > 1)) for one in sums],
+        )
+        if before and all(torch.equal(x, y) for x, y in zip(left_out, before, strict=True)):
             break  # the same equations again
-        products, sides = torch.zeros_like(identity.new_empty(3, 4, 4)), torch.zeros_like(identity)
-        total = identity.new_zeros(())
-        for (seen, target, weight), known in zip(equations, used, strict=True):
-            for channel in range(3):
-                weighted = seen * known[:, channel, None]
-                products[channel] += weighted.T @ seen
-                sides[channel] += weighted.T @ (target - seen @ identity.T)[:, channel]
-            total = total + weight.sum()
-        is_gain = torch.nn.functional.pad(identity[:, :3], (0, 1))
-        ridge = total.clamp_min(1) * torch.diag_embed(MIXING_RIDGE + (GAIN_RIDGE - MIXING_RIDGE) * is_gain)
-        affine = identity + torch.linalg.solve(products + ridge, sides)
+        products = torch.stack([one.products for one in sums]).sum(0).expand(3, 4, 7)
+        for one, weights in zip(sums, left_out, strict=True):
+            products = products - torch.einsum("pi,pc,pj->cij", one.edge[:, :4], weights, one.edge)
+        sides = products[:, :, 4:].diagonal(dim1=0, dim2=2).T
+        affine = identity + torch.linalg.solve(products[..., :4] + ridge, sides)
     return affine.float()
 
 
-def _equations(
-    image: Image, rendering: Rendering, background: Tensor, counts: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (P, 4) what M is applied to, (P, 3) what should come out, and (P, 1) weights, all float64."""
+class _Sums(NamedTuple):
+    """Sums over the pixels of an image, float64, and the B of its pixels that have a saturated channel.
+
+    Rows of seven numbers: the four that M is applied to, and what should come out less the first three of them.
+    """
+
+    weight: Tensor  # () of all pixels
+    products: Tensor  # (4, 7) weighted products of the four with all
+    edge: Tensor  # (B, 7) rows of the saturated
+    edge_weight: Tensor  # (B, 1)
+    saturated: Tensor  # (B, 3) bool, which channels are
+
+
+def _sums(image: Image, rendering: Rendering, background: Tensor, counts: Tensor | None) -> _Sums:
+    """Return the sums of the pixels that count."""
     rgb, truth = rendering.rgb[0], image.composite(background)
     ones, through = torch.ones_like(rgb[..., :1]), rendering.transmittance[0][..., None]
     if image.alpha is not None:
         rgb, truth, ones = rgb - through * background, truth - through * background, 1 - through
-    weight = torch.ones_like(through) if image.mask is None else image.mask[..., None]
-    weight = weight if counts is None else weight * counts[..., None]
-    seen = torch.cat([rgb, ones], -1)
-    counted = weight.reshape(-1) > 0
-    return tuple(x.reshape(-1, x.shape[-1])[counted].double() for x in (seen, truth, weight))  # type: ignore[return-value]
+    weight = ones.new_ones(()) if image.mask is None else image.mask
+    weight = (weight if counts is None else weight * counts).expand(ones.shape[:2]).reshape(-1, 1)
+    rows = torch.cat([rgb, ones, truth], -1).reshape(-1, 7)
+    if image.mask is not None or counts is not None:
+        counted = torch.nonzero(weight[:, 0] > 0)[:, 0]
+        rows, weight = rows[counted], weight[counted]
+    saturated = rows[:, 4:] >= SATURATED
+    rows, weight = rows.double(), weight.double()
+    rows[:, 4:] -= rows[:, :3]
+    edge = torch.nonzero(saturated.any(1))[:, 0]
+    return _Sums(weight.sum(), (weight * rows[:, :4]).T @ rows, rows[edge], weight[edge], saturated[edge])

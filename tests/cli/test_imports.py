@@ -1,0 +1,39 @@
+"""The garbage collector at imports of what is heavy."""
+
+from __future__ import annotations
+
+import gc
+import sys
+
+import pytest
+
+from dyngs.cli.imports import heavy_imports
+
+
+def test_the_collector_rests_during_imports_and_forgets_what_they_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "torch")  # as at the start of a command
+    try:
+        with heavy_imports():
+            assert not gc.isenabled()
+            kept = [[] for _ in range(10)]
+        assert gc.isenabled()
+        assert gc.get_freeze_count() > len(kept)
+    finally:
+        gc.unfreeze()
+
+
+def test_the_collector_stays_as_it_is_where_torch_is_there_already() -> None:
+    frozen = gc.get_freeze_count()
+    with heavy_imports():
+        assert gc.isenabled()
+    assert gc.get_freeze_count() == frozen
+
+
+def test_the_collector_goes_on_after_an_import_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "torch")
+    try:
+        with pytest.raises(ImportError), heavy_imports():
+            raise ImportError
+        assert gc.isenabled()
+    finally:
+        gc.unfreeze()
