@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -49,7 +50,8 @@ class Discs:
         from scipy.fft import irfft2, next_fast_len, rfft2
 
         self.radii = np.geomspace(SMALLEST, max(LARGEST * maps.shape[2], 2 * SMALLEST), SIZES)
-        shape = tuple(next_fast_len(n + math.ceil(1.7 * self.radii[-1]), real=True) for n in maps.shape[1:])
+        (height, width), edge = maps.shape[1:], math.ceil(1.7 * self.radii[-1])
+        shape = tuple(cast(int, next_fast_len(n + edge, real=True)) for n in (height, width))
         y, x = (np.minimum(i, n - i) for i, n in zip(np.indices(shape), shape, strict=True))
         away = np.hypot(y, x).astype(np.float32)
         kernels = np.empty((SIZES, shape[0], shape[1] // 2 + 1), np.complex64)
@@ -57,10 +59,10 @@ class Discs:
             disc = np.clip(radius - away + 0.5, 0, 1)
             ring = np.clip(1.6 * radius - away + 0.5, 0, 1) - np.clip(1.15 * radius - away + 0.5, 0, 1)
             kernels[k] = rfft2(disc / disc.sum() - ring / ring.sum())
-        self.values = np.empty((len(maps), SIZES, *maps.shape[1:]), np.float32)  # (T, S, H, W)
+        self.values: np.ndarray = np.empty((len(maps), SIZES, height, width), np.float32)  # (T, S, H, W)
         for values, one in zip(self.values, maps, strict=True):
-            found = irfft2(rfft2(one.astype(np.float32), shape) * kernels, shape)
-            values[:] = found[:, : maps.shape[1], : maps.shape[2]]
+            found = np.asarray(irfft2(rfft2(one.astype(np.float32), shape) * kernels, shape))
+            values[:] = found[:, :height, :width]
 
     def at(self, which: np.ndarray, pixels: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Return the (n,) values at ``pixels`` (n, 2) for discs of ``radii`` (n,) pixels, -0.2 out of the images."""
