@@ -15,11 +15,7 @@ from dyngs.ops.perceptron import Layer, perceptron
 
 
 class Decoder:
-    """A multilayer perceptron whose last layer starts at zero.
-
-    Args:
-        skip: layer whose input is the features once more, next to the hidden units.
-    """
+    """A multilayer perceptron whose last layer starts at zero; layer ``skip`` sees the features once more."""
 
     def __init__(
         self, num_inputs: int, hidden: Sequence[int], options: FieldSection, *, skip: int | None = None

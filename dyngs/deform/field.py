@@ -86,8 +86,7 @@ class DeformationField:
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         """Return the offsets at ``time`` in [0, 1] of the moving Gaussians with canonical ``means`` (M, 3), in order.
 
-        Args:
-            rows: (A,) only these of them are requested, in this order, and cost anything; None: all.
+        Only ``rows`` (A,) of them are requested, in this order, and cost anything; None: all.
         """
         raise NotImplementedError
 

@@ -27,6 +27,7 @@ from dyngs.static.training import start as start_static
 
 MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
+STEPS_PER_SHOT = 50  # Steps of the run for each: those take ten times as long as the search in one image
 
 
 def start(run: RunStart) -> GaussianModel:
@@ -71,10 +72,10 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         return [footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used]
 
     def shots(still: Gaussians) -> Shots | None:
-        order = one_camera(views)
-        if order is None or len(set(images.sizes)) > 1:
+        order, limit = one_camera(views), min(MAX_SHOTS, rates_of(config).steps // STEPS_PER_SHOT)
+        if order is None or limit == 0 or len(set(images.sizes)) > 1:
             return None
-        used = (images[order[i]] for i in evenly_spaced(len(order), MAX_SHOTS))
+        used = (images[order[i]] for i in evenly_spaced(len(order), limit))
         return shots_of(used, still, options, background, shader)
 
     return TrainingViews(

@@ -28,14 +28,11 @@ class MeasuredMotion:
 def measure_motion(
     field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor
 ) -> MeasuredMotion:
-    """Return the motion of M Gaussians over ``times``.
+    """Return the motion of M Gaussians over ``times``, of which at most ``MAX_SAMPLES`` are looked at, evenly chosen.
 
     The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size of a pixel, s being
-    the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour.
-
-    Args:
-        times: in [0, 1]; at most ``MAX_SAMPLES`` evenly chosen ones are looked at.
-        px_size: (M,) world units that one pixel covers, in the nearest training view.
+    the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the change of opacity and colour. A pixel
+    covers ``px_size`` (M,) world units in the nearest training view.
     """
     chosen = torch.linspace(0, len(times) - 1, min(len(times), MAX_SAMPLES), device="cpu").round().long().tolist()
     samples = [field.offsets(gaussians.means, times[i]) for i in chosen]

@@ -79,8 +79,7 @@ class DynamicScene(GaussianScene):
     def in_training(self, time: float, *, detach: bool) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
         """Return the Gaussians drawn at ``time``, the offsets of those of them that move, and the field's penalties.
 
-        Args:
-            detach: gradients reach the field alone, not the canonical Gaussians.
+        With ``detach`` gradients reach the field alone, not the canonical Gaussians.
         """
         if self.field is None:
             raise ValueError("nothing moves")

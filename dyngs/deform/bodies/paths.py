@@ -8,7 +8,9 @@ Local letters: T images, n candidates, K peaks, S sizes of discs.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -21,6 +23,7 @@ TRIPLES = 1500  # Candidates per middle image
 KEPT, SKIPPED = 10, 14  # Straight paths around an image, and images after which the next may follow
 FOLLOWED = 4  # Chains of straight paths
 ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7  # Of looking for the ball around its path, that many radii away
+LOOKS = 8  # Places on either side that are looked at there
 KINK, REWEIGHTED = 0.03, 4  # Second difference of a path in radii that counts in full, and rounds of weighting
 LEAST_SUPPORT = 0.28  # Contrast of a disc with its ring, mean over images, from which it is a thing
 STIFFNESS = 3.0
@@ -44,20 +47,22 @@ class Discs:
     """Mean of a map in a disc less that in the ring around it, for discs of all sizes at all pixels of T images."""
 
     def __init__(self, maps: np.ndarray) -> None:
+        from scipy.fft import irfft2, next_fast_len, rfft2
+
         self.radii = np.geomspace(SMALLEST, max(LARGEST * maps.shape[2], 2 * SMALLEST), SIZES)
-        edge = int(np.ceil(1.7 * self.radii[-1]))
-        padded = np.pad(maps, ((0, 0), (edge, edge), (edge, edge)))
-        shape = padded.shape[1:]
+        (height, width), edge = maps.shape[1:], math.ceil(1.7 * self.radii[-1])
+        shape = tuple(cast(int, next_fast_len(n + edge, real=True)) for n in (height, width))
         y, x = (np.minimum(i, n - i) for i, n in zip(np.indices(shape), shape, strict=True))
-        away = np.hypot(y, x)
-        spectrum = np.fft.rfft2(padded)
-        values = []
-        for radius in self.radii:
+        away = np.hypot(y, x).astype(np.float32)
+        kernels = np.empty((SIZES, shape[0], shape[1] // 2 + 1), np.complex64)
+        for k, radius in enumerate(self.radii):
             disc = np.clip(radius - away + 0.5, 0, 1)
             ring = np.clip(1.6 * radius - away + 0.5, 0, 1) - np.clip(1.15 * radius - away + 0.5, 0, 1)
-            kernel = np.fft.rfft2(disc / disc.sum() - ring / ring.sum())
-            values.append(np.fft.irfft2(spectrum * kernel, s=shape)[:, edge:-edge, edge:-edge])
-        self.values = np.stack(values, axis=1).astype(np.float32)  # (T, S, H, W)
+            kernels[k] = rfft2(disc / disc.sum() - ring / ring.sum())
+        self.values: np.ndarray = np.empty((len(maps), SIZES, height, width), np.float32)  # (T, S, H, W)
+        for values, one in zip(self.values, maps, strict=True):
+            found = np.asarray(irfft2(rfft2(one.astype(np.float32), shape) * kernels, shape))
+            values[:] = found[:, :height, :width]
 
     def at(self, which: np.ndarray, pixels: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Return the (n,) values at ``pixels`` (n, 2) for discs of ``radii`` (n,) pixels, -0.2 out of the images."""
@@ -72,10 +77,14 @@ class Discs:
 
     def peaks(self, index: int) -> np.ndarray:
         """Return the (K, 3) x, y and radius of the most marked discs of one image, in pixels."""
-        from scipy.ndimage import maximum_filter
-
         values = self.values[index]
-        k, y, x = np.nonzero((values == maximum_filter(values, size=(3, 5, 5))) & (values > LEAST_PEAK))
+        greatest = values.copy()
+        for axis, reach in (0, 1), (1, 2), (2, 2):
+            line, before = np.moveaxis(greatest, axis, 0), np.moveaxis(greatest.copy(), axis, 0)
+            for i in range(1, reach + 1):
+                np.maximum(line[i:], before[:-i], out=line[i:])
+                np.maximum(line[:-i], before[i:], out=line[:-i])
+        k, y, x = np.nonzero((values == greatest) & (values > LEAST_PEAK))
         best = np.argsort(-values[k, y, x] * np.sqrt(self.radii[k]), kind="stable")[:PEAKS]
         return np.stack([x[best] + 0.5, y[best] + 0.5, self.radii[k[best]]], axis=1)
 
@@ -155,13 +164,14 @@ class Start:
 def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) -> list[Pieces]:
     """Return straight paths through the most marked discs, around every other image."""
     peaks, found = [discs.peaks(i) for i in range(len(shots))], []
+    counts = np.array([len(one) for one in peaks])
+    table = np.stack([np.resize(one, (PEAKS, 3)) for one in peaks])
     for middle in range(HALF, len(shots) - HALF, 2):
-        near = [t for t in range(middle - HALF, middle + HALF + 1) if len(peaks[t])]
+        near = [t for t in range(middle - HALF, middle + HALF + 1) if counts[t]]
         if len(near) < 3:
             continue
         which = random.permuted(np.tile(near, (TRIPLES, 1)), axis=1)[:, :3]
-        ranks = random.integers(0, np.array([len(one) for one in peaks])[which])
-        picked = np.array([[peaks[t][k] for t, k in zip(*row, strict=True)] for row in zip(which, ranks, strict=True)])
+        picked = table[which, random.integers(0, counts[which])]
         centers, steps, radii = _through(shots, which, middle, picked)
         values = []
         for t in range(middle - HALF, middle + HALF + 1):
@@ -182,8 +192,10 @@ def _straight_pieces(shots: Shots, discs: Discs, random: np.random.Generator) ->
 def _chains(pieces: list[Pieces], count: int) -> list[Start]:
     """Return where chains of pieces lead, and where their best piece alone does; no two chains share a piece."""
     left, found = [piece.scores.copy() for piece in pieces], []
+    near = [[i for i in range(j) if pieces[j].middle - pieces[i].middle <= SKIPPED] for j in range(len(pieces))]
+    partings = [{i: _parting(pieces[i], pieces[j]) for i in before} for j, before in enumerate(near)]
     while len(found) < 2 * FOLLOWED and any(np.isfinite(scores).any() for scores in left):
-        chain = _best_chain(pieces, left)
+        chain = _best_chain(partings, left)
         best = max(chain, key=lambda at: left[at[0]][at[1]])
         found += [_along([(pieces[i], k) for i, k in part], count) for part in (chain, [best])]
         for i, k in chain:
@@ -191,20 +203,20 @@ def _chains(pieces: list[Pieces], count: int) -> list[Start]:
     return found
 
 
-def _best_chain(pieces: list[Pieces], scores: list[np.ndarray]) -> list[tuple[int, int]]:
+def _best_chain(partings: list[dict[int, np.ndarray]], scores: list[np.ndarray]) -> list[tuple[int, int]]:
     """Return which pieces, in order of time, have the most of ``scores`` in all less what parts them (Viterbi 1967).
 
-    Pieces must meet, but may change direction where they do, as what hops. Up to ``SKIPPED`` images may show nothing.
+    Pieces must meet, but may change direction where they do, as what hops. ``partings`` holds, for the pieces around
+    each middle image, the costs of coming from those around earlier ones.
     """
     totals = [x.copy() for x in scores]
     before: list[list[tuple[int, int] | None]] = [[None] * len(x) for x in scores]
-    for j, later in enumerate(pieces):
-        for i in range(j):
-            if later.middle - pieces[i].middle <= SKIPPED:
-                reached = totals[i][:, None] - _parting(pieces[i], later) + scores[j]
-                best = reached.argmax(0)
-                for k in np.nonzero(reached.max(0) > totals[j])[0]:
-                    totals[j][k], before[j][k] = reached[best[k], k], (i, int(best[k]))
+    for j, costs in enumerate(partings):
+        for i, cost in costs.items():
+            reached = totals[i][:, None] - cost + scores[j]
+            best = reached.argmax(0)
+            for k in np.nonzero(reached.max(0) > totals[j])[0]:
+                totals[j][k], before[j][k] = reached[best[k], k], (i, int(best[k]))
     last = int(np.argmax([total.max() for total in totals]))
     at: tuple[int, int] | None = (last, int(totals[last].argmax()))
     chain = []
@@ -272,37 +284,41 @@ def _followed(shots: Shots, discs: Discs, start: Start) -> Path:
 
     Followed outwards from there image by image, then looked for in all images at once.
     """
-    count, which, radius, centers = len(shots), np.arange(len(shots)), start.radius, start.centers
+    count, radius, centers = len(shots), start.radius, start.centers
     ways, weights = np.zeros((count, 3)), np.zeros(count)
 
-    def look(t: int, reach: float) -> None:
-        (pixel,), (depth,) = shots.projected(which[t : t + 1], centers[t : t + 1])
-        size = radius * shots.focal[t] / depth
-        far = max(1.0, reach * size)
-        grid = np.arange(-far, far + 0.1, max(0.5, far / 8))
-        shift = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-        values = discs.at(np.full(len(shift), t), pixel + shift, np.full(len(shift), size))
-        best = int(np.argmax(values - 0.15 * (shift**2).sum(1) / far**2))
-        ways[t] = shots.rays(which[t : t + 1], (pixel + shift[best])[None])[0]
-        weights[t] = max(float(values[best]), 0.0) ** 2
+    def looked(which: np.ndarray, reach: float) -> np.ndarray:
+        ways[which], weights[which] = _sighted(shots, discs, which, centers[which], radius, reach)
+        return _smooth(shots, ways, weights, radius)
 
     low, high = start.first, start.last
-    for t in range(low, high + 1):
-        look(t, REACH)
-    centers = _smooth(shots, ways, weights, radius)
+    centers = looked(np.arange(low, high + 1), REACH)
     while low > 0 or high < count - 1:
-        for t in {max(low - 1, 0), min(high + 1, count - 1)} - set(range(low, high + 1)):
-            look(t, REACH_NEW)
-        low, high = max(low - 1, 0), min(high + 1, count - 1)
-        centers = _smooth(shots, ways, weights, radius)
+        fresh = [t for t in (low - 1, high + 1) if 0 <= t < count]
+        low, high = min(low, *fresh), max(high, *fresh)
+        centers = looked(np.array(fresh), REACH_NEW)
     for turn in range(ROUNDS):
-        for t in range(count):
-            look(t, REACH)
-        centers = _smooth(shots, ways, weights, radius)
+        centers = looked(np.arange(count), REACH)
         if turn % 2:
             sizes = radius * np.geomspace(0.8, 1.25, 9)
             radius = float(sizes[np.argmax([_contrast(shots, discs, centers, size).mean() for size in sizes])])
     return Path(centers, radius, float(_contrast(shots, discs, centers, radius).mean()))
+
+
+def _sighted(
+    shots: Shots, discs: Discs, which: np.ndarray, centers: np.ndarray, radius: float, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return in ``which`` (n,) images (n, 3) directions and (n,) weights of discs up to ``reach`` radii from balls."""
+    pixels, depths = shots.projected(which, centers)
+    sizes = radius * shots.focal[which] / depths
+    side = np.linspace(-1, 1, 2 * LOOKS + 1)
+    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    looked = pixels[:, None] + grid * np.maximum(1.0, reach * sizes)[:, None, None]
+    images, radii = (np.repeat(x, len(grid)) for x in (which, sizes))
+    values = discs.at(images, looked.reshape(-1, 2), radii).reshape(len(which), -1)
+    best = (values - 0.15 * (grid**2).sum(1)).argmax(1)[:, None]
+    ways = shots.rays(which, np.take_along_axis(looked, best[..., None], 1)[:, 0])
+    return ways, np.maximum(np.take_along_axis(values, best, 1)[:, 0], 0.0) ** 2
 
 
 def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray, radius: float) -> np.ndarray:
@@ -322,11 +338,11 @@ def _smooth(shots: Shots, ways: np.ndarray, weights: np.ndarray, radius: float) 
         for j in range(i, 3):
             rays[6 + i - j, j::3] += across[:, i, j]
     rays[6] += 1e-9
-    second, stiff = np.diff(np.eye(count), n=2, axis=0), np.ones(count - 2)
+    stiff = np.ones(count - 2)
     for _ in range(REWEIGHTED):
-        bend, full = stiffness * (second.T * stiff) @ second, rays.copy()
-        for gap in range(3):
-            full[6 - 3 * gap, 3 * gap :] += np.repeat(np.diagonal(bend, gap), 3)
+        full = rays.copy()
+        for gap, taps in enumerate(([1, 4, 1], [-2, -2], [1])):  # of the squares of second differences
+            full[6 - 3 * gap, 3 * gap :] += np.repeat(stiffness * np.convolve(stiff, taps), 3)
         found = solveh_banded(full, right).reshape(count, 3)
-        stiff = np.minimum(1, KINK * radius / np.maximum(np.linalg.norm(second @ found, axis=1), 1e-12))
+        stiff = np.minimum(1, KINK * radius / np.maximum(np.linalg.norm(np.diff(found, 2, axis=0), axis=1), 1e-12))
     return found

@@ -17,13 +17,9 @@ def light_left(points: Tensor, labels: Tensor, places: Tensor, radii: Tensor, su
     """Return the (N,) parts of the light that reach ``points`` (N, 3) around balls; differentiable in the last two.
 
     A ball hides direct light from what lies behind it, near its axis, and of that from all around as much as it fills
-    of the view: the square of its radius over the distance.
-
-    Args:
-        labels: (N,) ball that each is a part of, which throws no shadow on it; -1 for none.
-        places: (B, 3) of the balls; ``radii``: (B,).
-        sun: (3,) where direct light comes from, of any length.
-        shade: (4,) as ``START``.
+    of the view: the square of its radius (B,) over the distance from its place (B, 3). The ball of ``labels`` (N,) that
+    a point is a part of, -1 for none, throws no shadow on it. Direct light comes from ``sun`` (3,), of any length;
+    ``shade`` (4,) is as ``START``.
     """
     direct, around = shade[:2].clamp(0.0, 0.95)
     size, softness = shade[2:].exp()

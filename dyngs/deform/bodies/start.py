@@ -102,7 +102,7 @@ def found_bodies(shots: Shots, limit: int, num_terms: int) -> Bodies | None:
     A body is taken if the colours of its surface, each compared with other images, agree clearly better than if it did
     not turn, and than by chance: what bends shows other colours in the same direction.
     """
-    bodies = _rigid_bodies(shots) if min(shots.size) >= SMALLEST else ()
+    bodies = _rigid_bodies(shots) if limit and min(shots.size) >= SMALLEST else ()
     if not bodies or limit < len(bodies):
         return None
     return Bodies(shots, bodies, tuple(_seeds(body, shots, limit // len(bodies), num_terms) for body in bodies))

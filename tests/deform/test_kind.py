@@ -1,0 +1,23 @@
+"""What a moving scene begins with: how much of a capture its first decisions look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import dyngs
+from dyngs.deform.training import DynamicTraining
+from dyngs.gaussians.model import GaussianModel
+from dyngs.kinds import assemble
+
+
+@pytest.mark.parametrize(("steps", "count"), [(49, None), (400, 8), (3000, 16)])
+def test_bodies_are_sought_in_as_many_images_as_the_run_is_long(moving: Path, steps: int, count: int | None) -> None:
+    """The search is to take at most a tenth of the run: of the capture's 16 images a short run looks at fewer."""
+    keys = (f"data.root={moving}", f"train.steps={steps}", "init.num_random=20")
+    model = assemble(dyngs.load_config("dynamic", keys)).model
+    assert isinstance(model, GaussianModel)
+    assert isinstance(model.training, DynamicTraining)
+    shots = model.training.capture.shots(model.scene.gaussians)
+    assert (None if shots is None else len(shots)) == count
