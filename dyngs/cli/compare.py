@@ -29,8 +29,8 @@ def add_parser(commands: args.Commands) -> None:
         "compare",
         run,
         "train several models on one capture with the same time, steps or size, and compare them",
-        "Train each model on the same views, evaluate all on the same held-out ones. Writes comparison.csv, .md, a page "
-        "with synchronised crops (.html) and, with the extra plots, quality over seconds (.svg, .png).",
+        "Train each model on the same views and evaluate all on the same held-out ones. Writes comparison.csv, .md, a "
+        "page with synchronised crops (.html) and, with the extra plots, quality over seconds (.svg, .png).",
         _EPILOG,
     )
     parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help="capture with cameras, in any format")

@@ -23,7 +23,7 @@ def require_same_comparison(bench: Bench, plan: Plan) -> None:
     limit = bench.limit
     facts = {
         "capture": str(bench.capture),
-        "models": [entry.name for entry in plan.entries] + list(plan.left_out),
+        "models": sorted([*(entry.name for entry in plan.entries), *plan.left_out]),
         "minutes": limit.minutes,
         "steps": limit.steps,
         "max_mb": limit.max_mb,

@@ -25,7 +25,7 @@ function pixelsOf(image) {
 
 // Mean difference of the channels times gain, from black over red and yellow to white.
 function errorOf(truth, model, gain) {
-  const result = pixelsOf(truth.canvas.image), out = result.data.data, a = truth.data.data, b = model.data.data;
+  const result = pixelsOf(truth.image), out = result.data.data, a = truth.data.data, b = model.data.data;
   for (let i = 0; i < out.length; i += 4) {
     const mean = (Math.abs(a[i] - b[i]) + Math.abs(a[i + 1] - b[i + 1]) + Math.abs(a[i + 2] - b[i + 2])) / 765;
     const heat = Math.min(1, gain * mean) * 3;
@@ -103,7 +103,6 @@ async function show(index) {
   const images = await Promise.all([view.truth, ...view.models.map((model) => model.image)].map(loaded));
   if (number !== shown) return; // another view was asked for meanwhile
   const [truth, ...models] = images.map((image) => Object.assign(pixelsOf(image), { image }));
-  truth.canvas.image = truth.image;
   size = [truth.canvas.width, truth.canvas.height];
   byId("panels").replaceChildren();
   panels = [];

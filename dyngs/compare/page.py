@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dyngs.compare.plan import Bench
-from dyngs.compare.result import TRUTH, Result
+from dyngs.compare.result import MEASURED, TRUTH, Result
 from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.study.tables import html_table
 
@@ -26,8 +26,7 @@ def page_text(
     """Return the page; ``parts``: what all had the same of, head and cells of the table, and the plot as SVG or ""."""
     about, head, cells, svg = parts
     style, script = (_file(f"page.{suffix}") for suffix in ("css", "js"))
-    own = {result.name for result in results}
-    foreign = [row["model"] not in own or row["source"] != rows[0]["source"] for row in rows]
+    foreign = [row["source"] != MEASURED for row in rows]
     plot = "" if not svg else f'<img class="plot" alt="PSNR over seconds of training" src="{_data("svg+xml", svg)}">'
     missing = "".join(f"<p>Left out: <b>{escape(n)}</b>: {escape(why)}</p>" for n, why in left_out.items())
     note = "<p>Shaded rows are figures of others, not measured here; their protocols may differ.</p>"

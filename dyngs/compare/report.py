@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dyngs.compare.page import page_text
 from dyngs.compare.peers import NUMBERS, Peer
 from dyngs.compare.plan import Bench
-from dyngs.compare.result import Result
+from dyngs.compare.result import MEASURED, Result
 from dyngs.files.write import atomic_file, write_text
 from dyngs.study.plots import can_plot, png_of, svg_of
 from dyngs.study.tables import csv_text, markdown_table
@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STEM = "comparison"
-_LABELS = {"psnr": ("PSNR dB", ".2f"), "ssim": ("SSIM", ".4f"), "lpips": ("LPIPS", ".4f")}
-_LABELS |= {"psnr_foreground": ("foreground dB", ".2f"), "psnr_moving": ("moving dB", ".2f"), "fps": ("fps", ".1f")}
+_LABELS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".4f"), "lpips": ("LPIPS", ".4f")}
+_LABELS |= {"psnr_foreground": ("foregr.", ".2f"), "psnr_moving": ("moving", ".2f"), "fps": ("fps", ".1f")}
 _LABELS |= {"mb": ("MB", ".2f"), "gaussians": ("Gaussians", ",.0f"), "steps": ("steps", ",.0f")}
-_LABELS |= {"seconds": ("training s", ".0f")}
-HERE = "measured here"
+_LABELS |= {"seconds": ("s", ".0f")}
 
 
 def table_rows(results: Sequence[Result], peers: Sequence[Peer]) -> list[dict[str, Any]]:
@@ -35,19 +34,17 @@ def table_rows(results: Sequence[Result], peers: Sequence[Peer]) -> list[dict[st
 def _row(result: Result) -> dict[str, Any]:
     fps = None if result.speed is None else 1e3 / result.speed.ms.median
     values = {key: fps if key == "fps" else getattr(result, key) for key in NUMBERS}
-    return {"model": result.name, "source": HERE} | values
+    return {"model": result.name, "source": MEASURED} | values
 
 
 def table_cells(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Return head and cells for people: without columns that nobody has; the source where not all are from here."""
+    """Return head and cells for people, without columns that nobody has; figures of others say whose they are."""
     shown = [key for key in NUMBERS if any(row[key] is not None for row in rows)]
-    foreign = any(row["source"] != HERE for row in rows)
-    head = ["model", *(_LABELS[key][0] for key in shown), *(["source"] if foreign else [])]
+    head = ["model", *(_LABELS[key][0] for key in shown)]
     cells = [
         [
-            str(row["model"]),
+            row["model"] if row["source"] == MEASURED else f"{row['model']} ({row['source']}, not measured here)",
             *("-" if row[key] is None else format(row[key], _LABELS[key][1]) for key in shown),
-            *([str(row["source"])] if foreign else []),
         ]
         for row in rows
     ]
@@ -56,7 +53,8 @@ def table_cells(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list
 
 def about(bench: Bench, results: Sequence[Result]) -> str:
     """Return what all models had the same of, in a line."""
-    return f"{bench.capture.name}: {bench.limit} each, {results[0].num_views} held-out views (split {bench.split})"
+    views = f"{results[0].num_views} held-out views (split {bench.split})"
+    return f"{bench.capture.name}: {bench.limit} each, {views}; PSNR in dB, seconds of training"
 
 
 def write_report(
@@ -83,6 +81,7 @@ def write_report(
 def _curves(results: Sequence[Result]) -> Figure:
     """Return quality over seconds, logarithmic, a line per model."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     figure = Figure(figsize=(9, 4.6), layout="constrained")
     axes = figure.subplots()
@@ -92,6 +91,9 @@ def _curves(results: Sequence[Result]) -> Figure:
     axes.set_xscale("log")
     axes.grid(color="#e4e4e4")
     axes.set_title("PSNR of some held-out views while training", loc="left", fontweight="bold")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.6g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("seconds of training, logarithmic")
     axes.set_ylabel("dB")
     axes.legend(frameon=False)
