@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -110,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _bench(arguments: argparse.Namespace) -> Bench:
     from dyngs.compare.plan import Bench, Limit
 
-    capture = arguments.capture.absolute()
+    capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
     return Bench(
         capture=capture,
         out=(arguments.out or Path("compare", capture.name)).absolute(),

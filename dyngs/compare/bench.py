@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 
 from dyngs.api.train import num_cores
 from dyngs.compare.plan import Bench, Plan
@@ -70,10 +71,20 @@ def compare(
         found[entry.name] = result
         say(f"{entry.name} ({place}): {result.psnr:.2f} dB, {result.steps:,} steps in {result.seconds:.0f} s")
     if not found:
+        _leave_nothing(bench, plan)
         name, problem = next(iter(left_out.items()))
         raise DyngsError(f"no model could be trained; {name}: {problem}")
     results = [found[entry.name] for entry in plan.entries if entry.name in found]
     return _timed(measured, results), left_out
+
+
+def _leave_nothing(bench: Bench, plan: Plan) -> None:
+    """Remove what a comparison that came to nothing has noted, so that another one can begin in its folder."""
+    for path in (bench.out / STUDY_NAME, *(bench.said_path(entry.name) for entry in plan.entries)):
+        path.unlink(missing_ok=True)
+    for folder in (bench.out / "said", bench.out / "runs"):
+        with suppress(OSError):  # it holds a run that began
+            folder.rmdir()
 
 
 def _timed(measured: Measured, results: list[Result]) -> list[Result]:

@@ -73,6 +73,10 @@ class Bench:
     def run_dir(self, name: str) -> Path:
         return self.out / "runs" / name
 
+    def said_path(self, name: str) -> Path:
+        """What training said, but for its progress."""
+        return self.out / "said" / f"{name}.txt"
+
     def result_path(self, name: str) -> Path:
         return self.out / "results" / f"{name}.json"
 

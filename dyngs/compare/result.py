@@ -97,8 +97,9 @@ class Measured:
     def _train(self, entry: Entry) -> None:
         limit, folder = self.bench.limit, self.bench.run_dir(entry.name)
         curve = QualityCurve(self.bench.split, None if limit.minutes is None else 60 * limit.minutes)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with (folder.parent / f"{entry.name}.txt").open("a", encoding="utf-8") as said, redirect_stdout(said):
+        said_path = self.bench.said_path(entry.name)
+        said_path.parent.mkdir(parents=True, exist_ok=True)
+        with said_path.open("a", encoding="utf-8") as said, redirect_stdout(said):
             finished(entry.config, folder, [curve])
 
     def _result(self, entry: Entry) -> Result:

@@ -167,6 +167,17 @@ def test_captures_on_which_nothing_can_be_compared(
     assert not out.exists()
 
 
+def test_a_comparison_that_comes_to_nothing_leaves_nothing(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["compare", str(capture), "--models", "static", "--minutes", "0.0001", "--out", str(out)]) == 2
+    said = capsys.readouterr()
+    assert "no model could be trained; static: train.minutes=0.0001: about" in said.err
+    assert "static (1 of 1): left out" in said.out
+    assert not out.exists()
+
+
 def test_to_the_same_size(capture: Path, tmp_path: Path) -> None:
     words = ["--models", "static", "--max-mb", "0.05", *OPTIONS[2:], "train.steps=20", "--out", str(tmp_path / "out")]
     assert main(["compare", str(capture), *words]) == 0
