@@ -99,6 +99,7 @@ class Measured:
         curve = QualityCurve(self.bench.split, None if limit.minutes is None else 60 * limit.minutes)
         said_path = self.bench.said_path(entry.name)
         said_path.parent.mkdir(parents=True, exist_ok=True)
+        print(f"training {entry.name}: {limit}", flush=True)
         with said_path.open("a", encoding="utf-8") as said, redirect_stdout(said):
             finished(entry.config, folder, [curve])
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from refused import error_line
+from toy_kind import registered
 
 from dyngs.cli import main
 from dyngs.compare import result
@@ -165,6 +166,20 @@ def test_captures_on_which_nothing_can_be_compared(
     words = ("--models", "static", "--steps", "3", "--out", str(out))
     assert part in error_line(capsys, "compare", str(folder), *words)
     assert not out.exists()
+
+
+def test_what_is_not_made_of_gaussians_takes_part(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, out = tmp_path / "grid.yaml", tmp_path / "out"
+    own.write_text("model:\n  kind: toy\n")
+    with registered():
+        words = ["compare", str(capture), "--models", str(own), "--out", str(out)]
+        assert "has no Gaussians that could be limited" in error_line(capsys, *words, "--max-mb", "1")
+        assert main([*words, "--steps", "20", "--threads", "1"]) == 0
+    stored = json.loads((out / "results" / "grid.json").read_text())
+    assert (stored["kind"], stored["gaussians"], stored["steps"]) == ("toy", 0, 20)
+    assert len(stored["curve"]) == 2
 
 
 def test_a_comparison_that_comes_to_nothing_leaves_nothing(
