@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.tables import numbers_table, print_tables
-from dyngs.errors import counted
+from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
     from dyngs.compare.plan import Bench
@@ -38,7 +38,7 @@ def add_parser(commands: args.Commands) -> None:
     args.add_overrides(parser, "key=value", "overrides for all models")
     names = "presets and YAML files, separated by commas"
     parser.add_argument("--models", type=_names, required=True, metavar="A,B,...", help=names)
-    limit = parser.add_mutually_exclusive_group(required=True)
+    limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--minutes", type=_positive, metavar="M", help="train each for so many minutes")
     limit.add_argument("--steps", type=args.whole("a number of steps", 1, 10**8), metavar="N", help="or so many steps")
     limit.add_argument("--max-mb", type=_positive, metavar="MB", help="or to a file of at most so many 1e6 bytes")
@@ -111,6 +111,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _bench(arguments: argparse.Namespace) -> Bench:
     from dyngs.compare.plan import Bench, Limit
 
+    if arguments.minutes is None and arguments.steps is None and arguments.max_mb is None:
+        raise DyngsError("say what all models get the same of: --minutes M, --steps N or --max-mb MB")
     capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
     return Bench(
         capture=capture,

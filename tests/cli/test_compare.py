@@ -126,7 +126,7 @@ def test_what_was_stopped_goes_on(
         ("--models statik --steps 3", "statik: no such preset (did you mean 'static'?)"),
         ("--models static,static --steps 3", "two models called static"),
         ("--models static,,mip --steps 3", "has an empty name"),
-        ("--models static", "one of the arguments --minutes --steps --max-mb is required"),
+        ("--models static", "say what all models get the same of: --minutes M, --steps N or --max-mb MB"),
         ("--models static --steps 3 --minutes 2", "not allowed with"),
         ("--models dynamic,human,human_predictor --steps 3", "none of the models can be trained on"),
         ("--models static --steps 3 train.steps=9", "the comparison sets this itself"),
