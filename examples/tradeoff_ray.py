@@ -12,17 +12,17 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
-import ray
+from dyngs.study.runs import done_in_turn
 
 
-@ray.remote
-def measured(run: str, words: list[str]) -> tuple[str, int, str]:
-    """Return the run, the exit code of its sweep, and its last line of output."""
+def measured(words: list[str], run: str) -> tuple[int, str]:
+    """Return the exit code of the sweep of a run, and its last line of output."""
     command = [sys.executable, "-m", "dyngs", "tradeoff", run, *words]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    return run, done.returncode, (done.stdout.strip().splitlines() or [""])[-1]
+    return done.returncode, (done.stdout.strip().splitlines() or [""])[-1]
 
 
 def main() -> int:
@@ -33,13 +33,10 @@ def main() -> int:
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
     arguments, words = parser.parse_args(sys.argv[1:split]), [*sys.argv[split + 1 :]]
     words += ["--threads", str(arguments.cpus)]
-    ray.init()
-    task = measured.options(num_cpus=arguments.cpus)
-    waiting = [task.remote(str(run.absolute()), words) for run in arguments.runs]
+    runs = [str(run.absolute()) for run in arguments.runs]
     failed = False
-    while waiting:
-        (ready,), waiting = ray.wait(waiting)
-        run, code, said = ray.get(ready)
+    for run, result in done_in_turn(partial(measured, words), runs, arguments.cpus):
+        code, said = result if isinstance(result, tuple) else (2, str(result))
         failed |= code != 0
         print(f"{run}: {said}", flush=True)
     return int(failed)

@@ -40,6 +40,7 @@ VERBS = (
     "doctor",
     "predict",
     "tradeoff",
+    "compare",
     "config",
     "docs",
     "completion",

@@ -41,6 +41,7 @@ from dyngs.errors import DyngsError, counted
 from dyngs.files.write import write_text
 from dyngs.gaussians.schedule import rate_factors
 from dyngs.kinds import GaussianTrainer, assemble, with_points
+from dyngs.models.kind import kind_of
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
@@ -104,14 +105,16 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     The capture is returned with the points that the scene begins with.
 
     Raises:
-        DyngsError: images that cannot be read, or a capture without times for a scene that is to move.
+        DyngsError: images that cannot be read, or a capture that this kind of model cannot be trained on.
         KeyboardInterrupt: during small runs; nothing has been written.
     """
+    problem = kind_of(config.model).refusal(capture)
+    if problem is not None:
+        raise DyngsError(f"{config.data.root}: {problem}")
     settings, plain_config = _settings(config), _without_auto(config)
     base = best = plain_config
     match plain_config.model:
         case DynamicModel() as model:
-            _require_times(config, capture.splits["train"])
             moves = _motion_of_fixed_cameras(capture, config) if model.choose else True
             asks = model.choose and moves and not model.deform.model_fields_set
             if asks and _views_at_once(capture) >= FREE_VIEWS:
@@ -383,12 +386,3 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
     said = "something moves" if moves else "nothing moves, trained as a static scene"
     print(f"{said}: {fraction:.2%} of the pixels of fixed cameras differ from their median", flush=True)
     return moves
-
-
-def _require_times(config: Config, views: Sequence[View]) -> None:
-    """Raise an error unless the views were taken at two times or more."""
-    if len({view.time for view in views}) < 2:
-        raise DyngsError(
-            f"{config.data.root}: the images have no times, so nothing can move; train configs/static.yaml, or add a "
-            "time to each image (docs/formats.md), or give data.times=order if their names are in the order of time"
-        )

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from itertools import count as counted_from
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -31,7 +31,7 @@ from dyngs.data.read import read_capture, require_folder
 from dyngs.errors import DyngsError, as_word, counted
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.fit.fitted_capture import with_fitted_body
-from dyngs.kinds import GaussianTrainer, build
+from dyngs.kinds import build
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
@@ -219,14 +219,11 @@ class _Run:
         if resumed is not None:
             trainer.restore(resumed)
             watch.pause(-seconds_at(folder, resumed.info.step))
-        self.limited = (
-            LimitedRun(folder, config, self.loop, cast(GaussianTrainer, trainer))
-            if config.model.made_of_gaussians
-            else None
-        )
+        self.limited = LimitedRun(folder, config, self.loop, trainer) if isinstance(trainer, Trainer) else None
         self._config, self._saved = config, self.loop.trainer.done
-        if self.limited is not None:
-            _tell_memory(self.limited.trainer, processes.local_size)
+        self._gaussians = self.limited if config.model.made_of_gaussians else None
+        if self._gaussians is not None:
+            _tell_memory(self._gaussians.trainer, processes.local_size)
         self._meter: CostMeter | None = None
         if self.limited is not None:
             self._set_limits(self.limited, resumed)
@@ -249,14 +246,14 @@ class _Run:
             Interrupts() as interrupts,
         ):
             measures = [] if self._meter is None else [self._meter]
-            limited = self.limited
-            if limited is not None:
-                loop.subscribe(FloaterRemoval(loop, lambda: limited.trainer))
+            gaussians = self._gaussians
+            if gaussians is not None:
+                loop.subscribe(FloaterRemoval(loop, lambda: gaussians.trainer))
             loop.subscribe(
                 self._leader, *measures, *self.limits.values(), log, progress, *listeners, self._save_and_evaluate
             )
-            if limited is not None:
-                loop.subscribe(PruneStage(loop, lambda: limited.trainer))
+            if gaussians is not None:
+                loop.subscribe(PruneStage(loop, lambda: gaussians.trainer))
             try:
                 loop.run(lambda: interrupts.requested)
             finally:
@@ -296,7 +293,7 @@ class _Run:
                 save=self._save,
                 on_refit=(lambda: None) if speed is None else speed.hold,
             )
-            self._meter = CostMeter(run, wanted) if resumed is None else None
+            self._meter = CostMeter(run, wanted) if resumed is None and self._gaussians is not None else None
         count = count_limit(run)
         if count is not None:
             self.limits[_COUNT] = count
@@ -371,7 +368,7 @@ class _Run:
             yield self.limits[_SPEED].reached()
 
 
-def _tell_memory(trainer: GaussianTrainer, processes: int) -> None:
+def _tell_memory(trainer: Trainer[Any], processes: int) -> None:
     """Print how much memory a run will take, and a warning where that is likely to be more than is there."""
     for forecast in memory_forecasts(trainer, processes):
         print(forecast, flush=True)

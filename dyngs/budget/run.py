@@ -6,14 +6,15 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from dyngs.config import Config
-from dyngs.kinds import GaussianTrainer
 from dyngs.prune.stage import quality_of
 from dyngs.training.events import Message, TopologyChanged
 from dyngs.training.loop import Loop
+from dyngs.training.trainer import Trainer
 
 STAGES = (0.7, 0.9)
 """Fractions of a run after which Gaussians are removed where that is needed, with steps left for the others to
@@ -33,7 +34,7 @@ class LimitedRun:
     folder: Path
     config: Config
     loop: Loop
-    trainer: GaussianTrainer
+    trainer: Trainer[Any]
     given: float = math.inf
     reserve: float = 0.0
 
@@ -46,7 +47,7 @@ class LimitedRun:
     def stage(self) -> int:
         return stage(self.config, self.trainer.done, self.used / self.given)
 
-    def exchange(self, trainer: GaussianTrainer) -> None:
+    def exchange(self, trainer: Trainer[Any]) -> None:
         self.trainer = self.loop.trainer = trainer
 
     def remove(self, kept: Tensor) -> tuple[float, float]:

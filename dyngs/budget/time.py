@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from torch import Tensor
 
@@ -16,10 +17,11 @@ from dyngs.budget.run import LimitedRun, two_digits
 from dyngs.config import Config
 from dyngs.deform.schedule import motion_begins_after
 from dyngs.errors import DyngsError, counted
-from dyngs.kinds import GaussianTrainer, assemble
+from dyngs.kinds import assemble
 from dyngs.runs.config_file import write_config
 from dyngs.training.clock import Forecast, with_steps
 from dyngs.training.events import Event, StepDone
+from dyngs.training.trainer import Trainer
 
 FEWEST_STEPS = 200
 """Fewest steps that must fit; otherwise the run is refused."""
@@ -127,7 +129,7 @@ class Deadline:
         run.loop.expect(run.config.total_steps)
 
 
-def first_fit(config: Config, trainer: GaussianTrainer, used: float) -> Config:
+def first_fit(config: Config, trainer: Trainer[Any], used: float) -> Config:
     """Return ``config`` with as many steps as fit, at most its own, by the measured rate of a copy of ``trainer``.
 
     ``used``: seconds that are not there for steps, up to now and at the end.
@@ -161,13 +163,13 @@ def first_fit(config: Config, trainer: GaussianTrainer, used: float) -> Config:
     return with_steps(config, found)
 
 
-def refitted(trainer: GaussianTrainer, config: Config) -> GaussianTrainer:
+def refitted(trainer: Trainer[Any], config: Config) -> Trainer[Any]:
     """Return a trainer that is where ``trainer`` is, but on the schedules of ``config``."""
     fitted = assemble(config, trainer.capture, restored=True, images=trainer.images)
     fitted.bad_gradients = trainer.bad_gradients
     fitted.restore(trainer.checkpoint())
     step = trainer.done + 1
-    fitted.model.training.extend(fitted.model.scene, trainer.model.training.window(step), step)
+    fitted.model.extend(trainer.model.window(step), step)
     return fitted
 
 

@@ -24,6 +24,7 @@ from typing import Any, NoReturn, TextIO
 from dyngs import __version__
 from dyngs.cli import (
     bench,
+    compare,
     completion,
     config,
     convert,
@@ -155,7 +156,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    running = (demo, train, prune, predict, evaluate, render, view, export, convert, tradeoff, data, bench)
+    running = (demo, train, prune, predict, evaluate, render, view, export, convert, tradeoff, compare, data, bench)
     for module in (*running, config, docs, completion, doctor):
         module.add_parser(commands)
     return parser

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
+from dyngs.cli.tables import numbers_table, print_tables
 from dyngs.errors import DyngsError, counted
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ examples:
 
 An interrupted or repeated command continues and measures only what is missing. Details: docs/tradeoff.md.
 """
-_WIDTH = 100
-"""Columns of the tables where there is no terminal."""
 
 
 def add_parser(commands: args.Commands) -> None:
@@ -63,6 +61,7 @@ def add_parser(commands: args.Commands) -> None:
     goal.add_argument("--maximize", metavar="METRIC", help="likewise (default psnr)")
     args.add_threads(parser)
     args.add_device(parser)
+    args.add_ray(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -78,10 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
+    from dyngs.study.plots import MISSING, can_plot
     from dyngs.tradeoff.pareto import exchange_rates
-    from dyngs.tradeoff.plot import MISSING, can_plot
     from dyngs.tradeoff.report import EXCHANGE_HEAD, exchange_cells, write_report
     from dyngs.tradeoff.sweep import Plan, sweep
     from dyngs.tradeoff.table import choose, parse_goal, parse_requirements, table_rows
@@ -101,16 +98,16 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.split,
         arguments.rounds,
         args.computing_device(arguments.device),
+        arguments.ray,
     )
     try:
         measurements = sweep(runs, plan, print)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished measurements are kept; the same command continues") from None
     files = write_report(runs.out, measurements)
-    console, rows = Console(width=None if sys.stdout.isatty() else _WIDTH), table_rows(measurements)
-    console.print(_variants_table(rows, measurements))
-    rates = exchange_rates(measurements[0], measurements)
-    console.print(_table("each setting alone", EXCHANGE_HEAD, [exchange_cells(rate) for rate in rates]))
+    rows, rates = table_rows(measurements), exchange_rates(measurements[0], measurements)
+    alone = numbers_table("each setting alone", EXCHANGE_HEAD, [exchange_cells(rate) for rate in rates])
+    print_tables(_variants_table(rows, measurements), alone)
     print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")
     if not can_plot():
         print(f"note: {MISSING}")
@@ -127,7 +124,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _trained(arguments: argparse.Namespace) -> Path:
     """Train a config to its end; return the run folder."""
     from dyngs.config.io import find_preset, load_config
-    from dyngs.tradeoff.variant_runs import finished
+    from dyngs.study.runs import finished
 
     try:
         config = find_preset(Path(arguments.target))
@@ -150,16 +147,6 @@ def _variants_table(rows: Sequence[TableRow], measurements: Sequence[Measurement
         quality = (f"{row.psnr:.2f}", f"{row.ssim:.4f}", *(lpips for _ in optional))
         name = f"{'* ' if row.on_front else '  '}{row.name}"
         cells.append((name, *quality, f"{row.fps:.1f}", f"{row.gain:.2f}", f"{row.mb:.2f}", memory))
-    return _table(f"{counted(measurements[0].num_views, 'view')}; * Pareto front of PSNR, speed and size", head, cells)
-
-
-def _table(title: str, head: Sequence[str], cells: Sequence[Sequence[str]]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(head[0], title=title, box=box.SIMPLE_HEAD)
-    for name in head[1:]:
-        table.add_column(name, justify="right")
-    for row in cells:
-        table.add_row(*row)
-    return table
+    return numbers_table(
+        f"{counted(measurements[0].num_views, 'view')}; * Pareto front of PSNR, speed and size", head, cells
+    )

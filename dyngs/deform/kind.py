@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dyngs.config import DynamicModel
+from dyngs.data.capture import Capture
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.shots import Shots, one_camera, shots_of
 from dyngs.deform.fixed_cameras.changes import Footage, footage_of
@@ -28,6 +29,16 @@ from dyngs.static.training import start as start_static
 MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
 STEPS_PER_SHOT = 50  # Steps of the run for each: those take ten times as long as the search in one image
+
+
+def refusal(capture: Capture) -> str | None:
+    """Return why nothing can move in a capture; None: it has images of two times or more."""
+    if len({view.time for view in capture.splits["train"]}) > 1:
+        return None
+    return (
+        "the images have no times, so nothing can move; train configs/static.yaml, or add a time to each image "
+        "(docs/formats.md), or give data.times=order if their names are in the order of time"
+    )
 
 
 def start(run: RunStart) -> GaussianModel:

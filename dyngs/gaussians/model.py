@@ -194,6 +194,9 @@ class GaussianModel(Model[GaussianScene]):
     def window(self, step: int) -> tuple[float, float]:
         return self.training.window(step)
 
+    def extend(self, seen: tuple[float, float], step: int) -> None:
+        self.training.extend(self._scene, seen, step)
+
     def update(self, step: int) -> Updated:
         before, generator = self._optimizer.parameters, self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)

@@ -40,8 +40,8 @@ class Kind:
     """A kind of model."""
 
     section: type[ModelSection]  # class of its configuration
-    # module with its ``start`` and ``restore``, and ``trainer`` of a network; imported when first needed, so that
-    # reading a configuration imports no model
+    # module with its ``start`` and ``restore``, ``trainer`` of a network, and ``refusal`` where it cannot take every
+    # capture; imported when first needed, so that reading a configuration imports no model
     home: str
 
     def start(self, start: RunStart) -> Model[Any]:
@@ -51,6 +51,11 @@ class Kind:
     def restore(self, model: ModelSection, checkpoint: Checkpoint) -> Renderable:
         """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
         return import_module(self.home).restore(model, checkpoint)
+
+    def refusal(self, capture: Capture) -> str | None:
+        """Return why it cannot be trained on ``capture``, to follow its folder and a colon; None: it can."""
+        refusal = getattr(import_module(self.home), "refusal", None)
+        return None if refusal is None else refusal(capture)
 
     def trainer(self, config: Config) -> Any:
         """Return what the loop steps, of a network, which is not trained on one capture."""

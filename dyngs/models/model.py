@@ -104,6 +104,9 @@ class Model(ABC, Generic[S_co]):
         """Return the first and last time that are trained on at ``step``."""
         return 0.0, 1.0
 
+    def extend(self, seen: tuple[float, float], step: int) -> None:
+        """Continue what was learned for the times in ``seen`` to those that are trained on at ``step``."""
+
     @property
     def rasterize_mode(self) -> RasterizeMode:
         """How other programs are to draw it."""

@@ -2,53 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import fmean, median
-from typing import Annotated
+from statistics import fmean
 
-import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic import TypeAdapter
 
 from dyngs.config import SceneModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError, reading, require_regular
-from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
-from dyngs.files.write import write_text
+from dyngs.errors import DyngsError
+from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import render_options
 from dyngs.metrics import Lpips, psnr, ssim
+from dyngs.study.speed import Speed
+from dyngs.study.stored import AS_STORED, read_stored, write_stored
 from dyngs.tradeoff.variants import Variant
-
-_Measured = Annotated[float, Field(gt=1e-9)]
-"""Milliseconds, or a gain: a smaller number is none that was measured."""
-_AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-@dataclass(frozen=True)
-class Quartiles:
-    """Median, lower and upper quartile."""
-
-    __pydantic_config__ = _AS_STORED
-    median: _Measured
-    low: _Measured
-    high: _Measured
-
-
-@dataclass(frozen=True)
-class Speed:
-    """Rendering speed, with deformation and upscaling.
-
-    Attributes:
-        ms: milliseconds per image.
-        gain: speed relative to the run itself, over pairs of renders taken right after each other.
-    """
-
-    ms: Quartiles
-    gain: Quartiles
 
 
 @dataclass(frozen=True)
@@ -62,7 +33,7 @@ class Measurement:
         speed: None until it is measured.
     """
 
-    __pydantic_config__ = _AS_STORED
+    __pydantic_config__ = AS_STORED
     variant: Variant
     num_views: int
     psnr: float
@@ -83,14 +54,11 @@ _STORED = TypeAdapter(Measurement)
 
 
 def read_measurement(path: Path) -> Measurement:
-    with reading(path, "it is no measurement of a variant: remove it to have it measured again"):
-        require_regular(path)
-        return _STORED.validate_json(path.read_bytes())
+    return read_stored(path, _STORED, "measurement of a variant")
 
 
 def write_measurement(path: Path, measurement: Measurement) -> None:
-    values = asdict(measurement) | {"variant": measurement.variant.changes}
-    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+    write_stored(path, asdict(measurement) | {"variant": measurement.variant.changes})
 
 
 def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
@@ -131,14 +99,3 @@ def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> 
         distances.append(lpips(rendered, truth, image.mask).value)
     known = [x for x in distances if x is not None]
     return fmean(psnrs), fmean(ssims), fmean(known) if len(known) == len(distances) else None
-
-
-def time_interleaved(drawings: Sequence[Drawing], images: Sequence[Image], rounds: int) -> list[Speed]:
-    """Return the speed of each drawing, relative to the first one; arguments as for ``seconds_in_turn``."""
-    seconds = seconds_in_turn(drawings, images, rounds)
-    return [Speed(ms=quartiles(1e3 * own), gain=quartiles(seconds[0] / own)) for own in seconds]
-
-
-def quartiles(values: np.ndarray) -> Quartiles:
-    low, high = np.percentile(values, [25, 75])
-    return Quartiles(float(median(values)), float(low), float(high))

@@ -1,11 +1,8 @@
-"""Plot of a sweep: PSNR against speed and against size; drawn by matplotlib, of the extra ``plots``."""
+"""Plot of a sweep: PSNR against speed and against size; see ``dyngs.study.plots``."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
-from html import escape
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from dyngs.tradeoff.measure import pareto_mask
@@ -15,12 +12,6 @@ from dyngs.tradeoff.variants import SEVERAL
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'"
-
-
-def can_plot() -> bool:
-    return find_spec("matplotlib") is not None
 
 
 def plot(rows: Sequence[TableRow]) -> Figure:
@@ -53,26 +44,6 @@ def plot(rows: Sequence[TableRow]) -> Figure:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
     return figure
-
-
-def svg_of(figure: Figure) -> str:
-    """Return a figure as an SVG element, whose points have their labels as tooltips; equal figures give equal text."""
-    import matplotlib
-
-    file = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": "dyngs", "svg.fonttype": "none"}):
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    text = file.getvalue()
-    text = text[text.index("<svg") :]
-    for tip in {str(line.get_gid()) for axes in figure.axes for line in axes.lines if line.get_gid()}:
-        text = text.replace(f'<g id="{tip}">', f"<g><title>{escape(tip)}</title>")
-    return text
-
-
-def png_of(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=200, metadata={"Software": None})
-    return file.getvalue()
 
 
 def _draw_panel(

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from html import escape
 from pathlib import Path
 
 from dyngs.files.write import atomic_file, write_text
+from dyngs.study.plots import can_plot, png_of, svg_of
+from dyngs.study.tables import STYLE, csv_text, html_table
 from dyngs.tradeoff.measure import Measurement
 from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates
-from dyngs.tradeoff.plot import can_plot, plot, png_of, svg_of
+from dyngs.tradeoff.plot import plot
 from dyngs.tradeoff.table import TableRow, table_rows
 
 STEM = "tradeoff"
-_STYLE = """\
-body { font: 14px sans-serif; max-width: 1060px; margin: 24px auto; }
-table { border-collapse: collapse; margin: 16px 0; }
-td, th { padding: 2px 10px; text-align: right; border-bottom: 1px solid #ddd; }
-td:first-child, th:first-child { text-align: left; }
-.front { background: #eef5ff; }
-"""
 _UNDER_PLOT = (
     "<p>Thick lines: Pareto fronts of the two axes. Thin lines: the values of one setting in their order. "
     "Hover over a point for its name.</p>"
@@ -41,17 +33,13 @@ def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
     rows, rates = table_rows(measurements), exchange_rates(measurements[0], measurements)
     figure = plot(rows) if can_plot() else None
     svg = "" if figure is None else svg_of(figure)
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(rows[0].columns), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row.columns for row in rows)
     values = {
         "points": [row.columns | {"changes": row.variant.changes} for row in rows],
         "exchange_rates": [asdict(rate) for rate in rates],
         "num_views": measurements[0].num_views,
     }
     texts = {
-        "csv": table.getvalue(),
+        "csv": csv_text([row.columns for row in rows]),
         "json": json.dumps(values, indent=2, allow_nan=False) + "\n",
         "html": _page(rows, rates, svg),
     }
@@ -85,22 +73,16 @@ def _cells(row: TableRow) -> tuple[str, ...]:
 
 
 def _page(rows: Sequence[TableRow], rates: Sequence[ExchangeRate], svg: str) -> str:
-    rate_lines = [_line("th", EXCHANGE_HEAD), *(_line("td", exchange_cells(rate)) for rate in rates)]
-    lines = [_line("th", _HEAD), *(_line("td", _cells(row), front=row.on_front) for row in rows)]
+    front = [row.on_front for row in rows]
     return "\n".join(
         [
             '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Tradeoff</title>',
-            f"<style>{_STYLE}</style></head><body><h1>Quality, speed and size</h1>",
+            f"<style>{STYLE}</style></head><body><h1>Quality, speed and size</h1>",
             f"{svg}{_UNDER_PLOT if svg else ''}",
-            "<h2>Each setting alone</h2><table>",
-            *rate_lines,
-            "</table><h2>All variants</h2><p>Shaded: Pareto front of PSNR, speed and size.</p><table>",
-            *lines,
-            "</table></body></html>",
+            "<h2>Each setting alone</h2>",
+            html_table(EXCHANGE_HEAD, [exchange_cells(rate) for rate in rates]),
+            "<h2>All variants</h2><p>Shaded: Pareto front of PSNR, speed and size.</p>",
+            html_table(_HEAD, [_cells(row) for row in rows], front),
+            "</body></html>",
         ]
     )
-
-
-def _line(cell: str, texts: Sequence[str], *, front: bool = False) -> str:
-    cells = "".join(f"<{cell}>{escape(text)}</{cell}>" for text in texts)
-    return f"<tr{' class=front' if front else ''}>{cells}</tr>"

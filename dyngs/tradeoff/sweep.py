@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import torch
 
@@ -19,7 +17,6 @@ from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.evaluate.view_scores import Drawing
-from dyngs.files.write import write_text
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.metrics import load_lpips
 from dyngs.models.views import evaluation_background
@@ -27,12 +24,14 @@ from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.inputs import inputs_of
+from dyngs.study.runs import done_in_turn
+from dyngs.study.speed import time_interleaved
+from dyngs.study.stored import require_same_study
 from dyngs.tradeoff.measure import (
     Measurement,
     measure_quality,
     read_measurement,
     render_options_of,
-    time_interleaved,
     write_measurement,
 )
 from dyngs.tradeoff.memory import MemoryMeter
@@ -58,6 +57,7 @@ class Plan:
         split: "test", "val", "train" or "pose".
         rounds: renders of each timed view.
         device: draws what is measured.
+        ray_cores: of each run that is trained by Ray; None: they are trained here.
     """
 
     settings: tuple[Varied, ...]
@@ -66,6 +66,7 @@ class Plan:
     split: str = "test"
     rounds: int = 5
     device: torch.device = CPU
+    ray_cores: int | None = None
 
 
 def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Measurement]:
@@ -86,6 +87,11 @@ def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Mea
         if idle:
             log(f"nothing to vary in this run: {', '.join(idle)}")
         singles = [Variant(), *single_changes(plan.settings, own, plan.finetune)]
+        elsewhere = replace(runs, run_dir=runs.run_dir.absolute(), out=runs.out.absolute())
+        trained = list(dict.fromkeys(variant.trained for variant in singles))
+        for _, problem in done_in_turn(elsewhere.folder, trained, plan.ray_cores):
+            if isinstance(problem, DyngsError):
+                raise problem
         measured = session.measured(singles)
         return session.measured([*singles, *combinations(measured[0], measured[1:], plan.combine)])
 
@@ -171,15 +177,4 @@ def _require_same_source(runs: VariantRuns, plan: Plan) -> None:
         "split": plan.split,
         "device": plan.device.type,
     }
-    path = runs.out / SOURCE_NAME
-    if not path.is_file():
-        write_text(path, json.dumps(source, indent=2) + "\n")
-        return
-    try:
-        known = cast(object, json.loads(path.read_text(encoding="utf-8")))
-    except ValueError:
-        known = None
-    if not isinstance(known, dict) or any(known.get(key) != source[key] for key in ("sha256", "split", "device")):
-        raise DyngsError(
-            f"{runs.out}: holds measurements of another run, checkpoint, split or device; give another --out"
-        )
+    require_same_study(runs.out / SOURCE_NAME, source, ("sha256", "split", "device"))

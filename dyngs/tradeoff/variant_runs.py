@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dyngs.api.prune import prune_run
-from dyngs.api.train import num_cores, train
+from dyngs.api.train import num_cores
 from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.schema import section_class
@@ -30,6 +30,7 @@ from dyngs.runs.checkpoint import (
 from dyngs.runs.config_file import write_config
 from dyngs.state import tensors_of
 from dyngs.storage.file import write_scene
+from dyngs.study.runs import finished
 from dyngs.tradeoff.measure import with_render_settings
 from dyngs.tradeoff.variants import RunSettings, Variant
 
@@ -114,11 +115,6 @@ class VariantRuns:
             trainer.restore(checkpoint)
             prune_(trainer)
             return trainer.checkpoint(), config
-
-
-def finished(config: Config, out: Path) -> Path:
-    """Train the run in folder ``out`` to its end, from its last checkpoint if there is one; return ``out``."""
-    return train(config, resume_from=out if checkpoint_paths(out) else None)
 
 
 def run_settings(run_dir: Path) -> RunSettings:

@@ -32,7 +32,7 @@ def require_possible(config: Config) -> None:
     if given and not config.model.made_of_gaussians:
         kind = config.model.kind
         raise DyngsError(f"budget.{given[0]}: model.kind={kind} has no Gaussians that could be limited; leave it out")
-    if config.train.minutes is not None and not config.model.made_of_gaussians:
+    if config.train.minutes is not None and config.model.is_network:
         raise DyngsError(f"train.minutes: model.kind={config.model.kind} is trained for train.steps; leave it out")
     if config.train.minutes is not None and config.prune.is_wanted:
         raise DyngsError(

@@ -32,6 +32,7 @@ WORDS = {
     "render": {"times", "view", "overrides"},
     "export": {"times", "overrides"},
     "tradeoff": {"overrides", "vary", "require", "minimize", "maximize"},
+    "compare": {"overrides"},
     "config": {"overrides"},
     "docs": {"topic"},
 }

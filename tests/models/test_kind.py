@@ -109,8 +109,21 @@ def test_what_needs_gaussians_refuses_it_in_a_line(
     )
 
 
+def test_it_keeps_to_a_time(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.budget.time.FEWEST_STEPS", 5)  # whatever else the machine does
+    run = tmp_path / "run"
+    assert main(["train", *options(capture, run), "train.steps=100000", "train.minutes=0.04"]) == 0
+    loaded = load_run(run)
+    assert loaded.step == loaded.config.train.steps, "schedules end where the run ends"
+    assert 5 <= loaded.step < 100_000
+    assert 1 < loaded.seconds_train < 3
+    assert "train.minutes: asked 0.04" in capsys.readouterr().out
+
+
 def test_budgets_of_gaussians_are_refused(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for key in ("budget.max_gaussians=100", "budget.max_mb=1", "train.minutes=1"):
+    for key in ("budget.max_gaussians=100", "budget.max_mb=1"):
         assert main(["train", *options(capture, tmp_path / "run"), key]) == 2
         assert key.partition("=")[0] in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

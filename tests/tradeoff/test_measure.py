@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from moving_scene import Sliding, camera, moving_scene, still_scene
@@ -13,7 +12,7 @@ from dyngs.data.loader import Image
 from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import Lpips
-from dyngs.tradeoff.measure import measure_quality, quartiles, render_options_of, time_interleaved
+from dyngs.tradeoff.measure import measure_quality, render_options_of
 from dyngs.tradeoff.variants import Variant
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,20 +46,3 @@ def test_lpips_is_the_mean_where_it_can_be_had() -> None:
     drawing = Drawing(still_scene(), RenderOptions(), BLACK)
     distance = Lpips("alex", None, lambda a, b: (a - b).abs().mean() + 0.25)
     assert measure_quality(drawing, [image_of(drawing)] * 2, distance)[2] == pytest.approx(0.25)
-
-
-def test_all_draw_every_image_in_turn() -> None:
-    scenes = [moving_scene(Sliding()), moving_scene(Sliding())]
-    drawings = [Drawing(scene, RenderOptions(), BLACK) for scene in scenes]
-    views = [image_of(drawings[0], 0.5)] * 3
-    before = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
-    speeds = time_interleaved(drawings, views, rounds=2)
-    after = [scene.field.calls for scene in scenes if isinstance(scene.field, Sliding)]
-    assert [b - a for a, b in zip(before, after, strict=True)] == [7, 7]  # a warm-up, and twice three views
-    assert speeds[0].gain.low == speeds[0].gain.median == speeds[0].gain.high == 1.0
-    assert all(s.ms.low <= s.ms.median <= s.ms.high for s in speeds)
-
-
-def test_quartiles() -> None:
-    found = quartiles(np.array([4.0, 1.0, 2.0, 3.0, 100.0]))
-    assert (found.low, found.median, found.high) == (2.0, 3.0, 4.0)

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dyngs.tradeoff.measure import Measurement, Quartiles, Speed, on_front, pareto_mask
+from dyngs.study.speed import Quartiles, Speed
+from dyngs.tradeoff.measure import Measurement, on_front, pareto_mask
 from dyngs.tradeoff.pareto import combinations, exchange_rates, rate, slope
 from dyngs.tradeoff.variants import Variant
 

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.tradeoff.plot import plot, png_of, svg_of
+from dyngs.study.plots import png_of, svg_of
+from dyngs.tradeoff.plot import plot
 from dyngs.tradeoff.table import TableRow
 from dyngs.tradeoff.variants import Variant
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import html
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +19,7 @@ from dyngs.deform.scene import field_scene_of
 from dyngs.errors import counted
 from dyngs.export.chosen_path import front_of, orbit_around, view_to_show
 from dyngs.export.html.numbers import Lists, add_scene
+from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.files.write import write_text
 from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.models.views import training_cameras
@@ -155,27 +153,12 @@ def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
     shaders = "\n".join(f'<script type="text/plain" id="{name}">\n{_file(name)}</script>' for name in SHADERS)
     page = _file("page.html")
     fixed = {"style": style, "script": script, "shaders": shaders}
-    fixed |= {"style_hash": _hash(style), "script_hash": _hash(script), "title": html.escape(title)}
-    fixed |= {"header": _script_safe(header), "numbers": numbers}
+    fixed |= {"style_hash": source_hash(style), "script_hash": source_hash(script), "title": html.escape(title)}
+    fixed |= {"header": script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
     fixed["about"] = f"{counted(header['count'], 'Gaussian')}, {size / 1e6:.1f} MB"
-    pieces = page.split("{{")
-    filled = [pieces[0]]
-    for piece in pieces[1:]:
-        name, rest = piece.split("}}", 1)
-        filled += [fixed[name], rest]
-    return "".join(filled)
+    return filled(page, fixed)
 
 
 def _file(name: str) -> str:
     return (HERE / name).read_text(encoding="utf-8")
-
-
-def _hash(text: str) -> str:
-    """Return how a Content-Security-Policy names an inline script or style."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-
-def _script_safe(value: Any) -> str:
-    """Return JSON that cannot end the script element it stands in."""
-    return json.dumps(value, allow_nan=False).replace("<", "\\u003c")

@@ -26,6 +26,13 @@ from dyngs.models.views import training_cameras
 FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
 
 
+def refusal(capture: Capture) -> str | None:
+    """Return why a capture is of no person; None: it has body parameters."""
+    if capture.body is not None:
+        return None
+    return "has no body parameters, which model.kind=human needs; see docs/human.md"
+
+
 def start(run: RunStart) -> GaussianModel:
     """Return the model of a person before the first step.
 
@@ -57,8 +64,9 @@ def human_start(config: Config, model: HumanModel, capture: Capture, images: Ima
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     sh_degree = config.stored_sh_degree
-    if capture.body is None:
-        raise DyngsError(f"{capture.root}: has no body parameters, which model.kind=human needs; see docs/human.md")
+    problem = refusal(capture)
+    if problem is not None or capture.body is None:
+        raise DyngsError(f"{capture.root}: {problem}")
     if sh_degree > 1:
         raise DyngsError(f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1")
     given, body = capture.body["train"], load_template(model)

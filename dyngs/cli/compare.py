@@ -1,0 +1,126 @@
+"""``dyngs compare``: several models on one capture, with the same time, steps or size."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dyngs.cli import arguments as args
+from dyngs.cli.tables import numbers_table, print_tables
+from dyngs.errors import DyngsError, counted
+
+if TYPE_CHECKING:
+    from dyngs.compare.plan import Bench
+
+_EPILOG = """\
+examples:
+  dyngs compare scans/bench --models static,mip,static_mcmc --minutes 2       -> compare/bench
+  dyngs compare scans/dance --models static,dynamic,mine.yaml --steps 7000 data.longest_side=400
+  dyngs compare scans/bench --models static,mip --max-mb 2 --peers published.csv --out study
+
+Each model is a preset or a YAML file. An interrupted command continues when it is given again. Details: docs/cli.md.
+"""
+
+
+def add_parser(commands: args.Commands) -> None:
+    parser = args.add_command(
+        commands,
+        "compare",
+        run,
+        "train several models on one capture with the same time, steps or size, and compare them",
+        "Train each model on the same views and evaluate all on the same held-out ones. Writes comparison.csv, .md, a "
+        "page with synchronised crops (.html) and, with the extra plots, quality over seconds (.svg, .png).",
+        _EPILOG,
+    )
+    parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help="capture with cameras, in any format")
+    args.add_overrides(parser, "key=value", "overrides for all models")
+    names = "presets and YAML files, separated by commas"
+    parser.add_argument("--models", type=_names, required=True, metavar="A,B,...", help=names)
+    limit = parser.add_mutually_exclusive_group()
+    limit.add_argument("--minutes", type=_positive, metavar="M", help="train each for so many minutes")
+    limit.add_argument("--steps", type=args.whole("a number of steps", 1, 10**8), metavar="N", help="or so many steps")
+    limit.add_argument("--max-mb", type=_positive, metavar="MB", help="or to a file of at most so many 1e6 bytes")
+    parser.add_argument("--out", type=args.output_path, metavar="DIR", help="output folder (default compare/CAPTURE)")
+    peers = "CSV of published or foreign figures: columns model, source, psnr, ..."
+    parser.add_argument("--peers", type=args.input_path, metavar="FILE", help=peers)
+    kind = args.whole("a number of views", 1, 20)
+    parser.add_argument("--views", type=kind, default=4, metavar="N", help="views on the page (default 4)")
+    args.add_split(parser)
+    args.add_threads(parser)
+    args.add_device(parser)
+    args.add_ray(parser)
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"{text!r} has an empty name; write for instance static,mip")
+    return names
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r} is not possible; write a number above 0, for instance 2")
+    return value
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train, compare, print the table and write the report; the folder is locked against other commands."""
+    from dyngs.compare.bench import compare, is_finished, require_same_comparison
+    from dyngs.compare.peers import read_peers
+    from dyngs.compare.plan import planned
+    from dyngs.compare.report import about, table_cells, table_rows, write_report
+    from dyngs.runs.inputs import inputs_of
+    from dyngs.runs.lock import writing
+    from dyngs.study.plots import MISSING, can_plot
+
+    bench = _bench(arguments)
+    args.computing_device(bench.device)
+    peers = [] if arguments.peers is None else read_peers(arguments.peers)
+    plan = planned(bench, arguments.models)
+    for entry in plan.entries:
+        inputs_of(entry.config).require_output(bench.out)
+    args.print_notes(plan.notes)
+    with writing(bench.out):
+        require_same_comparison(bench, plan)
+        was_finished = is_finished(bench, plan)
+        try:
+            results, left_out = compare(bench, plan, lambda line: print(line, flush=True), arguments.ray)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("finished models are kept; the same command continues") from None
+        files = write_report(bench, results, peers, left_out)
+    print_tables(numbers_table(about(bench, results), *table_cells(table_rows(results, peers))))
+    for name, problem in left_out.items():
+        print(f"left out: {name}: {problem}")
+    if was_finished:
+        print(f"{arguments.out or bench.out}: holds just this comparison, finished: nothing was trained")
+    print(f"written: {files[0]} and {', '.join(file.suffix for file in files[1:])}")
+    if not can_plot():
+        print(f"note: {MISSING}")
+    if arguments.ray is not None and arguments.minutes is not None:
+        print(f"note: {counted(len(results), 'model')} by Ray: the same minutes are less on a slower or busier machine")
+    return 0
+
+
+def _bench(arguments: argparse.Namespace) -> Bench:
+    from dyngs.compare.plan import Bench, Limit
+
+    if arguments.minutes is None and arguments.steps is None and arguments.max_mb is None:
+        raise DyngsError("say what all models get the same of: --minutes M, --steps N or --max-mb MB")
+    capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
+    return Bench(
+        capture=capture,
+        out=(arguments.out or Path("compare", capture.name)).absolute(),
+        limit=Limit(arguments.minutes, arguments.steps, arguments.max_mb),
+        split=arguments.split,
+        overrides=tuple(arguments.overrides),
+        threads=arguments.threads,
+        device=arguments.device,
+        num_shown=arguments.views,
+    )

@@ -1,0 +1,1 @@
+"""What studies of several runs share: training them in turn or on several machines, stored results, speeds, tables."""

@@ -1,0 +1,32 @@
+"""Texts of others stay text in every table."""
+
+from __future__ import annotations
+
+import csv
+from html.parser import HTMLParser
+
+from dyngs.study.tables import csv_text, html_table, markdown_table
+
+ODD = ["<script>alert(1)</script>", "a|b", 'say "x", y', "é"]
+
+
+def test_csv_is_read_as_it_was() -> None:
+    rows = [{"name": text, "n": str(i)} for i, text in enumerate(ODD)]
+    assert list(csv.DictReader(csv_text(rows).splitlines())) == rows
+
+
+def test_html_shows_it_and_runs_nothing() -> None:
+    seen: list[str] = []
+    tags: list[tuple[str, object]] = []
+    parser = HTMLParser()
+    parser.handle_data = seen.append  # type: ignore[method-assign]
+    parser.handle_starttag = lambda tag, attrs: tags.append((tag, attrs))  # type: ignore[method-assign]
+    parser.feed(html_table(["name"], [[text] for text in ODD], [True, False, False, False]))
+    assert [text for text in seen if text.strip()] == ["name", *ODD]
+    assert {tag for tag, _ in tags} == {"table", "tr", "th", "td"}
+    assert sum(("class", "marked") in attrs for _, attrs in tags) == 1  # type: ignore[operator]
+
+
+def test_markdown_has_as_many_columns_in_every_row() -> None:
+    lines = markdown_table(["name", "n"], [[text, "1"] for text in ODD]).splitlines()
+    assert {line.replace("\\|", "").count("|") for line in lines} == {3}
