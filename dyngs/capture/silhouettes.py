@@ -24,8 +24,8 @@ MOST = 0.5  # fraction of the points inside above which the silhouettes say noth
 def points_in_silhouettes(views: Sequence[View], options: DataConfig, init: PointsInit) -> PointCloud | None:
     """Return random points of the cube around the origin that lie in the silhouettes, in the images' median colours.
 
-    ``init.num_random`` are drawn, and as many again where few of them lie inside. None where images have no silhouettes, where
-    those hold no points, or most.
+    ``init.num_random`` are drawn, and as many again where few of them lie inside. None where images have no
+    silhouettes, where those hold no points, or most.
     """
     shown = [(views[i], small_image(views[i], options)) for i in evenly_spaced(len(views), SILHOUETTES)]
     if all(bool((image[..., 3] >= INSIDE).all()) for _, image in shown):
