@@ -58,10 +58,10 @@ class Discs:
         for k, radius in enumerate(self.radii):
             disc = np.clip(radius - away + 0.5, 0, 1)
             ring = np.clip(1.6 * radius - away + 0.5, 0, 1) - np.clip(1.15 * radius - away + 0.5, 0, 1)
-            kernels[k] = rfft2(disc / disc.sum() - ring / ring.sum())
+            kernels[k] = np.asarray(rfft2(disc / disc.sum() - ring / ring.sum()))
         self.values: np.ndarray = np.empty((len(maps), SIZES, height, width), np.float32)  # (T, S, H, W)
         for values, one in zip(self.values, maps, strict=True):
-            found = np.asarray(irfft2(rfft2(one.astype(np.float32), shape) * kernels, shape))
+            found = np.asarray(irfft2(np.asarray(rfft2(one.astype(np.float32), shape)) * kernels, shape))
             values[:] = found[:, :height, :width]
 
     def at(self, which: np.ndarray, pixels: np.ndarray, radii: np.ndarray) -> np.ndarray:

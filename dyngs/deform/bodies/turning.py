@@ -23,7 +23,7 @@ from dyngs.deform.bodies.shots import Shots
 from dyngs.ops.harmonics import light_harmonics
 
 COARSE, FINE = 6, 8  # Cells along an edge of the cube that the sphere is divided by
-GRID = 160  # Cubes along an edge of the table of the cells that directions point at
+GRID = 256  # Cubes along an edge of the table of the cells that directions point at
 MOST_PIXELS, FEWER_PIXELS = 250, 80  # Of a body in an image that are looked at, and that the first search looks at
 FEWEST_PIXELS = 50  # Of a body in an image, for that image to say how it turns
 LEAST_PIXELS = 2  # In a cell, for its mean colour to count
@@ -106,7 +106,7 @@ def cells(normals: np.ndarray, size: int) -> np.ndarray:
 @cache
 def _table(size: int) -> np.ndarray:
     """Return the (``GRID``^3,) cells of a grid of cubes around the origin, where the unit sphere cuts these."""
-    side = np.arange(GRID) + 0.5 - GRID / 2
+    side = np.arange(GRID, dtype=np.float32) + 0.5 - GRID / 2
     away = np.sqrt(side[:, None, None] ** 2 + side[:, None] ** 2 + side**2)
     cut, found = np.nonzero(np.abs(away - GRID / 2) < 1), np.zeros((GRID, GRID, GRID), np.int16)
     found[cut] = cells(side[np.stack(cut, axis=1)], size)
