@@ -45,7 +45,7 @@ def reference_composite(
         through = torch.ones((), dtype=densities.dtype)
         colour, depth = torch.zeros(3, dtype=densities.dtype), torch.zeros((), dtype=densities.dtype)
         for i in range(begin, end):
-            if float(through) < transmittance_min:
+            if float(through.detach()) < transmittance_min:
                 break
             left = torch.exp(-densities[i] * (samples.ends[i] - samples.starts[i]))
             weight = through * (1 - left)

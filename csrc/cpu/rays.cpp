@@ -71,21 +71,21 @@ void composite_ray_vjp(const RaySamples<S>& in, const Composited<const S>& grads
     const S* c = in.colours + 3 * i;
     return dot3(g[0], c[0], g[1], c[1], g[2], c[2]) + grads.depth[ray] * middle_of(in, i);
   };
-  S through = S(1), total = S(0);
+  S through = S(1);
   int64_t stop = begin;
   for (; stop < end && !(through < in.transmittance_min); ++stop) {
-    const S alpha = opacity(in, stop);
-    total += through * alpha * value(stop);
-    through *= S(1) - alpha;
+    const S weight = through * opacity(in, stop);
+    for (int c = 0; c < 3; ++c) g_colours[3 * stop + c] = weight * g[c];
+    through *= S(1) - opacity(in, stop);
+    g_densities[stop] = through;  // for now
   }
+  // From the back, so that the sum behind the last sample is 0 exactly: its length may be 1e10.
   const S at_end = grads.transmittance[ray] * through;
-  through = S(1);
-  for (int64_t i = begin; i < stop; ++i) {
-    const S alpha = opacity(in, i), weight = through * alpha, seen = value(i);
-    through *= S(1) - alpha;
-    total -= weight * seen;
-    g_densities[i] = (in.ends[i] - in.starts[i]) * (through * seen - total - at_end);
-    for (int c = 0; c < 3; ++c) g_colours[3 * i + c] = weight * g[c];
+  S behind = S(0);
+  for (int64_t i = stop; i-- > begin;) {
+    const S before = i == begin ? S(1) : g_densities[i - 1], seen = value(i);
+    g_densities[i] = (in.ends[i] - in.starts[i]) * (g_densities[i] * seen - behind - at_end);
+    behind += before * opacity(in, i) * seen;
   }
   std::fill(g_densities + stop, g_densities + end, S(0));
   std::fill(g_colours + 3 * stop, g_colours + 3 * end, S(0));

@@ -25,7 +25,6 @@ from dyngs.tensor_checks import require_tensor
 
 WIDTH, GEOMETRY = 64, 16  # Features of hidden layers, and of the density network's output, whose first is the density
 DIRECTION_DEGREE, DIRECTION_TERMS = 3, 16  # Of the harmonics of directions; Instant-NGP counts degrees from 1
-STEPS_ACROSS = 1024  # Samples along the diagonal of the innermost cube
 CONE = 1 / 256  # Least length of a sample outside of it, in units of its distance
 FIRST = 1e-4  # Rows of the grid begin within this of 0
 
@@ -36,7 +35,8 @@ class NgpSizes:
 
     levels: HashLevels
     features: int
-    num_samples: int
+    num_samples: int  # of a step
+    across: int  # samples along the diagonal of the innermost cube
 
     @staticmethod
     def of(model: NgpModel) -> NgpSizes:
@@ -47,7 +47,7 @@ class NgpSizes:
         log2_rows = model.log2_rows or (19 if published else 17)
         finest = model.finest or (4096 if published else 1024)
         grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows, dims=4 if model.time else 3)
-        return NgpSizes(grid, features, 1 << (model.log2_samples or (18 if published else 16)))
+        return NgpSizes(grid, features, 1 << (model.log2_samples or (18 if published else 16)), 1024 if published else 512)
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class NgpField(Field):
         table: (rows, F) of all levels.
         density, colour: weights of the networks, (out, in) each.
         occupied: bool of ``space.shape``.
+        across: samples along the diagonal of the innermost cube.
     """
 
     space: Space
@@ -66,6 +67,7 @@ class NgpField(Field):
     density: tuple[Tensor, ...]
     colour: tuple[Tensor, ...]
     occupied: Tensor
+    across: int
     sees_time: bool = False
 
     @staticmethod
@@ -82,7 +84,7 @@ class NgpField(Field):
         ]
         occupied = torch.ones(space.shape, dtype=torch.bool, device="cpu")
         table = (FIRST * (2 * rows - 1)).requires_grad_()
-        return NgpField(space, sizes.levels, table, weights[0], weights[1], occupied, model.time)
+        return NgpField(space, sizes.levels, table, weights[0], weights[1], occupied, sizes.across, model.time)
 
     @staticmethod
     def restored(model: NgpModel, space: Space, checkpoint: Checkpoint) -> NgpField:
@@ -100,7 +102,8 @@ class NgpField(Field):
         }
         count = math.prod(space.shape)
         bits = require_tensor("occupied", stored["occupied"], (-(-count // 8),), torch.uint8)
-        return NgpField(space, sizes.levels, table, *networks.values(), _unpacked(bits, space), model.time)
+        occupied = _unpacked(bits, space)
+        return NgpField(space, sizes.levels, table, *networks.values(), occupied, sizes.across, model.time)
 
     @property
     def num_shifts(self) -> int:
@@ -119,7 +122,7 @@ class NgpField(Field):
     @cached_property
     def step(self) -> float:
         """Length of a sample, world units."""
-        return 2 * self.space.half * math.sqrt(3) / STEPS_ACROSS
+        return 2 * self.space.half * math.sqrt(3) / self.across
 
     def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
         steps = Steps(near, self.step, CONE if self.space.cascades > 1 else 0.0)

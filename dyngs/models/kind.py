@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from dyngs.deform.keys import DynamicModel
-from dyngs.fields.keys import NgpModel
+from dyngs.fields.keys import NerfModel, NgpModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import ModelSection
 from dyngs.static.keys import StaticModel
@@ -64,6 +64,7 @@ KINDS: tuple[Kind, ...] = (
     Kind(HumanModel, "dyngs.human.avatar.kind"),
     Kind(HumanPredictorModel, "dyngs.training.prediction"),
     Kind(NgpModel, "dyngs.fields.kind"),
+    Kind(NerfModel, "dyngs.fields.kind"),
 )
 
 

@@ -106,7 +106,8 @@ def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: Ste
     """
     if occupied.shape != space.shape or occupied.dtype != torch.bool:
         raise DyngsError(f"march: cells must be bool {space.shape}, got {occupied.dtype} {tuple(occupied.shape)}")
-    sizes = (space.centre, float(space.half), space.cascades, space.cells)
+    centre = tuple(float(x) for x in space.centre)
+    sizes = (centre, float(space.half), space.cascades, space.cells)
     options = (float(steps.near), float(steps.length), float(steps.cone), steps.most)
     given = (rays.origins.contiguous(), rays.directions.contiguous(), shifts, sizes, occupied, options)
     counts = torch.empty(len(rays), dtype=torch.int64, device="cpu")
