@@ -64,6 +64,10 @@ class Field(ABC):
     def densities(self, points: Tensor, time: float) -> Tensor:
         """Return (M,) densities, per world unit, at points (M, 3) of the world."""
 
+    def may_hold(self, points: Tensor) -> Tensor:
+        """Return (M,) bool: whether there may be anything at points (M, 3) of the world, before looking."""
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+
     @abstractmethod
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
         """Return (M, 3) colours of points (M, 3) of the world, seen along unit directions (M, 3)."""

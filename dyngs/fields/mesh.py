@@ -29,19 +29,19 @@ class Surface:
 
 
 @torch.no_grad()
-def surface_of(scene: FieldScene, time: float = 0.0, level: float | None = None, cells: int = CELLS) -> Surface:
+def surface_of(scene: FieldScene, time: float = 0.0, level: float | None = None, cells: int | None = None) -> Surface:
     """Return the surface in the innermost cube at ``time``.
 
     Args:
         level: density there, per unit of a world whose innermost cube has half side 1.5; None: ``LEVEL``.
-        cells: along an axis of the cube.
+        cells: along an axis of the cube; None: ``CELLS``.
 
     Raises:
         DyngsError: the density is nowhere, or everywhere, of that level.
     """
     from skimage.measure import marching_cubes
 
-    level = LEVEL if level is None else level
+    level, cells = LEVEL if level is None else level, CELLS if cells is None else cells
     space = scene.field.space
     grid = _densities(scene, time, cells) * (space.half / PUBLISHED_HALF)
     if not float(grid.min()) < level < float(grid.max()):
@@ -66,7 +66,10 @@ def _densities(scene: FieldScene, time: float, cells: int) -> Tensor:
     axis = torch.linspace(-space.half, space.half, cells + 1, device="cpu")
     x, y, z = torch.meshgrid(*(axis + middle for middle in space.centre), indexing="ij")
     points = torch.stack([x, y, z], -1).view(-1, 3)
-    found = torch.cat([scene.field.densities(part, time) for part in points.split(CHUNK)]).view(x.shape)
+    found = torch.zeros(len(points), device="cpu")
+    for which in scene.field.may_hold(points).nonzero()[:, 0].split(CHUNK):
+        found[which] = scene.field.densities(points[which], time)
+    found = found.view(x.shape)
     inner = torch.zeros_like(found)
     inner[1:-1, 1:-1, 1:-1] = found[1:-1, 1:-1, 1:-1]
     return inner

@@ -144,11 +144,14 @@ class NgpField(Field):
         return Seen(drawn.colour, drawn.transmittance, drawn.depth, len(samples))
 
     def densities(self, points: Tensor, time: float) -> Tensor:
-        return self.unit_densities(self.space.unit(points), time)
+        return self._density(self._geometry(self.space.unit(points), time))
 
-    def unit_densities(self, coords: Tensor, time: float) -> Tensor:
-        """Return (M,) densities at points (M, 3) of the unit cube."""
-        return self._density(self._geometry(coords, time))
+    def may_hold(self, points: Tensor) -> Tensor:
+        """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
+        n, middle = self.space.cells, points.new_tensor(self.space.centre)
+        place = ((points - middle) / self.space.half + 1) * (n / 2)
+        x, y, z = place.long().clamp(0, n - 1).unbind(1)
+        return self.occupied[0, z, y, x] | ((place < 0) | (place > n)).any(1)
 
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
         geometry = self._geometry(self.space.unit(points), time)
