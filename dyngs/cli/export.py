@@ -146,7 +146,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
     """Raise for the first option that does not go with a format, with the reason."""
-    format = "--bodies" if arguments.bodies else "--joints" if arguments.joints else f"--format {_SHOWN.get(kind, kind)}"
+    format = (
+        "--bodies" if arguments.bodies else "--joints" if arguments.joints else f"--format {_SHOWN.get(kind, kind)}"
+    )
     unfit = "bodies" if arguments.bodies else "mesh" if arguments.joints else kind
     for name, reason in _UNFIT.get(unfit, {}).items():
         passed = getattr(arguments, name)

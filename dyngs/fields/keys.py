@@ -15,8 +15,9 @@ class FieldModel(ModelSection):
     draws_whole_images: ClassVar[bool] = False
 
     time: bool = Field(default=False, description="time is an input, too: a moving scene (T-NeRF)")
-    half_extent: Positive | None = Field(
+    half_extent: float | None = Field(
         default=None,
+        gt=0,
         le=1e9,
         description="half the side of the cube that is resolved best, world units; null: what all cameras frame of an "
         "object before a background, else where the cameras are",
@@ -40,7 +41,7 @@ class NgpModel(FieldModel):
         "16 of 2^19 of 2 and 2^18",
     )
     levels: int | None = Field(default=None, ge=1, le=32, description="levels of the hash grid")
-    features: Literal[1, 2, 4, 8, None] = Field(default=None, description="features per level")
+    features: Literal[1, 2, 4, 8] | None = Field(default=None, description="features per level")
     log2_rows: int | None = Field(default=None, ge=4, le=24, description="most rows of a level, as a power of two")
     finest: int | None = Field(default=None, ge=16, le=2**17, description="cells of the finest level along an axis")
     log2_samples: int | None = Field(

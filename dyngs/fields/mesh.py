@@ -52,7 +52,9 @@ def surface_of(scene: FieldScene, time: float = 0.0, level: float | None = None,
     # x is the first axis of the grid; a logarithm, because density rises by orders of magnitude within a cell
     found = marching_cubes(np.log(np.maximum(grid.numpy(), 1e-6)), np.log(level), gradient_direction="ascent")
     places, faces, normals = found[0], found[1], found[2]
-    vertices = torch.from_numpy(places.copy()) * (2 * space.half / cells) + (torch.tensor(space.centre, device="cpu") - space.half)
+    vertices = torch.from_numpy(places.copy()) * (2 * space.half / cells) + (
+        torch.tensor(space.centre, device="cpu") - space.half
+    )
     inwards = torch.nn.functional.normalize(torch.from_numpy(-normals.copy()), dim=1)
     colours = [
         scene.field.colours(x, d, time) for x, d in zip(vertices.split(CHUNK), inwards.split(CHUNK), strict=True)

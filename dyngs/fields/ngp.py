@@ -47,7 +47,9 @@ class NgpSizes:
         log2_rows = model.log2_rows or (19 if published else 17)
         finest = model.finest or (4096 if published else 1024)
         grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows, dims=4 if model.time else 3)
-        return NgpSizes(grid, features, 1 << (model.log2_samples or (18 if published else 16)), 1024 if published else 512)
+        return NgpSizes(
+            grid, features, 1 << (model.log2_samples or (18 if published else 16)), 1024 if published else 512
+        )
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,9 @@ def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
     assert len(list((tmp_path / "images").rglob("*.png"))) > 1
     opened = open_run(run)
     for layer in ("colour", "depth"):
-        shot = Shot(viewpoint_of(opened).start) if layer == "colour" else Shot(viewpoint_of(opened).start, layer="depth")
+        shot = (
+            Shot(viewpoint_of(opened).start) if layer == "colour" else Shot(viewpoint_of(opened).start, layer="depth")
+        )
         assert draw(opened, shot).std() > 0
 
 

@@ -9,7 +9,6 @@ import torch
 from small_fields import NGP, config_of
 
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import read_capture
 from dyngs.fields.ngp_training import NgpTraining
 from dyngs.fields.space import rays_of
 from dyngs.kinds import assemble

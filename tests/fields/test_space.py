@@ -19,7 +19,6 @@ from dyngs.fields.keys import NgpModel
 from dyngs.fields.space import MOST_CASCADES, part_of, rays_of, space_of
 
 
-
 @pytest.fixture
 def still(capture: Path) -> Capture:
     return read_capture(config_of(capture).data)
