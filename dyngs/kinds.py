@@ -108,7 +108,8 @@ def assemble(
         exposures=exposures,
         refinement=refinement,
     )
-    trainer.place(device_for(config.run.device))
+    anywhere = config.model.on_gpu or config.run.device != "auto"
+    trainer.place(device_for(config.run.device if anywhere else "cpu"))
     return trainer
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,6 @@ def write_surface(opened: Opened, out: Path, *, time: float = 0.0, level: float 
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, surface.faces, vertex_colors=colours, process=False)
     with atomic_file(out) as temporary:
-        data = mesh.export(file_type=out.suffix.lower()[1:])
+        data: Any = mesh.export(file_type=out.suffix.lower()[1:])
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
     return surface

@@ -16,7 +16,7 @@ from dyngs.state import State
 
 LARGEST_EXPONENT = 15.0
 PUBLISHED_HALF = 1.5
-"""Half the side of the cube of the published figures: densities are per unit of a world in which the cube is as large."""
+"""Half the side of the cube of published figures: densities are per unit of a world in which the cube is as large."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ class FieldModel(ModelSection):
     """Keys that all fields share."""
 
     draws_whole_images: ClassVar[bool] = False
+    on_gpu: ClassVar[bool] = False
 
     time: bool = Field(default=False, description="time is an input, too: a moving scene (T-NeRF)")
     half_extent: float | None = Field(
@@ -24,7 +25,7 @@ class FieldModel(ModelSection):
     )
     surroundings: Literal["auto", "never", "always"] = Field(
         default="auto",
-        description="whether anything lies outside of that cube, up to 64 times as far; auto: where images have no alpha",
+        description="whether anything lies outside of that cube, up to 64 times as far; auto: if images have no alpha",
     )
     lr: Positive = Field(default=1e-2, le=1, description="learning rate of Adam at its height")
 

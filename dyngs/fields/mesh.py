@@ -14,8 +14,8 @@ from dyngs.fields.scene import FieldScene
 
 CELLS = 192  # Along an axis of the innermost cube, unless asked otherwise
 LEVEL = 25.0
-"""Density at the surface, per unit of a world whose innermost cube has half side 1.5, unless asked otherwise: half of the
-light is lost in a 36th of a unit."""
+"""Density at the surface, unless asked otherwise, per unit of a world whose innermost cube has half side 1.5: half of
+the light is lost in a 36th of a unit."""
 CHUNK = 1 << 17  # Points looked at together
 
 
@@ -63,7 +63,7 @@ def surface_of(scene: FieldScene, time: float = 0.0, level: float | None = None,
 
 
 def _densities(scene: FieldScene, time: float, cells: int) -> Tensor:
-    """Return (cells + 1, cells + 1, cells + 1) densities, per world unit, x the first axis; 0 on the cube's own sides."""
+    """Return densities, per world unit, at (cells + 1)^3 places, x the first axis; 0 on the sides of the cube."""
     space = scene.field.space
     axis = torch.linspace(-space.half, space.half, cells + 1, device="cpu")
     x, y, z = torch.meshgrid(*(axis + middle for middle in space.centre), indexing="ij")

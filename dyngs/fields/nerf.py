@@ -103,15 +103,15 @@ class NerfField(Field):
 
     @staticmethod
     def new(model: NerfModel, space: Space, generator: torch.Generator) -> NerfField:
-        networks = (NerfNetwork.new(model, generator) for _ in range(2))
-        return NerfField(space, *networks, model.coarse, model.fine, model.time)
+        coarse, fine = (NerfNetwork.new(model, generator) for _ in range(2))
+        return NerfField(space, coarse, fine, model.coarse, model.fine, model.time)
 
     @staticmethod
     def restored(model: NerfModel, space: Space, checkpoint: Checkpoint) -> NerfField:
         """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
         stored = checkpoint.part("field")
-        networks = (NerfNetwork.restored(model, stored, name) for name in ("coarse", "fine"))
-        return NerfField(space, *networks, model.coarse, model.fine, model.time)
+        coarse, fine = (NerfNetwork.restored(model, stored, name) for name in ("coarse", "fine"))
+        return NerfField(space, coarse, fine, model.coarse, model.fine, model.time)
 
     @property
     def num_shifts(self) -> int:

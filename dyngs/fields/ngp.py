@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -81,8 +82,7 @@ class NgpField(Field):
         density = (inputs, WIDTH, GEOMETRY)
         colour = (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)
         weights = [
-            tuple(glorot(i, o, generator).requires_grad_() for i, o in zip(widths, widths[1:], strict=False))
-            for widths in (density, colour)
+            tuple(glorot(i, o, generator).requires_grad_() for i, o in pairwise(widths)) for widths in (density, colour)
         ]
         occupied = torch.ones(space.shape, dtype=torch.bool, device="cpu")
         table = (FIRST * (2 * rows - 1)).requires_grad_()
@@ -98,14 +98,16 @@ class NgpField(Field):
         networks = {
             name: tuple(
                 require_tensor(f"{name}.{i}", stored[f"{name}.{i}"], (out, before)).clone()
-                for i, (before, out) in enumerate(zip(w, w[1:], strict=False))
+                for i, (before, out) in enumerate(pairwise(w))
             )
             for name, w in widths.items()
         }
         count = math.prod(space.shape)
         bits = require_tensor("occupied", stored["occupied"], (-(-count // 8),), torch.uint8)
         occupied = _unpacked(bits, space)
-        return NgpField(space, sizes.levels, table, *networks.values(), occupied, sizes.across, model.time)
+        return NgpField(
+            space, sizes.levels, table, networks["density"], networks["colour"], occupied, sizes.across, model.time
+        )
 
     @property
     def num_shifts(self) -> int:

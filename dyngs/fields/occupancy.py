@@ -29,7 +29,7 @@ class Occupancy:
 
     @torch.no_grad()
     def updated(self, field: NgpField, step: int, times: tuple[float, ...], generator: torch.Generator) -> Tensor:
-        """Look at densities at a random place of cells, at a random one of ``times``; return bool of ``space.shape``."""
+        """Look at densities at random places of cells, at one of ``times``; return bool of ``space.shape``."""
         cells = self._chosen(field.occupied, step, generator)
         found = torch.cat([self._opacities(field, x, times, generator) for x in cells.split(CHUNK)])
         self._values[cells] = torch.maximum(self._values[cells] * DECAY, found)

@@ -16,7 +16,7 @@ _LEAST = 1e-5  # Weight of an interval that nothing was seen in
 
 @torch.no_grad()
 def crossed(rays: Rays, space: Space, near: float) -> tuple[Tensor, Tensor]:
-    """Return distances (R,) at which rays enter and leave the outermost cube, at least ``near``; equal where they miss."""
+    """Return distances (R,) at which rays enter and leave the outermost cube, from ``near`` on; equal if they miss."""
     offsets = rays.origins - rays.origins.new_tensor(space.centre)
     walls = torch.stack([-space.outermost - offsets, space.outermost - offsets]) / rays.directions
     walls = walls.nan_to_num(0.0)  # along a wall, within it

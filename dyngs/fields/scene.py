@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -27,7 +28,7 @@ class FieldScene(Renderable):
 
     field: Field
     seen_at: tuple[float, ...] = ()
-    options: DrawOptions = field(default_factory=DrawOptions)
+    options: DrawOptions = dataclasses.field(default_factory=DrawOptions)
     background: Tensor | None = None
 
     @property

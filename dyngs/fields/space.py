@@ -20,7 +20,7 @@ from dyngs.ops.rays import Rays, Space
 
 MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
 BESIDE = 1.25
-"""The innermost cube around cameras that look at something between them, in units of their farthest distance from it."""
+"""Half the side of the innermost cube of a real capture, in the farthest distances of a camera from its middle."""
 SEEN_FAR = 0.02  # Fraction of the sparse points that may lie outside of the outermost cube
 
 
@@ -80,7 +80,7 @@ def _cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
     needed = 1 + math.ceil(math.log2(max(float(np.quantile(norms, 1 - SEEN_FAR)), 1.0)))
     if needed > MOST_CASCADES + 3:
         raise DyngsError(
-            f"the points of the capture lie up to {2.0 ** (needed - 1):.0f} times as far away as its cameras are apart, "
+            f"the points of the capture lie up to {2.0 ** (needed - 1):.0f} times as far away as its cameras are apart "
             f"and a field holds {2 ** (MOST_CASCADES - 1)} times: give model.half_extent"
         )
     return min(max(needed + 1, 2), MOST_CASCADES)  # what is behind the points, too

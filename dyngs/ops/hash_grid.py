@@ -73,7 +73,9 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 
 def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    return None, hash_grid_backward_op(*ctx.saved_tensors, grad.contiguous(), *ctx.levels), None, None, None
+    coords, table = ctx.saved_tensors
+    scales, sizes, rows = ctx.levels
+    return None, hash_grid_backward_op(coords, table, grad.contiguous(), scales, sizes, rows), None, None, None
 
 
 hash_grid_op = register("hash_grid", _hash_grid, devices=("cpu",), gradient=Gradient(_save, _backward))

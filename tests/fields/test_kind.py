@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +66,8 @@ def test_its_surface_is_a_mesh_with_colours(
     assert isinstance(mesh, trimesh.Trimesh)
     assert len(mesh.faces) > 10
     assert np.abs(mesh.vertices).max() < 1.5
-    assert np.ptp(np.asarray(mesh.visual.vertex_colors)[:, :3]) > 0
+    visual: Any = mesh.visual
+    assert np.ptp(np.asarray(visual.vertex_colors)[:, :3]) > 0
 
 
 @pytest.mark.parametrize(

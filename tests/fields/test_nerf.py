@@ -31,8 +31,7 @@ def test_networks_have_the_published_size() -> None:
 
 
 def test_rays_see_a_slab_of_even_density() -> None:
-    """Networks of biases alone: density 2 everywhere, one colour; so 1 - exp(-2 length) up to the last sample, which hides
-    all that is left."""
+    """Networks of biases alone: density 2 everywhere, one colour; the last sample hides all that is left."""
     model = NerfModel(width=8, coarse=16, fine=16)
     field = NerfField.new(model, SPACE, torch.Generator().manual_seed(0))
     with torch.no_grad():

@@ -11,7 +11,7 @@ from dyngs.kinds import assemble
 
 
 def test_it_learns(capture: Path) -> None:
-    """Of both networks: the mean loss of the last steps is far below that of the first, which is that of a grey image."""
+    """The mean loss of the last steps, of both networks, is far below that of the first ones."""
     trainer = assemble(config_of(capture, *NERF, "train.steps=60"))
     losses = [trainer.step().loss for _ in range(60)]
     assert sum(losses[-20:]) < 0.8 * sum(losses[:20])

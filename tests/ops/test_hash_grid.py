@@ -79,9 +79,8 @@ def test_the_same_bytes_on_any_number_of_threads(features: int) -> None:
 def test_single_precision_is_close() -> None:
     coords, table = some(200, 3), table_of(LEVELS, 4).detach()
     exact, single = hash_features(coords, table, LEVELS), hash_features(coords.float(), table.float(), LEVELS)
-    assert (
-        single.double() - exact
-    ).abs().max() < 1e-4  # weights are off by 24 cells times the rounding of a coordinate
+    # weights are off by 24 cells times the rounding of a coordinate
+    assert (single.double() - exact).abs().max() < 1e-4
 
 
 def test_known_features_have_the_gradient_of_a_look_up() -> None:
