@@ -1,4 +1,5 @@
-// Python bindings of radiance fields: hash grids, marching and compositing. Argument unpacking only.
+// Python bindings of radiance fields: hash grids, marching and compositing. Argument unpacking only. For the CPU alone.
+#if !defined(DYNGS_GPU)
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
@@ -189,3 +190,4 @@ void bind_fields(nb::module_& module) {
 }
 
 }  // namespace dyngs
+#endif

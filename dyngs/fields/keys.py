@@ -48,7 +48,12 @@ class NgpModel(FieldModel):
     log2_samples: int | None = Field(
         default=None, ge=8, le=22, description="samples per step, as a power of two; the number of rays follows"
     )
-    cells: int = Field(default=128, ge=8, le=512, description="cells of the occupancy grid along an axis")
+    cells: int | None = Field(
+        default=None,
+        ge=8,
+        le=512,
+        description="cells of the occupancy grid along an axis of each cube; null: 128, 64 with surroundings",
+    )
     weight_decay: float = Field(default=1e-6, ge=0, description="L2 penalty of the networks' weights, in Adam")
 
 

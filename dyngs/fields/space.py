@@ -19,16 +19,20 @@ from dyngs.fields.keys import FieldModel
 from dyngs.ops.rays import Rays, Space
 
 MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
+CELLS, FAR_CELLS = 128, 64  # Along an axis of a single cube, and of each of several: looking at all takes a while
 BESIDE = 1.25
 """Half the side of the innermost cube of a real capture, in the farthest distances of a camera from its middle."""
 SEEN_FAR = 0.02  # Fraction of the sparse points that may lie outside of the outermost cube
 
 
-def space_of(model: FieldModel, cells: int, capture: Capture) -> Space:
+def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
     """Return the space of the field of ``capture``.
 
     An object before a background lies in a cube around the point that the cameras look at, as large as what all of them
     frame. Otherwise the innermost cube holds the cameras, and others around it what is far away.
+
+    Args:
+        cells: of each cube along an axis; None: as suits their number.
 
     Raises:
         DyngsError: nothing tells depth, or much lies too far away.
@@ -55,11 +59,11 @@ def space_of(model: FieldModel, cells: int, capture: Capture) -> Space:
     return _space(middle, half, _cascades(capture, middle, half), cells)
 
 
-def _space(middle: np.ndarray, half: float, cascades: int, cells: int) -> Space:
+def _space(middle: np.ndarray, half: float, cascades: int, cells: int | None) -> Space:
     if not (math.isfinite(half) and half > 0 and np.isfinite(middle).all()):
         raise DyngsError("the cameras of the capture frame no common space: give model.half_extent")
     x, y, z = (float(value) for value in middle)
-    return Space((x, y, z), float(half), cascades, cells)
+    return Space((x, y, z), float(half), cascades, cells or (CELLS if cascades == 1 else FAR_CELLS))
 
 
 def _framed(views: Sequence[View], middle: np.ndarray) -> float:

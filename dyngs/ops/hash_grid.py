@@ -127,7 +127,7 @@ def _backward_known(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
 
 
 known_features_op = register(
-    "known_hash_features", _known, devices=("cpu",), gradient=Gradient(_save_known, _backward_known)
+    "known_features", _known, devices=("cpu",), gradient=Gradient(_save_known, _backward_known)
 )
 
 

@@ -11,7 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.ops.hash_grid import HashLevels, hash_features, hash_grid_op, known_features
+from dyngs.ops.hash_grid import (
+    HashLevels,
+    hash_features,
+    hash_grid_backward_op,
+    hash_grid_op,
+    known_features,
+    known_features_op,
+)
 from dyngs.ops.native import kernel_threads
 
 LEVELS = HashLevels.geometric(4, 3, 24, 64)
@@ -119,3 +126,12 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         with pytest.raises(DyngsError, match=message):
             hash_features(points, rows, LEVELS)
+
+
+def test_the_ops_are_registered_as_torch_wants_them() -> None:
+    coords, table = some(6, 3), table_of(LEVELS, 2)
+    sizes = list(LEVELS.scales), list(LEVELS.sizes), list(LEVELS.rows)
+    features = hash_features(coords, table, LEVELS).detach()
+    torch.library.opcheck(hash_grid_op, (coords, table, *sizes))
+    torch.library.opcheck(hash_grid_backward_op, (coords, table.detach(), features, *sizes))
+    torch.library.opcheck(known_features_op, (features, torch.tensor([1, 4]), coords[[1, 4]], table, *sizes))

@@ -12,7 +12,18 @@ from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
-from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, composite_op, march, offsets_of, reached
+from dyngs.ops.rays import (
+    Rays,
+    Samples,
+    Space,
+    Steps,
+    composite,
+    composite_backward_op,
+    composite_op,
+    march,
+    offsets_of,
+    reached,
+)
 
 NESTED = Space((0.1, 0.2, -0.1), 1.0, 2, 8)
 
@@ -166,3 +177,11 @@ def test_what_does_not_fit_is_refused() -> None:
         composite(densities.float(), colours.float(), samples)
     with pytest.raises(DyngsError, match="cells must be"):
         march(towards(1.0, 0, 0), torch.zeros(1), NESTED, torch.ones(2, 8, 8, 4, dtype=torch.bool), Steps(0.0, 0.1))
+
+
+def test_the_ops_are_registered_as_torch_wants_them() -> None:
+    densities, colours, samples = some_samples([2, 3])
+    given = densities, colours, samples.starts, samples.ends, samples.offsets
+    torch.library.opcheck(composite_op, (*given, 0.0))
+    grads = [torch.ones(2, 3, dtype=torch.float64), *torch.ones(2, 2, dtype=torch.float64).unbind()]
+    torch.library.opcheck(composite_backward_op, ([x.detach() for x in given], grads, 0.0))
