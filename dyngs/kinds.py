@@ -85,7 +85,7 @@ def assemble(
     robust, exposures = _robust(config, capture, images), exposures_of(config.train, images)
     alpha_weight, findings = _alpha_weight(config, capture, images)
     losses = [
-        ImageLoss(config.train.ssim_weight),
+        model.colour_loss or ImageLoss(config.train.ssim_weight),
         SilhouetteLoss(alpha_weight, masked=robust is not None),
         PenaltyLoss(),
         *([] if exposures is None else [exposures]),
@@ -108,7 +108,8 @@ def assemble(
         exposures=exposures,
         refinement=refinement,
     )
-    trainer.place(device_for(config.run.device))
+    anywhere = config.model.on_gpu or config.run.device != "auto"
+    trainer.place(device_for(config.run.device if anywhere else "cpu"))
     return trainer
 
 
@@ -155,7 +156,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
 
 def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors:
     """Return the priors of the capture that are used; none for people, whose poses say how they move."""
-    if config.model.is_posed:
+    if config.model.is_posed or not config.model.draws_whole_images:
         return UsedPriors()
     moves = config.model.may_move and len(set(training_times(capture))) > 1
     return used_priors(config, capture, images, moves=moves)

@@ -67,7 +67,8 @@ auto checked(const std::optional<A>& array, Sizes... sizes) -> decltype(array->d
   return array ? checked(*array, sizes...) : nullptr;
 }
 
-// The bindings of all ops.
+// The bindings of all ops; those of fields are for the CPU alone.
+void bind_fields(nb::module_& module);
 void bind_nodes(nb::module_& module);
 void bind_offsets(nb::module_& module);
 void bind_perceptron(nb::module_& module);

@@ -22,6 +22,7 @@ _OTHER_SUFFIXES = {f".{MOVING}": MOVING, ".npz": "tracks", ".safetensors": "avat
 _OTHER_SUFFIXES |= {".html": "html", ".json": "cameras"}
 
 _TIMES, _PARTS, _AXES = ("time", "times"), ("static", "dynamic"), ("up", "from_up", "sh_degree")
+_SHOWN = {"surface": "mesh"}  # Names of --format, where these are others
 _FOR_DYNGS = {"max_change": "it goes with --format dyngs"}
 _FOR_SPLATS = dict.fromkeys(_AXES, "it goes with files of Gaussians")
 _UNFIT: dict[str, dict[str, str]] = {
@@ -34,6 +35,8 @@ _UNFIT: dict[str, dict[str, str]] = {
         "sh_degree": "the page has the colours of the run",
     },
     "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up") | _FOR_DYNGS,
+    "surface": dict.fromkeys(("times", "motion", *_PARTS, *_AXES), "the file has the surface of a field at one time")
+    | _FOR_DYNGS,
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
     "tracks": _FOR_SPLATS,
@@ -88,6 +91,8 @@ def add_parser(commands: args.Commands) -> None:
         "the PSNR of training views by 0.025 dB)"
     )
     parser.add_argument("--max-change", type=float, metavar="X", help=about)
+    about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
+    parser.add_argument("--level", type=float, metavar="X", help=about)
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "what moves rigidly as animated nodes of a .glb; the rest stands as at --time"
@@ -106,10 +111,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
+    kind = "surface" if kind == "mesh" and _is_field(arguments) else kind
     _require_fitting(arguments, kind)
     writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
+    writers["surface"] = _export_surface
     if arguments.bodies:
         return _export_bodies(arguments)
+    if arguments.level is not None and kind != "surface":
+        raise DyngsError("--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)")
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
@@ -139,7 +148,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
     """Raise for the first option that does not go with a format, with the reason."""
-    format = "--bodies" if arguments.bodies else "--joints" if arguments.joints else f"--format {kind}"
+    format = (
+        "--bodies" if arguments.bodies else "--joints" if arguments.joints else f"--format {_SHOWN.get(kind, kind)}"
+    )
     unfit = "bodies" if arguments.bodies else "mesh" if arguments.joints else kind
     for name, reason in _UNFIT.get(unfit, {}).items():
         passed = getattr(arguments, name)
@@ -159,7 +170,7 @@ def _kind(arguments: argparse.Namespace) -> str:
         return stated or "ply"
     found = known_format(out)
     named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
-    if stated == "mesh" and named == "glb":
+    if stated == "mesh" and (named in ("glb", "ply") or out.suffix.lower() == ".obj"):
         return stated
     if stated is None and named is None:
         if _is_sequence(arguments) and not out.suffix:
@@ -369,6 +380,28 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
     args.print_notes(written.notes)
     args.print_written(written.path)
+    return 0
+
+
+def _is_field(arguments: argparse.Namespace) -> bool:
+    """Return whether the run is a radiance field, whose surface is a mesh."""
+    from dyngs.config.io import load_resolved
+    from dyngs.fields.keys import FieldModel
+
+    return arguments.run_dir.is_dir() and isinstance(load_resolved(arguments.run_dir).model, FieldModel)
+
+
+def _export_surface(arguments: argparse.Namespace) -> int:
+    """Write the surface of a radiance field."""
+    from dyngs.export.surface_file import write_surface
+    from dyngs.runs.opened import open_scene
+
+    out: Path = arguments.out or arguments.run_dir / "mesh.ply"
+    opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
+    time = 0.0 if arguments.time is None else arguments.time
+    surface = write_surface(opened, out, time=time, level=arguments.level)
+    args.print_notes((f"{counted(len(surface.faces), 'triangle')} with colours of {len(surface.vertices):,} vertices",))
+    args.print_written(out)
     return 0
 
 

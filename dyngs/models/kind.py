@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from dyngs.deform.keys import DynamicModel
+from dyngs.fields.keys import NerfModel, NgpModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import ModelSection
 from dyngs.static.keys import StaticModel
@@ -67,6 +68,8 @@ KINDS: tuple[Kind, ...] = (
     Kind(DynamicModel, "dyngs.deform.kind"),
     Kind(HumanModel, "dyngs.human.avatar.kind"),
     Kind(HumanPredictorModel, "dyngs.training.prediction"),
+    Kind(NgpModel, "dyngs.fields.kind"),
+    Kind(NerfModel, "dyngs.fields.kind"),
 )
 
 

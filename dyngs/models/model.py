@@ -35,6 +35,8 @@ class Drawn:
     # field could go unseen; empty: nothing was
     moved: Mapping[str, Tensor] = field(default_factory=dict)
     after_backward: Callable[[], None] = nothing  # takes in gradients once they are there
+    # what the rendering is compared with where that is only some pixels of the image; None: the whole image
+    image: Image | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,11 @@ class Model(ABC, Generic[S_co]):
     @abstractmethod
     def place(self, device: torch.device) -> None:
         """Go on on ``device``."""
+
+    @property
+    def colour_loss(self) -> Loss | None:
+        """How its colours are compared with true ones; None: by L1 and D-SSIM."""
+        return None
 
     def regularizers(self) -> Mapping[str, Tensor]:
         return {}

@@ -26,6 +26,7 @@ def require_possible(config: Config) -> None:
     """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
     if config.model.is_posed and config.camera.refine == "always":
         raise DyngsError("camera.refine: cameras of people are not refined, their poses are; leave it out")
+    _require_whole_images(config)
     _require_batch(config)
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]
@@ -54,6 +55,21 @@ def shared(config: Config, processes: Processes) -> Config:
     return config
 
 
+def _require_whole_images(config: Config) -> None:
+    """Raise where something is asked for that looks at whole images of a model that draws some of their pixels."""
+    if config.model.draws_whole_images:
+        return
+    for key, value in _of_single_images(config).items():
+        if value == "always":
+            raise DyngsError(f"{key}=always: model.kind={config.model.kind} draws no whole images; leave it out")
+
+
+def _of_single_images(config: Config) -> dict[str, str]:
+    """Return the choices that follow single images, by their keys."""
+    train = config.train
+    return {"train.robust": train.robust, "train.exposure": train.exposure, "camera.refine": config.camera.refine}
+
+
 def _require_batch(config: Config) -> None:
     """Raise where several views per step are asked for, and something that follows single images."""
     if config.train.batch_size == 1:
@@ -61,12 +77,7 @@ def _require_batch(config: Config) -> None:
     asked = f"train.batch_size={config.train.batch_size}"
     if config.model.is_network:
         raise DyngsError(f"{asked}: a network is trained on one person per step, by one process; leave it out")
-    single = {
-        "train.robust": config.train.robust,
-        "train.exposure": config.train.exposure,
-        "camera.refine": config.camera.refine,
-    }
-    for key, value in single.items():
+    for key, value in _of_single_images(config).items():
         if value != "never":
             raise DyngsError(f"{asked}: {key}={value} follows one image per step; give {key}=never, or one process")
 

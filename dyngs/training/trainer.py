@@ -148,7 +148,7 @@ class Trainer(Generic[M]):
         background = sent(background_colour(self.background, self.generator), self.device)
         depth = any(loss.needs_depth(image) for loss in self.losses)
         drawn = self.model.draw(image, step, background, depth=depth)
-        rendering = drawn.rendering
+        rendering, image = drawn.rendering, drawn.image or image
         if self.robust is not None:
             draw, time = self._drawn_with_depth(background), image.time
             image = self.robust.masked(

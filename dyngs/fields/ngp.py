@@ -1,0 +1,187 @@
+"""Instant-NGP (Müller et al. 2022): a multiresolution hash grid, a density and a colour network, occupied cells.
+
+Trained by the protocol of nerfacc's occupancy grid (Li et al. 2023).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from dyngs.fields.field import PUBLISHED_HALF, Field, Seen, network, truncated_exp
+from dyngs.fields.keys import NgpModel
+from dyngs.initialisation import glorot
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.ops.harmonics import harmonics_basis
+from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
+from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march, reached
+from dyngs.state import Role, State, with_role
+from dyngs.tensor_checks import require_tensor
+
+WIDTH, GEOMETRY = 64, 16  # Features of hidden layers, and of the density network's output, whose first is the density
+DIRECTION_DEGREE, DIRECTION_TERMS = 3, 16  # Of the harmonics of directions; Instant-NGP counts degrees from 1
+CONE = 1 / 256  # Least length of a sample outside of it, in units of its distance
+FIRST = 1e-4  # Rows of the grid begin within this of 0
+
+
+@dataclass(frozen=True)
+class NgpSizes:
+    """Sizes of a field and of a step of its training."""
+
+    levels: HashLevels
+    features: int
+    num_samples: int  # of a step
+    across: int  # samples along the diagonal of the innermost cube
+
+    @staticmethod
+    def of(model: NgpModel) -> NgpSizes:
+        """Return what ``model`` asks for; what it leaves open is for a CPU, or as published."""
+        published = model.sizes == "published"
+        levels = model.levels or (16 if published else 8)
+        features = model.features or (2 if published else 4)
+        log2_rows = model.log2_rows or (19 if published else 17)
+        finest = model.finest or (4096 if published else 1024)
+        grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows, dims=4 if model.time else 3)
+        return NgpSizes(
+            grid, features, 1 << (model.log2_samples or (18 if published else 16)), 1024 if published else 512
+        )
+
+
+@dataclass(frozen=True)
+class NgpField(Field):
+    """A hash grid with its two networks, and the cells in which anything is.
+
+    Attributes:
+        table: (rows, F) of all levels.
+        density, colour: weights of the networks, (out, in) each.
+        occupied: bool of ``space.shape``.
+        across: samples along the diagonal of the innermost cube.
+    """
+
+    space: Space
+    levels: HashLevels
+    table: Tensor
+    density: tuple[Tensor, ...]
+    colour: tuple[Tensor, ...]
+    occupied: Tensor
+    across: int
+    sees_time: bool = False
+
+    @staticmethod
+    def new(model: NgpModel, space: Space, generator: torch.Generator) -> NgpField:
+        """Return a field before the first step: nearly grey, hardly dense, occupied everywhere."""
+        sizes = NgpSizes.of(model)
+        rows = torch.rand((sizes.levels.num_rows, sizes.features), generator=generator, device="cpu")
+        inputs = len(sizes.levels.rows) * sizes.features
+        density = (inputs, WIDTH, GEOMETRY)
+        colour = (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)
+        weights = [
+            tuple(glorot(i, o, generator).requires_grad_() for i, o in pairwise(widths)) for widths in (density, colour)
+        ]
+        occupied = torch.ones(space.shape, dtype=torch.bool, device="cpu")
+        table = (FIRST * (2 * rows - 1)).requires_grad_()
+        return NgpField(space, sizes.levels, table, weights[0], weights[1], occupied, sizes.across, model.time)
+
+    @staticmethod
+    def restored(model: NgpModel, space: Space, checkpoint: Checkpoint) -> NgpField:
+        """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
+        stored, sizes = checkpoint.part("field"), NgpSizes.of(model)
+        table = require_tensor("table", stored["table"], (sizes.levels.num_rows, sizes.features)).clone()
+        inputs = len(sizes.levels.rows) * sizes.features
+        widths = {"density": (inputs, WIDTH, GEOMETRY), "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)}
+        networks = {
+            name: tuple(
+                require_tensor(f"{name}.{i}", stored[f"{name}.{i}"], (out, before)).clone()
+                for i, (before, out) in enumerate(pairwise(w))
+            )
+            for name, w in widths.items()
+        }
+        count = math.prod(space.shape)
+        bits = require_tensor("occupied", stored["occupied"], (-(-count // 8),), torch.uint8)
+        occupied = _unpacked(bits, space)
+        return NgpField(
+            space, sizes.levels, table, networks["density"], networks["colour"], occupied, sizes.across, model.time
+        )
+
+    @property
+    def num_shifts(self) -> int:
+        return 1
+
+    @property
+    def parameters(self) -> Mapping[str, Tensor]:
+        networks = {"density": self.density, "colour": self.colour}
+        weights = {f"{name}.{i}": x for name, network in networks.items() for i, x in enumerate(network)}
+        return {"table": self.table, **weights}
+
+    def state(self) -> State:
+        tensors = {name: x.detach() for name, x in self.parameters.items()}
+        return with_role(tensors | {"occupied": _packed(self.occupied)}, Role.SHARED)
+
+    @cached_property
+    def step(self) -> float:
+        """Length of a sample, world units."""
+        return 2 * self.space.half * math.sqrt(3) / self.across
+
+    def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
+        steps = Steps(near, self.step, CONE if self.space.cascades > 1 else 0.0)
+        shift = rays.origins.new_full((len(rays),), 0.5) if shifts is None else shifts[:, 0].contiguous()
+        samples = march(rays, shift, self.space, self.occupied, steps)
+        with torch.no_grad():  # which samples are reached takes their densities alone
+            coords = self._with_time(samples.coords, time)
+            features = hash_features(coords, self.table, self.levels)
+            through, offsets = reached(self._density(network(features, self.density)), samples)
+        which = through.nonzero()[:, 0]
+        samples = Samples(
+            offsets, samples.rays[which].long(), samples.starts[which], samples.ends[which], samples.coords[which]
+        )
+        found = known_features(features, which, coords[which], self.table, self.levels)
+        geometry = network(found, self.density)
+        basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
+        colours = self._colours(geometry, basis[samples.rays])
+        drawn = composite(self._density(geometry), colours, samples)
+        return Seen(drawn.colour, drawn.transmittance, drawn.depth, len(samples))
+
+    def densities(self, points: Tensor, time: float) -> Tensor:
+        return self._density(self._geometry(self.space.unit(points), time))
+
+    def may_hold(self, points: Tensor) -> Tensor:
+        """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
+        n, middle = self.space.cells, points.new_tensor(self.space.centre)
+        place = ((points - middle) / self.space.half + 1) * (n / 2)
+        x, y, z = place.long().clamp(0, n - 1).unbind(1)
+        return self.occupied[0, z, y, x] | ((place < 0) | (place > n)).any(1)
+
+    def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
+        geometry = self._geometry(self.space.unit(points), time)
+        return self._colours(geometry, harmonics_basis(directions, DIRECTION_DEGREE))
+
+    def _geometry(self, coords: Tensor, time: float) -> Tensor:
+        return network(hash_features(self._with_time(coords, time), self.table, self.levels), self.density)
+
+    def _with_time(self, coords: Tensor, time: float) -> Tensor:
+        return torch.cat([coords, coords.new_full((len(coords), 1), time)], 1) if self.sees_time else coords
+
+    def _density(self, geometry: Tensor) -> Tensor:
+        """Return (M,) densities, per world unit; the published ones are per unit of a cube of half side 1.5."""
+        return truncated_exp(geometry[:, 0] - 1) * (PUBLISHED_HALF / self.space.half)
+
+    def _colours(self, geometry: Tensor, basis: Tensor) -> Tensor:
+        return network(torch.cat([geometry, basis], 1), self.colour).sigmoid()
+
+
+def _packed(occupied: Tensor) -> Tensor:
+    """Return (cells / 8,) uint8, rounded up: bit i % 8 of byte i / 8 is cell i."""
+    flat = occupied.flatten()
+    flat = torch.cat([flat, flat.new_zeros(-len(flat) % 8)]).view(-1, 8)
+    return (flat.to(torch.uint8) << torch.arange(8, dtype=torch.uint8, device=flat.device)).sum(1, dtype=torch.uint8)
+
+
+def _unpacked(bits: Tensor, space: Space) -> Tensor:
+    flat = bits[:, None] >> torch.arange(8, dtype=torch.uint8, device=bits.device) & 1
+    return flat.bool().flatten()[: math.prod(space.shape)].reshape(space.shape)

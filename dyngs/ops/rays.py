@@ -1,0 +1,204 @@
+"""Samples along rays through the occupied cells of a space, and what is seen along them (Max 1995), differentiable.
+
+R rays, M samples. The samples of a ray lie next to each other, from ``offsets[r]`` to before ``offsets[r + 1]``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dyngs.errors import DyngsError
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, empty_like, launch, register
+
+TRANSMITTANCE_MIN = 1e-4  # A ray ends when less than this is left (Müller et al. 2022)
+
+
+@dataclass(frozen=True)
+class Space:
+    """Nested cubes around a centre, each twice the one inside it, all cut into as many cells along an axis.
+
+    Example::
+
+        Space((0.0, 0.0, 0.0), half=1.5, cascades=1, cells=128)  # one cube: nothing lies outside of it
+    """
+
+    centre: tuple[float, float, float]  # world
+    half: float  # half the side of the innermost cube, world units
+    cascades: int  # number of cubes
+    cells: int  # along an axis of each
+
+    @property
+    def outermost(self) -> float:
+        """Half the side of the outermost cube, world units."""
+        return self.half * 2 ** (self.cascades - 1)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Cubes, and cells along z, y, x."""
+        return self.cascades, self.cells, self.cells, self.cells
+
+    def unit(self, points: Tensor) -> Tensor:
+        """Return points (..., 3) of the world in the unit cube.
+
+        With several cubes what lies outside of the innermost is contracted: y to (2 - 1/|y|) y/|y| in the max-norm
+        (Barron et al. 2022), so that the innermost cube becomes [1/4, 3/4]^3.
+        """
+        y = (points - points.new_tensor(self.centre)) / self.half
+        if self.cascades == 1:
+            return y / 2 + 0.5
+        norm = y.abs().amax(-1, keepdim=True).clamp_min(1)
+        return y * ((2 - 1 / norm) / norm) / 4 + 0.5
+
+
+@dataclass(frozen=True)
+class Rays:
+    """R rays in the world, float32 or float64."""
+
+    origins: Tensor  # (R, 3)
+    directions: Tensor  # (R, 3) unit
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def __getitem__(self, which: slice | Tensor) -> Rays:
+        return Rays(self.origins[which], self.directions[which])
+
+
+@dataclass(frozen=True)
+class Samples:
+    """M samples of R rays."""
+
+    offsets: Tensor  # (R + 1,) int64
+    rays: Tensor  # (M,) int32 or int64 index of the ray
+    starts: Tensor  # (M,) distance along the ray
+    ends: Tensor  # (M,)
+    coords: Tensor  # (M, 3) of the middle in the unit cube, see ``Space.unit``
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    @property
+    def num_rays(self) -> int:
+        return len(self.offsets) - 1
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How long samples are: at least ``length``, and at least ``cone`` times their distance; world units."""
+
+    near: float
+    length: float
+    cone: float = 0.0
+    most: int = 1 << 16  # of a ray
+
+
+@torch.no_grad()
+def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: Steps) -> Samples:
+    """Return the samples of rays whose middle lies in an occupied cell.
+
+    Empty cells are skipped by whole steps. ``shifts`` (R,) in [0, 1): by which fraction of a step those of each ray are
+    shifted. ``occupied``: bool of ``space.shape``. The same samples on any number of threads.
+    """
+    if occupied.shape != space.shape or occupied.dtype != torch.bool:
+        raise DyngsError(f"march: cells must be bool {space.shape}, got {occupied.dtype} {tuple(occupied.shape)}")
+    centre = tuple(float(x) for x in space.centre)
+    sizes = (centre, float(space.half), space.cascades, space.cells)
+    options = (float(steps.near), float(steps.length), float(steps.cone), steps.most)
+    given = (rays.origins.contiguous(), rays.directions.contiguous(), shifts, sizes, occupied, options)
+    counts = torch.empty(len(rays), dtype=torch.int64, device="cpu")
+    launch(shifts, "march_count", *given, counts, num_threads())
+    offsets = offsets_of(counts)
+    count = int(offsets[-1])
+    which = torch.empty(count, dtype=torch.int32, device="cpu")
+    starts, ends, coords = shifts.new_empty(count), shifts.new_empty(count), shifts.new_empty(count, 3)
+    launch(shifts, "march_samples", *given, offsets, (which, starts, ends, coords), num_threads())
+    return Samples(offsets, which, starts, ends, coords)
+
+
+@torch.no_grad()
+def reached(densities: Tensor, samples: Samples, transmittance_min: float = TRANSMITTANCE_MIN) -> tuple[Tensor, Tensor]:
+    """Return (M,) bool which samples light gets to through those before them, and the (R + 1,) offsets of these."""
+    which = torch.empty(len(samples), dtype=torch.bool, device="cpu")
+    counts = torch.empty(samples.num_rays, dtype=torch.int64, device="cpu")
+    given = (densities.contiguous(), samples.starts, samples.ends, samples.offsets, transmittance_min)
+    launch(densities, "reached_samples", *given, which, counts, num_threads())
+    return which, offsets_of(counts)
+
+
+def offsets_of(counts: Tensor) -> Tensor:
+    """Return (R + 1,) sums of the counts (R,) before each ray, and of all."""
+    return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+
+
+def _composite(
+    densities: Tensor, colours: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, transmittance_min: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    rays = offsets.shape[0] - 1
+    out = (densities.new_empty(rays, 3), densities.new_empty(rays), densities.new_empty(rays), empty_like(densities))
+    launch(
+        densities, "composite_forward", densities, colours, starts, ends, offsets, transmittance_min, out, num_threads()
+    )
+    return out
+
+
+def _composite_backward(samples: list[Tensor], grads: list[Tensor], transmittance_min: float) -> tuple[Tensor, Tensor]:
+    g_densities, g_colours = empty_like(samples[0]), empty_like(samples[1])
+    results = g_densities, g_colours
+    launch(samples[0], "composite_backward", *samples, transmittance_min, tuple(grads), *results, num_threads())
+    return g_densities, g_colours
+
+
+composite_backward_op = register("composite_backward", _composite_backward, devices=("cpu",))
+"""Gradients by densities and colours; ``samples`` are the first five inputs of ``composite``."""
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    *samples, ctx.transmittance_min = inputs
+    ctx.mark_non_differentiable(output[3])
+    ctx.save_for_backward(*samples)
+
+
+def _backward(ctx: Any, colour: Tensor, transmittance: Tensor, depth: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    grads = [x.contiguous() for x in (colour, transmittance, depth)]
+    by_densities, by_colours = composite_backward_op(list(ctx.saved_tensors), grads, ctx.transmittance_min)
+    return by_densities, by_colours, None, None, None, None
+
+
+composite_op = register("composite", _composite, devices=("cpu",), gradient=Gradient(_save, _backward))
+"""Colour (R, 3), transmittance (R,), sum of weight times distance (R,), and weights (M,)."""
+
+
+@dataclass(frozen=True)
+class Composited:
+    """What R rays see."""
+
+    colour: Tensor  # (R, 3) before black
+    transmittance: Tensor  # (R,) that is left
+    depth: Tensor  # (R,) sum of weight times the distance along the ray
+    weights: Tensor  # (M,) of the samples, without gradient
+
+
+def composite(
+    densities: Tensor, colours: Tensor, samples: Samples, transmittance_min: float = TRANSMITTANCE_MIN
+) -> Composited:
+    """Return what rays see of samples with densities (M,), per world unit, and colours (M, 3); differentiable once.
+
+    alpha = 1 - exp(-density length), weight = alpha times the transmittance before it. A ray ends when less than
+    ``transmittance_min`` is left. The same bits on any number of threads. Raises DyngsError: shapes or dtypes that do
+    not fit.
+    """
+    count = len(samples)
+    if densities.shape != (count,) or colours.shape != (count, 3):
+        raise DyngsError(
+            f"composite: densities must be ({count},) and colours ({count}, 3), got {tuple(densities.shape)} and "
+            f"{tuple(colours.shape)}"
+        )
+    if not densities.dtype == colours.dtype == samples.starts.dtype:
+        raise DyngsError("composite: densities, colours and samples must be of one dtype")
+    given = (densities.contiguous(), colours.contiguous(), samples.starts, samples.ends, samples.offsets)
+    return Composited(*composite_op(*given, transmittance_min))

@@ -1,0 +1,137 @@
+"""Hash grids against their formula in float64, and their promises: same bits on any threads, what lies outside."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from field_reference import reference_features
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dyngs.errors import DyngsError
+from dyngs.ops.hash_grid import (
+    HashLevels,
+    hash_features,
+    hash_grid_backward_op,
+    hash_grid_op,
+    known_features,
+    known_features_op,
+)
+from dyngs.ops.native import kernel_threads
+
+LEVELS = HashLevels.geometric(4, 3, 24, 64)
+
+
+def some(count: int, dims: int, seed: int = 0) -> torch.Tensor:
+    """Points inside and around the unit cube."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(count, dims, generator=generator, dtype=torch.float64) * 1.2 - 0.1
+
+
+def table_of(levels: HashLevels, features: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return torch.randn(levels.num_rows, features, generator=generator, dtype=torch.float64).requires_grad_()
+
+
+def test_levels_are_the_published_ones() -> None:
+    """16 levels from 16 to 2,048 grow by 1.38 each (Müller et al. 2022, table 1 and equation 3)."""
+    levels = HashLevels.geometric(16, 16, 2048, 2**19)
+    assert (levels.sizes[0], levels.sizes[-1]) == (16, 2048)
+    ratios = [(b + 1) / (a + 1) for a, b in zip(levels.scales, levels.scales[1:], strict=False)]
+    assert ratios == pytest.approx([1.3819] * 15, abs=1e-4)
+    assert levels.rows[0] == 16**3
+    assert levels.rows[-1] == 2**19
+
+
+@given(
+    dims=st.sampled_from([3, 4]),
+    features=st.sampled_from([1, 2, 4, 8]),
+    count=st.integers(0, 50),
+    shape=st.tuples(st.integers(1, 4), st.integers(2, 6), st.integers(6, 30), st.integers(3, 8)),
+)
+@settings(max_examples=40, deadline=None)
+def test_double_equals_the_formula(dims: int, features: int, count: int, shape: tuple[int, int, int, int]) -> None:
+    number, coarsest, finest, log2_rows = shape
+    levels = HashLevels.geometric(number, coarsest, finest, 1 << log2_rows, dims)
+    coords, table = some(count, dims, count), table_of(levels, features)
+    found, expected = hash_features(coords, table, levels), reference_features(coords, table, levels)
+    weights = torch.randn(found.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
+    by_kernel, by_formula = (torch.autograd.grad(x, table, weights)[0] for x in (found, expected))
+    assert torch.allclose(by_kernel, by_formula, rtol=1e-12, atol=1e-12)
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    levels = HashLevels.geometric(2, 2, 4, 8)
+    coords, table = some(6, 3), table_of(levels, 2)
+    sizes = list(levels.scales), list(levels.sizes), list(levels.rows)
+    assert torch.autograd.gradcheck(lambda x: hash_grid_op(coords, x, *sizes), (table,))
+
+
+@pytest.mark.parametrize("features", [2, 4])
+def test_the_same_bytes_on_any_number_of_threads(features: int) -> None:
+    """More threads than levels share the rows of a level between them."""
+    coords, table = some(5000, 3).float(), table_of(LEVELS, features).detach().float().requires_grad_()
+    weights = torch.randn(5000, 4 * features, generator=torch.Generator().manual_seed(3))
+    results = []
+    for threads in (1, 2, 7):
+        with kernel_threads(threads):
+            found = hash_features(coords, table, LEVELS)
+            results.append((found.detach(), torch.autograd.grad(found, table, weights)[0]))
+    assert all(torch.equal(a, b) for one in results[1:] for a, b in zip(one, results[0], strict=True))
+
+
+def test_single_precision_is_close() -> None:
+    coords, table = some(200, 3), table_of(LEVELS, 4).detach()
+    exact, single = hash_features(coords, table, LEVELS), hash_features(coords.float(), table.float(), LEVELS)
+    # weights are off by 24 cells times the rounding of a coordinate
+    assert (single.double() - exact).abs().max() < 1e-4
+
+
+def test_known_features_have_the_gradient_of_a_look_up() -> None:
+    coords, table = some(40, 3), table_of(LEVELS, 2)
+    which = torch.tensor([3, 17, 39])
+    known = known_features(hash_features(coords, table, LEVELS).detach(), which, coords[which], table, LEVELS)
+    again = hash_features(coords[which], table, LEVELS)
+    assert torch.equal(known, again)
+    (one,), (other,) = (torch.autograd.grad(x.square().sum(), table) for x in (known, again))
+    assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_coordinate_that_is_no_number_shows(bad: float) -> None:
+    coords = some(5, 3)
+    coords[2, 1] = bad
+    found = hash_features(coords, table_of(LEVELS, 2), LEVELS)
+    assert found.isfinite().all(1).tolist() == [True, True, False, True, True]
+
+
+def test_nan_in_a_row_reaches_only_points_beside_it() -> None:
+    table = table_of(LEVELS, 1).detach()
+    table[0] = math.nan  # the lowest corner of the coarsest level
+    found = hash_features(torch.tensor([[0.0, 0, 0], [0.9, 0.9, 0.9]], dtype=torch.float64), table, LEVELS)
+    assert found.isfinite().all(1).tolist() == [False, True]
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    coords, table = some(4, 3), table_of(LEVELS, 2)
+    for points, rows, message in (
+        (coords[:, :2], table, r"\(M, 3\)"),
+        (coords, table[1:], "table must be"),
+        (coords, torch.cat([table, table[:, :1]], 1), "1, 2, 4 or 8"),
+        (coords.float(), table, "float64"),
+        (coords.clone().requires_grad_(), table, "no gradient"),
+    ):
+        with pytest.raises(DyngsError, match=message):
+            hash_features(points, rows, LEVELS)
+
+
+def test_the_ops_are_registered_as_torch_wants_them() -> None:
+    coords, table = some(6, 3), table_of(LEVELS, 2)
+    sizes = list(LEVELS.scales), list(LEVELS.sizes), list(LEVELS.rows)
+    features = hash_features(coords, table, LEVELS).detach()
+    torch.library.opcheck(hash_grid_op, (coords, table, *sizes))
+    torch.library.opcheck(hash_grid_backward_op, (coords, table.detach(), features, *sizes))
+    torch.library.opcheck(known_features_op, (features, torch.tensor([1, 4]), coords[[1, 4]], table, *sizes))
