@@ -331,7 +331,8 @@ def write_keyframes(root: Path) -> None:
 
 def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
-    from dyngs.tradeoff.measure import Measurement, Quartiles, Speed
+    from dyngs.study.speed import Quartiles, Speed
+    from dyngs.tradeoff.measure import Measurement
     from dyngs.tradeoff.measure import write_measurement as write
     from dyngs.tradeoff.variants import Variant
 

@@ -75,7 +75,7 @@ KINDS = (
     ("init.kind=random",),
     *(("model.kind=dynamic", f"model.deform.kind={kind}") for kind in ("mlp", "hexplane", "control_nodes")),
 )
-PRESETS = ("static", "dynamic", "human", "human_predictor")
+PRESETS = ("static", "dynamic", "human", "human_predictor", "ngp")
 PLACEHOLDER = re.compile(r"[A-Z]|\.\.\.|start:stop:step|value|X,Y")
 
 

@@ -19,19 +19,16 @@ from dyngs.api.pair_scores import PairScore, after_colour_fit, after_pose_fit, e
 from dyngs.config import (
     BudgetConfig,
     Config,
-    DefaultStrategy,
     DeformField,
     DynamicModel,
     FieldSection,
     FreeField,
     NetworkColour,
-    OptimConfig,
-    PointsInit,
     PruneConfig,
     ShColour,
     StaticModel,
-    TrainConfig,
 )
+from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.images import target_size
 from dyngs.data.loader import ImageLoader
@@ -186,11 +183,12 @@ def write_choices(folder: Path, choices: Sequence[Choice]) -> None:
 def as_static(config: Config) -> Config:
     """Return ``config`` as a static scene: what was requested stays where a static one has such a key.
 
-    All else are the defaults, which the preset ``static`` has.
+    All else is as in the preset ``static``.
     """
-    usual = {"model": StaticModel(), "init": PointsInit(), "strategy": DefaultStrategy(), "optim": OptimConfig()}
-    changed = {name: _requested(getattr(config, name), section) for name, section in usual.items()}
-    train = _requested(config.train, TrainConfig())
+    usual = load_config(packaged_preset("static"), [f"data.root={config.data.root}"])
+    names = ("model", "init", "strategy", "optim")
+    changed = {name: _requested(getattr(config, name), getattr(usual, name)) for name in names}
+    train = _requested(config.train, usual.train)
     lengths = ("steps", "log_every", "save_every", "eval_every", "tensorboard")
     kept = {name: getattr(config.train, name) for name in lengths}
     return config.model_copy(update=changed | {"train": train.model_copy(update=kept)})

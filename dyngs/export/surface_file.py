@@ -11,6 +11,7 @@ from dyngs.errors import DyngsError
 from dyngs.fields.mesh import Surface, surface_of
 from dyngs.fields.scene import FieldScene
 from dyngs.files.write import atomic_file
+from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 
 SUFFIXES = ".ply", ".glb", ".obj"
@@ -26,6 +27,7 @@ def write_surface(opened: Opened, out: Path, *, time: float = 0.0, level: float 
         raise DyngsError(f"{out}: a surface is that of a radiance field (model.kind=ngp or nerf)")
     if out.suffix.lower() not in SUFFIXES:
         raise DyngsError(f"{out}: a mesh of a radiance field is one file that ends in {', '.join(SUFFIXES)}")
+    inputs_of(opened).require_output(out)
     import trimesh
 
     surface = surface_of(scene, time, level)

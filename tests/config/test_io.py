@@ -72,10 +72,8 @@ def test_published_protocols() -> None:
     assert blender.train.steps == 30_000
     assert blender.data.background == "white"
     assert blender.init == RandomInit(num_random=100_000, half_extent=1.3)
-    assert (blender.strategy, blender.optim) == (DefaultStrategy(prune_pixels=0), OptimConfig())
-    assert blender.train.initial_downscale == 1
+    assert (blender.strategy, blender.optim) == (DefaultStrategy(), OptimConfig())
     colmap = load_config(packaged_preset("colmap"), [ROOT])
-    assert (colmap.strategy, colmap.train.initial_downscale) == (DefaultStrategy(prune_pixels=0), 1)
     assert (colmap.train.steps, colmap.data.test_every, colmap.data.longest_side) == (30_000, 8, 1600)
     mip = load_config(packaged_preset("mip"), [ROOT]).model
     assert (mip.rasterize_mode, mip.eps2d, mip.filter_3d) == (RasterizeMode.ANTIALIASED, 0.1, True)

@@ -21,7 +21,15 @@ from dyngs.training.trainer import Trainer
 
 
 def config_of(root: Path, *keys: str) -> Config:
-    words = [f"data.root={root}", "train.steps=12", "init.num_random=300", "run.threads=1", *keys]
+    words = [
+        f"data.root={root}",
+        "train.steps=12",
+        "init.kind=random",
+        "init.num_random=300",
+        "strategy.prune_pixels=0",
+        "run.threads=1",
+        *keys,
+    ]
     return load_config(packaged_preset("static"), words)
 
 

@@ -52,9 +52,7 @@ def _config(captures: Path, folder: Path, kind: str, **changes: object) -> Confi
         return busy_config(captures / "moving", folder, kind).model_copy(update=changes)
     person, still = kind == "human", "person" if kind == "human" else "still"
     strategies = {
-        "default": DefaultStrategy(
-            start=1, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150, prune_pixels=0
-        ),
+        "default": DefaultStrategy(start=1, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150),
         "mcmc": McmcStrategy(start=1, stop=15_000, every=3, max_gaussians=90, min_opacity=0.45),
         "human": DefaultStrategy(grow=False),
     }

@@ -255,7 +255,7 @@ def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name
 @pytest.mark.parametrize("name", ["none pays", "some pay"])
 def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> None:
     """For good: they stay zero while the set changes; the view that tells is not trained on before."""
-    busy = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000, prune_pixels=0)
+    busy = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000)
     trainer = _coloured(seven_views, COLOURS[name], busy)
     seen, findings, counts = set(), {}, set()
     for step in range(1, 41):

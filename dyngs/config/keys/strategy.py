@@ -37,7 +37,7 @@ class DefaultStrategy(Section):
         "null: never",
     )
     prune_pixels: float = Field(
-        default=0.5,
+        default=0.0,
         ge=0,
         description="when no more Gaussians are added, those are removed that make up less than so many pixels of "
         "every training view; static scenes only; 0: none",

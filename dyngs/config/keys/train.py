@@ -26,10 +26,10 @@ class TrainConfig(Section):
         "(docs/several_processes.md), and 1 means one for each process there",
     )
     initial_downscale: Literal[1, 2, 4, 8, 16] = Field(
-        default=2, description="sides of the training images are divided by this at first; 1: full resolution"
+        default=1, description="sides of the training images are divided by this at first; 1: full resolution"
     )
     resolution_grows_from: Fraction = Field(
-        default=0.3, description="fraction of the run after which initial_downscale is halved for the first time"
+        default=0.4, description="fraction of the run after which initial_downscale is halved for the first time"
     )
     resolution_full_at: Fraction = Field(
         default=0.7, description="fraction of the run after which images have their full resolution"

@@ -359,8 +359,8 @@ def _shrink_axis(
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
     if old % size == 0:  # all taps of all outputs alike: no gathers, the same sums
         taps = pixels.narrow(axis, begin_at * old // size - first_input, (end_at - begin_at) * old // size)
-        taps, share = taps.unflatten(axis, (-1, old // size)), pixels.new_tensor(size / old)
-        return sum((tap * share for tap in taps.unbind(axis + 1)), pixels.new_zeros(1))
+        taps = taps.unflatten(axis, (-1, old // size)).unbind(axis + 1)
+        return sum((tap * (size / old) for tap in taps), pixels.new_zeros(1))
     # Output i covers [i * old / size, (i + 1) * old / size): integer arithmetic keeps the fractions exact.
     starts = torch.arange(begin_at, end_at + 1, device=pixels.device) * old
     first = starts[:-1] // size
