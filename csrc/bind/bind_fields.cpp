@@ -18,8 +18,7 @@ std::vector<HashLevel> hash_levels(const LevelSizes& sizes, int64_t dims) {
   std::vector<HashLevel> levels;
   int64_t first = 0;
   for (const auto& [scale, size, rows] : sizes) {
-    if (size < 1 || size > 1 << 20 || !(scale >= 0 && scale <= size))
-      throw nb::value_error("hash grid: no such level");
+    if (size < 1 || size > 1 << 20 || !(scale >= 0 && scale <= size)) throw nb::value_error("hash grid: no such level");
     int64_t samples = 1;
     for (int64_t a = 0; a < dims; ++a) samples = std::min(samples * size, int64_t{1} << 40);
     const bool dense = samples == rows;
@@ -80,9 +79,11 @@ March<S> march_of(const SpaceSizes& sizes, const Array<const bool>& occupied, co
     throw nb::value_error("march: no such space");
   const int64_t rays = origins.shape(0);
   March<S> march{};
-  march.space = {{static_cast<S>(std::get<0>(centre)), static_cast<S>(std::get<1>(centre)),
-                  static_cast<S>(std::get<2>(centre))},
-                 static_cast<S>(half), cascades, cells};
+  march.space = {
+      {static_cast<S>(std::get<0>(centre)), static_cast<S>(std::get<1>(centre)), static_cast<S>(std::get<2>(centre))},
+      static_cast<S>(half),
+      cascades,
+      cells};
   march.occupied = checked(occupied, cascades * cells * cells * cells, "march: cells");
   march.origins = checked(origins, rays, 3, "march");
   march.directions = checked(directions, rays, 3, "march");
@@ -118,8 +119,8 @@ void write_samples(Rows<const S> origins, Rows<const S> directions, Array<const 
 
 template <class S>
 RaySamples<S> ray_samples(const Array<const S>& densities, const MaybeArray<const S>& colours,
-                          const Array<const S>& starts, const Array<const S>& ends,
-                          const Array<const int64_t>& offsets, double transmittance_min, int threads) {
+                          const Array<const S>& starts, const Array<const S>& ends, const Array<const int64_t>& offsets,
+                          double transmittance_min, int threads) {
   const int64_t count = densities.size(), rays = static_cast<int64_t>(offsets.size()) - 1;
   const int64_t* from = offsets.data();
   if (rays < 0 || from[0] != 0 || from[rays] != count || !std::is_sorted(from, from + rays + 1))
@@ -167,8 +168,7 @@ void backward(Array<const S> densities, Array<const S> colours, Array<const S> s
 template <class S>
 void reached(Array<const S> densities, Array<const S> starts, Array<const S> ends, Array<const int64_t> offsets,
              double transmittance_min, Array<bool> which, Array<int64_t> counts, int threads) {
-  const RaySamples<S> in =
-      ray_samples<S>(densities, std::nullopt, starts, ends, offsets, transmittance_min, threads);
+  const RaySamples<S> in = ray_samples<S>(densities, std::nullopt, starts, ends, offsets, transmittance_min, threads);
   bool* to = checked(which, static_cast<int64_t>(densities.size()), "reached");
   int64_t* numbers = checked(counts, in.rays, "reached");
   nb::gil_scoped_release release;

@@ -125,8 +125,7 @@ void composite_forward(const RaySamples<S>& in, const Composited<S>& out) {
 
 template <class S>
 void composite_backward(const RaySamples<S>& in, const Composited<const S>& grads, S* g_densities, S* g_colours) {
-  for_each_ray<S>(in.rays, in.threads,
-                  [&](int64_t ray) { composite_ray_vjp(in, grads, ray, g_densities, g_colours); });
+  for_each_ray<S>(in.rays, in.threads, [&](int64_t ray) { composite_ray_vjp(in, grads, ray, g_densities, g_colours); });
 }
 
 template <class S>
@@ -143,11 +142,11 @@ void reached_samples(const RaySamples<S>& in, bool* reached, int64_t* counts) {
   });
 }
 
-#define DYNGS_INSTANTIATE(S)                                                                            \
-  template void march_count<S>(const March<S>&, int64_t*);                                              \
-  template void march_samples<S>(const March<S>&, const int64_t*, const Samples<S>&);                   \
-  template void composite_forward<S>(const RaySamples<S>&, const Composited<S>&);                       \
-  template void composite_backward<S>(const RaySamples<S>&, const Composited<const S>&, S*, S*);        \
+#define DYNGS_INSTANTIATE(S)                                                                     \
+  template void march_count<S>(const March<S>&, int64_t*);                                       \
+  template void march_samples<S>(const March<S>&, const int64_t*, const Samples<S>&);            \
+  template void composite_forward<S>(const RaySamples<S>&, const Composited<S>&);                \
+  template void composite_backward<S>(const RaySamples<S>&, const Composited<const S>&, S*, S*); \
   template void reached_samples<S>(const RaySamples<S>&, bool*, int64_t*);
 DYNGS_INSTANTIATE(float)
 DYNGS_INSTANTIATE(double)

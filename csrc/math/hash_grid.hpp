@@ -8,11 +8,11 @@ namespace dyngs {
 
 // A level's rows lie one after the other in the table of all levels.
 struct HashLevel {
-  double scale;     // cells along an axis are 1 / scale wide; sample g lies at (g - 0.5) / scale
-  int64_t size;     // samples along an axis
-  int64_t first;    // row
-  int64_t rows;     // size^D where `dense`, else a power of two
-  bool dense;       // every sample has a row of its own; else rows are shared by a hash
+  double scale;   // cells along an axis are 1 / scale wide; sample g lies at (g - 0.5) / scale
+  int64_t size;   // samples along an axis
+  int64_t first;  // row
+  int64_t rows;   // size^D where `dense`, else a power of two
+  bool dense;     // every sample has a row of its own; else rows are shared by a hash
 };
 
 inline constexpr uint32_t kHashPrimes[4] = {1u, 2654435761u, 805459861u, 3674653429u};
@@ -27,8 +27,7 @@ struct HashCorners {
 
 // `coords` (kDims, kCount) in [0, 1], clamped; a coordinate that is no finite number makes the weights NaN.
 template <int kDims, int kCount, class S>
-DYNGS_INLINE void locate_hashed(const HashLevel& level, const S (*coords)[kCount],
-                                HashCorners<kDims, kCount, S>& out) {
+DYNGS_INLINE void locate_hashed(const HashLevel& level, const S (*coords)[kCount], HashCorners<kDims, kCount, S>& out) {
   const S scale = static_cast<S>(level.scale);
   const uint32_t last = static_cast<uint32_t>(level.size - 1), mask = static_cast<uint32_t>(level.rows - 1);
   uint32_t low[kDims][kCount], high[kDims][kCount];
