@@ -40,6 +40,7 @@ DYNGS_INLINE void locate_hashed(const HashLevel& level, const S (*coords)[kCount
       const S x = coords[a][i], inside = x > S(0) ? (x < S(1) ? x : S(1)) : S(0), at = inside * scale + S(0.5);
       const uint32_t below = static_cast<uint32_t>(static_cast<int32_t>(at));
       const uint32_t above = below + 1 < last ? below + 1 : last;
+      // NOLINTNEXTLINE(misc-redundant-expression): x - x is 0, but NaN for what is no finite number
       frac[a][i] = at - static_cast<S>(static_cast<int32_t>(below)) + (x - x);
       low[a][i] = below * factor, high[a][i] = above * factor;
     }
