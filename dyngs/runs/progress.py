@@ -71,7 +71,8 @@ class Progress:
         self._forecast.observe(config, record.step, now, record.num_gaussians, pixels)
         left = _clock(self._forecast.seconds(config, self._total))
         psnr = "-" if self._psnr is None else f"{self._psnr:.2f}"
-        text = f"loss {record.loss:.4f} psnr {psnr} {record.num_gaussians:,} Gaussians {rate:.1f} steps/s"
+        count = f"{record.num_gaussians:,} Gaussians " if record.num_gaussians else ""
+        text = f"loss {record.loss:.4f} psnr {psnr} {count}{rate:.1f} steps/s"
         if self._bar is not None:
             self._bar.update(self._task, completed=record.step, text=text, left=left)
         elif record.step >= self._next_line or record.step == self._total:
