@@ -165,7 +165,7 @@ def test_gaussians_with_joints(avatar: Path, tmp_path: Path, suffix: str) -> Non
     ("options", "words"),
     [
         ("--format mesh", r"ann\.safetensors: where to\? Give --out FILE\.glb"),
-        ("--format mesh --out x.ply", "--format mesh does not write files of that suffix"),
+        ("--format mesh --out x.ply", r"--format mesh writes one file; give --out x\.glb"),
         ("--format mesh --out .", r"--format mesh writes one file; give --out"),
         ("--format mesh --time 0 --out x.glb", "--time does not go with --format mesh"),
         ("--format mesh --up y --out x.glb", "--up does not go with --format mesh"),
