@@ -10,8 +10,7 @@ from dyngs.compare.page import page_text
 from dyngs.compare.peers import NUMBERS, Peer
 from dyngs.compare.plan import Bench
 from dyngs.compare.result import MEASURED, Result
-from dyngs.files.write import atomic_file, write_text
-from dyngs.study.plots import can_plot, png_of, svg_of
+from dyngs.study.plots import can_plot, svg_of, write_files
 from dyngs.study.tables import csv_text, markdown_table
 
 if TYPE_CHECKING:
@@ -68,14 +67,7 @@ def write_report(
     texts = {"csv": csv_text(rows), "md": f"{about(bench, results)}\n\n{markdown_table(head, cells)}{missing}"}
     svg = "" if figure is None else svg_of(figure)
     texts["html"] = page_text(bench, results, rows, left_out, (about(bench, results), head, cells, svg))
-    if svg:
-        texts["svg"] = svg
-    for suffix, text in texts.items():
-        write_text(out / f"{STEM}.{suffix}", text)
-    if figure is not None:
-        with atomic_file(out / f"{STEM}.png") as temporary:
-            temporary.write_bytes(png_of(figure))
-    return [out / f"{STEM}.{suffix}" for suffix in (*texts, *(["png"] if svg else []))]
+    return write_files(out / STEM, texts, svg, figure)
 
 
 def _curves(results: Sequence[Result]) -> Figure:

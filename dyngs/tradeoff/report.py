@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from dyngs.files.write import atomic_file, write_text
-from dyngs.study.plots import can_plot, png_of, svg_of
+from dyngs.study.plots import can_plot, svg_of, write_files
 from dyngs.study.tables import STYLE, csv_text, html_table
 from dyngs.tradeoff.measure import Measurement
 from dyngs.tradeoff.pareto import ExchangeRate, exchange_rates
@@ -43,14 +42,7 @@ def write_report(out: Path, measurements: Sequence[Measurement]) -> list[Path]:
         "json": json.dumps(values, indent=2, allow_nan=False) + "\n",
         "html": _page(rows, rates, svg),
     }
-    if svg:
-        texts["svg"] = svg
-    for suffix, text in texts.items():
-        write_text(out / f"{STEM}.{suffix}", text)
-    if figure is not None:
-        with atomic_file(out / f"{STEM}.png") as temporary:
-            temporary.write_bytes(png_of(figure))
-    return [out / f"{STEM}.{suffix}" for suffix in (*texts, *(["png"] if svg else []))]
+    return write_files(out / STEM, texts, svg, figure)
 
 
 def exchange_cells(rate: ExchangeRate) -> tuple[str, ...]:
