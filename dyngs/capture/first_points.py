@@ -1,5 +1,7 @@
 """The points that a scene begins with: those of the capture unless they are noise, else triangulated, else none.
 
+In still captures, dense ones may be added to few.
+
 Triangulated by pycolmap on the CPU from the images of one time step, or of one moving camera over the full clip: there,
 what moves violates the poses.
 """
@@ -18,6 +20,7 @@ import numpy as np
 import torch
 
 from dyngs.capture.looks import colours_at, small_image
+from dyngs.capture.plane_sweep import dense_points
 from dyngs.capture.sfm_work import ColmapError, feature_options, match_listed, matching_options, quiet_colmap
 from dyngs.capture.silhouettes import points_in_silhouettes
 from dyngs.config import DataConfig, PointsInit
@@ -192,6 +195,23 @@ def checked_points(capture: Capture, options: DataConfig) -> tuple[Capture, str 
 
 def with_first_points(capture: Capture, options: DataConfig, init: PointsInit) -> tuple[Capture, list[str]]:
     """Return the capture with the points that a scene begins with, None for random ones, and lines on the choice.
+
+    Sparse ones, and in still captures ``init.dense`` of depth maps where there are fewer sparse ones than that.
+    """
+    capture, lines = with_sparse_points(capture, options, init)
+    views, points = capture.splits["train"], capture.points
+    if points is None or views[0].time is not None or not len(points.xyz) < init.dense:
+        return capture, lines
+    dense = dense_points(views, options, points.xyz, init.dense)
+    if dense is None:
+        return capture, lines
+    lines.append(f"{len(dense.xyz):,} points of depth maps were added to {len(points.xyz):,} (init.dense)")
+    both = PointCloud(np.concatenate([points.xyz, dense.xyz]), np.concatenate([points.rgb, dense.rgb]))
+    return capture.replace(points=both), lines
+
+
+def with_sparse_points(capture: Capture, options: DataConfig, init: PointsInit) -> tuple[Capture, list[str]]:
+    """Return the capture with its sparse points, None where there are none, and lines on the choice.
 
     Points are triangulated where there are none: from the images of a time step that several cameras show, else from
     those of a moving camera over the full clip. Not where it is published custom to begin with random points: in the
