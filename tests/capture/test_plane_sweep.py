@@ -131,7 +131,7 @@ def test_dense_points_join_few_sparse_ones_of_still_captures_only(
     assert np.array_equal(joined.points.xyz[: len(SPARSE)], SPARSE)
     assert lines == ["1,000 points of depth maps were added to 60 (init.dense)"]
     monkeypatch.setattr(plane_sweep, "MAPS", 0)  # none can be found
-    for init in (PointsInit(dense=1000), PointsInit(), PointsInit(dense=60)):
+    for init in (PointsInit(dense=1000), PointsInit(), PointsInit(dense=120)):
         same, lines = with_first_points(capture, options, init)
         assert same.points is points
         assert not lines

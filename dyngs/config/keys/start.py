@@ -23,7 +23,7 @@ class PointsInit(Section):
     dense: int = Field(
         default=0,
         ge=0,
-        description="points of depth maps, added to fewer others in still captures; presets static, mip: 10000",
+        description="points of depth maps, added in still captures to fewer than half as many; preset static: 10000",
     )
     num_random: int = Field(
         default=20_000, ge=1, description="number of random points; auto: where there are no others"
