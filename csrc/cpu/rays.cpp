@@ -39,10 +39,9 @@ template <class S>
 void march_samples(const March<S>& march, const int64_t* offsets, const Samples<S>& out) {
   for_each_ray<S>(march.rays, march.threads, [&](int64_t ray) {
     RaySteps<S> steps = steps_of(march, ray);
-    S x[3];
-    for (int64_t i = offsets[ray]; i < offsets[ray + 1]; ++i) {
-      if (!steps.next(march, march.occupied, out.starts[i], out.ends[i], x)) break;
-      out.rays[i] = static_cast<int32_t>(ray);
+    S start, end, x[3];
+    for (int64_t i = offsets[ray]; i < offsets[ray + 1] && steps.next(march, march.occupied, start, end, x); ++i) {
+      out.rays[i] = static_cast<int32_t>(ray), out.starts[i] = start, out.ends[i] = end;
       unit_coords(march.space, x, out.coords + 3 * i);
     }
   });
