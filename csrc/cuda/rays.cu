@@ -2,7 +2,7 @@
 // CPU does. One kernel both counts samples and writes them, so that both round alike.
 //
 // Limits, H100 (3.35 TB/s; some 0.5 us for a read that must be waited for). Per sample: marching 24 bytes, and per step a byte of
-// a grid that stays in the second-level cache; compositing 32 bytes forward, 48 backward: 7 to 14 ps. Rays of a step, thousands,
+// a grid that stays in the second-level cache; compositing 28 bytes forward, 40 backward: 7 to 12 ps. Rays of a step, thousands,
 // are too few to hide the wait for each sample: 32 samples of each take some 20 us, whatever the number of rays.
 #include "cuda/api.hpp"
 #include "cuda/device.hpp"
