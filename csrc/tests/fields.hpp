@@ -157,6 +157,13 @@ struct SampleCase {
   int64_t rays() const { return static_cast<int64_t>(offsets.size()) - 1; }
 };
 
+// Numbers of samples of so many rays, from none to 39.
+inline std::vector<int64_t> varied_counts(int64_t rays) {
+  std::vector<int64_t> counts(rays);
+  for (int64_t ray = 0; ray < rays; ++ray) counts[ray] = ray * 7 % 40;
+  return counts;
+}
+
 // Rays with so many samples each.
 inline SampleCase sample_case(const std::vector<int64_t>& counts, double density, double transmittance_min) {
   const std::vector<int64_t> offsets = sums_of(counts);

@@ -171,9 +171,7 @@ Composition<float> composite_on_gpu(const SampleCase& c) {
 }
 
 void test_composition(double density, double transmittance_min) {
-  std::vector<int64_t> lengths;
-  for (int64_t ray = 0; ray < 300; ++ray) lengths.push_back(ray * 7 % 40);
-  const SampleCase c = sample_case(lengths, density, transmittance_min);
+  const SampleCase c = sample_case(varied_counts(300), density, transmittance_min);
   const std::string what = ", density " + std::to_string(density);
   const auto cpu = composite_on_cpu<double>(c);
   const auto gpu = composite_on_gpu(c);

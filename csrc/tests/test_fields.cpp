@@ -334,9 +334,7 @@ void test_composition(double density, double transmittance_min) {
 }
 
 void test_composition_threads() {
-  std::vector<int64_t> counts;
-  for (int64_t ray = 0; ray < 500; ++ray) counts.push_back(ray * 7 % 40);
-  const SampleCase c = sample_case(counts, 3, 1e-4);
+  const SampleCase c = sample_case(varied_counts(500), 3, 1e-4);
   const auto one = composite_on_cpu<float>(c);
   for (const int threads : {2, 4}) {
     const auto other = composite_on_cpu<float>(c, threads);
