@@ -13,7 +13,6 @@ class FieldModel(ModelSection):
     """Keys that all fields share."""
 
     draws_whole_images: ClassVar[bool] = False
-    on_gpu: ClassVar[bool] = False
 
     time: bool = Field(default=False, description="time is an input, too: a moving scene (T-NeRF)")
     half_extent: float | None = Field(

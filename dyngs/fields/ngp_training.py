@@ -81,3 +81,7 @@ class NgpTraining(FieldTraining[NgpField]):
         self._occupancy = Occupancy(self._field.space)
         self._occupancy.load_state(stored)
         self._rays = min(MOST_RAYS, max(1, int(require_tensor("rays", stored["rays"], (1,), torch.int64))))
+
+    def place(self, device: torch.device) -> None:
+        super().place(device)
+        self._occupancy.place(device)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.fields.ngp import NgpField
+from dyngs.ops.device import sent
 from dyngs.ops.rays import Space
 from dyngs.tensor_checks import require_tensor
 
@@ -23,6 +24,10 @@ class Occupancy:
     def __init__(self, space: Space) -> None:
         self._space = space
         self._values = torch.zeros(math.prod(space.shape), device="cpu")
+
+    def place(self, device: torch.device) -> None:
+        """Go on on ``device``; random numbers stay those of the CPU."""
+        self._values = self._values.to(device)
 
     def is_due(self, step: int) -> bool:
         return step % EVERY == 0
@@ -44,13 +49,13 @@ class Occupancy:
 
     def _chosen(self, occupied: Tensor, step: int, generator: torch.Generator) -> Tensor:
         """Return indices of cells: all while it warms up, then a quarter of all and as many occupied ones."""
-        count = len(self._values)
+        count, device = len(self._values), self._values.device
         if step <= WARM_UP:
-            return torch.arange(count, device="cpu")
-        drawn = torch.randint(count, (count // 4,), generator=generator, device="cpu")
+            return torch.arange(count, device=device)
+        drawn = sent(torch.randint(count, (count // 4,), generator=generator, device="cpu"), device)
         full = occupied.flatten().nonzero()[:, 0]
         if len(full) > count // 4:
-            full = full[torch.randint(len(full), (count // 4,), generator=generator, device="cpu")]
+            full = full[sent(torch.randint(len(full), (count // 4,), generator=generator, device="cpu"), device)]
         return torch.cat([drawn, full]).unique()
 
     def _opacities(
@@ -64,7 +69,8 @@ class Occupancy:
         )
         cascade, z = torch.div(z, n, rounding_mode="floor"), z % n
         half = space.half * 2.0**cascade
-        places = torch.stack([x, y, z], 1) + torch.rand((len(cells), 3), generator=generator, device="cpu")
-        points = (places * (2 / n) - 1) * half[:, None] + torch.tensor(space.centre, device="cpu")
+        within = sent(torch.rand((len(cells), 3), generator=generator, device="cpu"), cells.device)
+        places = torch.stack([x, y, z], 1) + within
+        points = (places * (2 / n) - 1) * half[:, None] + within.new_tensor(space.centre)
         time = times[int(torch.randint(len(times), (1,), generator=generator, device="cpu"))] if times else 0.0
         return field.densities(points, time) * field.step * 2.0**cascade
