@@ -16,17 +16,23 @@ from torch import Tensor
 
 from dyngs.fields.field import PUBLISHED_HALF, Field, Seen, network, truncated_exp
 from dyngs.fields.keys import NgpModel
+from dyngs.fields.thinning import reached_samples, thinned_samples
 from dyngs.initialisation import glorot
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
-from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march, reached
+from dyngs.ops.rays import Rays, Space, Steps, composite, march
 from dyngs.state import Role, State, with_role
 from dyngs.tensor_checks import require_tensor
 
 WIDTH, GEOMETRY = 64, 16  # Features of hidden layers, and of the density network's output, whose first is the density
 DIRECTION_DEGREE, DIRECTION_TERMS = 3, 16  # Of the harmonics of directions; Instant-NGP counts degrees from 1
 CONE = 1 / 256  # Least length of a sample outside of it, in units of its distance
+LOG2_SAMPLES = 14  # Samples of a step, for a CPU
+PUBLISHED_PIXELS = 800  # Along a side of the images of published figures
+ACROSS, FINEST = 1024 / PUBLISHED_PIXELS, 2.56
+"""For a CPU, per pixel of an image's longest side: samples along the diagonal of the innermost cube, as published, and
+cells of the finest level along an axis, half as published."""
 FIRST = 1e-4  # Rows of the grid begin within this of 0
 
 
@@ -40,17 +46,16 @@ class NgpSizes:
     across: int  # samples along the diagonal of the innermost cube
 
     @staticmethod
-    def of(model: NgpModel) -> NgpSizes:
-        """Return what ``model`` asks for; what it leaves open is for a CPU, or as published."""
+    def of(model: NgpModel, pixels: int = PUBLISHED_PIXELS) -> NgpSizes:
+        """Return what ``model`` asks for; what it leaves open is for a CPU and images of ``pixels``, or as published."""
         published = model.sizes == "published"
         levels = model.levels or (16 if published else 8)
         features = model.features or (2 if published else 4)
         log2_rows = model.log2_rows or (19 if published else 17)
-        finest = model.finest or (4096 if published else 1024)
+        finest = model.finest or (4096 if published else min(max(64, round(FINEST * pixels)), 4096))
+        across = 1024 if published else min(max(128, round(ACROSS * pixels)), 1024)
         grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows, dims=4 if model.time else 3)
-        return NgpSizes(
-            grid, features, 1 << (model.log2_samples or (18 if published else 16)), 1024 if published else 512
-        )
+        return NgpSizes(grid, features, 1 << (model.log2_samples or (18 if published else LOG2_SAMPLES)), across)
 
 
 @dataclass(frozen=True)
@@ -61,10 +66,12 @@ class NgpField(Field):
         table: (rows, F) of all levels.
         density, colour: weights of the networks, (out, in) each.
         occupied: bool of ``space.shape``.
+        pixels: of the longest side of the images that it was made for.
         across: samples along the diagonal of the innermost cube.
     """
 
     space: Space
+    pixels: int
     levels: HashLevels
     table: Tensor
     density: tuple[Tensor, ...]
@@ -74,9 +81,12 @@ class NgpField(Field):
     sees_time: bool = False
 
     @staticmethod
-    def new(model: NgpModel, space: Space, generator: torch.Generator) -> NgpField:
-        """Return a field before the first step: nearly grey, hardly dense, occupied everywhere."""
-        sizes = NgpSizes.of(model)
+    def new(model: NgpModel, space: Space, generator: torch.Generator, pixels: int = PUBLISHED_PIXELS) -> NgpField:
+        """Return a field before the first step: nearly grey, hardly dense, occupied everywhere.
+
+        ``pixels``: of the longest side of the images.
+        """
+        sizes = NgpSizes.of(model, pixels)
         rows = torch.rand((sizes.levels.num_rows, sizes.features), generator=generator, device="cpu")
         inputs = len(sizes.levels.rows) * sizes.features
         density = (inputs, WIDTH, GEOMETRY)
@@ -86,12 +96,14 @@ class NgpField(Field):
         ]
         occupied = torch.ones(space.shape, dtype=torch.bool, device="cpu")
         table = (FIRST * (2 * rows - 1)).requires_grad_()
-        return NgpField(space, sizes.levels, table, weights[0], weights[1], occupied, sizes.across, model.time)
+        return NgpField(space, pixels, sizes.levels, table, weights[0], weights[1], occupied, sizes.across, model.time)
 
     @staticmethod
     def restored(model: NgpModel, space: Space, checkpoint: Checkpoint) -> NgpField:
         """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
-        stored, sizes = checkpoint.part("field"), NgpSizes.of(model)
+        stored = checkpoint.part("field")
+        pixels = int(require_tensor("pixels", stored["pixels"], (1,), torch.int64))
+        sizes = NgpSizes.of(model, pixels)
         table = require_tensor("table", stored["table"], (sizes.levels.num_rows, sizes.features)).clone()
         inputs = len(sizes.levels.rows) * sizes.features
         widths = {"density": (inputs, WIDTH, GEOMETRY), "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)}
@@ -106,12 +118,20 @@ class NgpField(Field):
         bits = require_tensor("occupied", stored["occupied"], (-(-count // 8),), torch.uint8)
         occupied = _unpacked(bits, space)
         return NgpField(
-            space, sizes.levels, table, networks["density"], networks["colour"], occupied, sizes.across, model.time
+            space,
+            pixels,
+            sizes.levels,
+            table,
+            networks["density"],
+            networks["colour"],
+            occupied,
+            sizes.across,
+            model.time,
         )
 
     @property
     def num_shifts(self) -> int:
-        return 1
+        return 2  # where the samples of a ray lie, and which of those that hardly show are taken
 
     @property
     def parameters(self) -> Mapping[str, Tensor]:
@@ -121,7 +141,8 @@ class NgpField(Field):
 
     def state(self) -> State:
         tensors = {name: x.detach() for name, x in self.parameters.items()}
-        return with_role(tensors | {"occupied": _packed(self.occupied)}, Role.SHARED)
+        own = {"occupied": _packed(self.occupied), "pixels": torch.tensor([self.pixels], device="cpu")}
+        return with_role(tensors | own, Role.SHARED)
 
     @cached_property
     def step(self) -> float:
@@ -131,15 +152,15 @@ class NgpField(Field):
     def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
         steps = Steps(near, self.step, CONE if self.space.cascades > 1 else 0.0)
         shift = rays.origins.new_full((len(rays),), 0.5) if shifts is None else shifts[:, 0].contiguous()
-        samples = march(rays, shift, self.space, self.occupied, steps)
-        with torch.no_grad():  # which samples are reached takes their densities alone
-            coords = self._with_time(samples.coords, time)
+        marched = march(rays, shift, self.space, self.occupied, steps)
+        with torch.no_grad():  # which samples are worth it takes their densities alone
+            coords = self._with_time(marched.coords, time)
             features = hash_features(coords, self.table, self.levels)
-            through, offsets = reached(self._density(network(features, self.density)), samples)
-        which = through.nonzero()[:, 0]
-        samples = Samples(
-            offsets, samples.rays[which].long(), samples.starts[which], samples.ends[which], samples.coords[which]
-        )
+            densities = self._density(network(features, self.density))
+            if shifts is None:
+                samples, which = reached_samples(densities, marched)
+            else:
+                samples, which = thinned_samples(densities, marched, shifts[:, 1])
         found = known_features(features, which, coords[which], self.table, self.levels)
         geometry = network(found, self.density)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)

@@ -11,21 +11,33 @@ from dyngs.fields.ngp import NgpField
 from dyngs.ops.rays import Space
 from dyngs.tensor_checks import require_tensor
 
-EVERY, WARM_UP = 16, 256  # Steps between updates; up to which step all cells are looked at each time
+EVERY, WARM_UP = 16, 256  # Steps between updates after the warm-up; in it all cells are looked at, ever less often
 DECAY = 0.95
-THRESHOLD = 1e-2  # Opacity of a sample, about, above which a cell counts as occupied; less where the mean is less
+THRESHOLD = 1e-2
+"""Opacity above which a cell counts as occupied, or the mean opacity if that is less: of a sample as long as published,
+a 1,024th of the cube's diagonal."""
 CHUNK = 1 << 17  # Cells looked at together
 
 
 class Occupancy:
-    """The largest opacity of a sample found in each cell, which fades until it is found again."""
+    """The largest opacity of a sample found in each cell, which fades until it is found again.
 
-    def __init__(self, space: Space) -> None:
+    Args:
+        seen: bool of ``space.shape``: cells that may be occupied at all, see ``frusta``.
+        num_random: random cells of each look after the warm-up; a quarter of all at most.
+    """
+
+    def __init__(self, space: Space, seen: Tensor, num_random: int) -> None:
         self._space = space
+        self.seen = seen
+        self._cells = seen.flatten().nonzero()[:, 0]
+        self._num_random = min(num_random, -(-len(self._cells) // 4))
         self._values = torch.zeros(math.prod(space.shape), device="cpu")
 
     def is_due(self, step: int) -> bool:
-        return step % EVERY == 0
+        if step > WARM_UP:
+            return step % EVERY == 0
+        return step > EVERY and step & (step - 1) == 0
 
     @torch.no_grad()
     def updated(self, field: NgpField, step: int, times: tuple[float, ...], generator: torch.Generator) -> Tensor:
@@ -33,7 +45,7 @@ class Occupancy:
         cells = self._chosen(field.occupied, step, generator)
         found = torch.cat([self._opacities(field, x, times, generator) for x in cells.split(CHUNK)])
         self._values[cells] = torch.maximum(self._values[cells] * DECAY, found)
-        mean = float(self._values.double().mean())
+        mean = float(self._values[self._cells].double().mean())
         return (self._values > min(THRESHOLD, mean)).view(self._space.shape)
 
     def state(self) -> dict[str, Tensor]:
@@ -43,14 +55,13 @@ class Occupancy:
         self._values = require_tensor("values", state["values"], tuple(self._values.shape)).clone()
 
     def _chosen(self, occupied: Tensor, step: int, generator: torch.Generator) -> Tensor:
-        """Return indices of cells: all while it warms up, then a quarter of all and as many occupied ones."""
-        count = len(self._values)
+        """Return indices of cells: all while it warms up, then random ones and occupied ones, a quarter of all at most."""
         if step <= WARM_UP:
-            return torch.arange(count, device="cpu")
-        drawn = torch.randint(count, (count // 4,), generator=generator, device="cpu")
-        full = occupied.flatten().nonzero()[:, 0]
-        if len(full) > count // 4:
-            full = full[torch.randint(len(full), (count // 4,), generator=generator, device="cpu")]
+            return self._cells
+        drawn = self._cells[torch.randint(len(self._cells), (self._num_random,), generator=generator, device="cpu")]
+        full, most = occupied.flatten().nonzero()[:, 0], -(-len(self._cells) // 4)
+        if len(full) > most:
+            full = full[torch.randint(len(full), (most,), generator=generator, device="cpu")]
         return torch.cat([drawn, full]).unique()
 
     def _opacities(
@@ -67,4 +78,4 @@ class Occupancy:
         places = torch.stack([x, y, z], 1) + torch.rand((len(cells), 3), generator=generator, device="cpu")
         points = (places * (2 / n) - 1) * half[:, None] + torch.tensor(space.centre, device="cpu")
         time = times[int(torch.randint(len(times), (1,), generator=generator, device="cpu"))] if times else 0.0
-        return field.densities(points, time) * field.step * 2.0**cascade
+        return field.densities(points, time) * (half * (2 * math.sqrt(3) / 1024))
