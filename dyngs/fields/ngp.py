@@ -27,12 +27,13 @@ from dyngs.tensor_checks import require_tensor
 
 WIDTH, GEOMETRY = 64, 16  # Features of hidden layers, and of the density network's output, whose first is the density
 DIRECTION_DEGREE, DIRECTION_TERMS = 3, 16  # Of the harmonics of directions; Instant-NGP counts degrees from 1
-CONE = 1 / 256  # Least length of a sample outside of it, in units of its distance
+CONE = 4.0  # Least length of a sample where there are several cubes, in its distance over `across`: 1/256 as published
 LOG2_SAMPLES = 14  # Samples of a step, for a CPU
 PUBLISHED_PIXELS = 800  # Along a side of the images of published figures
 ACROSS, FINEST = 1024 / PUBLISHED_PIXELS, 2.56
 """For a CPU, per pixel of an image's longest side: samples along the diagonal of the innermost cube, as published, and
-cells of the finest level along an axis, half as published."""
+cells of the finest level along an axis, half as published; twice as many where the innermost cube is half of all."""
+TIME_SPAN = 1 / 8  # Part of the unit cube's side that all of time is, so that times share rows
 FIRST = 1e-4  # Rows of the grid begin within this of 0
 
 
@@ -46,13 +47,13 @@ class NgpSizes:
     across: int  # samples along the diagonal of the innermost cube
 
     @staticmethod
-    def of(model: NgpModel, pixels: int = PUBLISHED_PIXELS) -> NgpSizes:
-        """Return what ``model`` asks for; what it leaves open is for a CPU and images of ``pixels``, or as published."""
+    def of(model: NgpModel, pixels: int = PUBLISHED_PIXELS, cascades: int = 1) -> NgpSizes:
+        """Return what ``model`` asks for; the rest is for a CPU and images of ``pixels``, or as published."""
         published = model.sizes == "published"
         levels = model.levels or (16 if published else 8)
         features = model.features or (2 if published else 4)
-        log2_rows = model.log2_rows or (19 if published else 17)
-        finest = model.finest or (4096 if published else min(max(64, round(FINEST * pixels)), 4096))
+        log2_rows = model.log2_rows or (19 if published else 16)
+        finest = model.finest or (4096 if published else min(max(64, round(FINEST * pixels * min(cascades, 2))), 4096))
         across = 1024 if published else min(max(128, round(ACROSS * pixels)), 1024)
         grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows, dims=4 if model.time else 3)
         return NgpSizes(grid, features, 1 << (model.log2_samples or (18 if published else LOG2_SAMPLES)), across)
@@ -86,7 +87,7 @@ class NgpField(Field):
 
         ``pixels``: of the longest side of the images.
         """
-        sizes = NgpSizes.of(model, pixels)
+        sizes = NgpSizes.of(model, pixels, space.cascades)
         rows = torch.rand((sizes.levels.num_rows, sizes.features), generator=generator, device="cpu")
         inputs = len(sizes.levels.rows) * sizes.features
         density = (inputs, WIDTH, GEOMETRY)
@@ -103,7 +104,7 @@ class NgpField(Field):
         """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
         stored = checkpoint.part("field")
         pixels = int(require_tensor("pixels", stored["pixels"], (1,), torch.int64))
-        sizes = NgpSizes.of(model, pixels)
+        sizes = NgpSizes.of(model, pixels, space.cascades)
         table = require_tensor("table", stored["table"], (sizes.levels.num_rows, sizes.features)).clone()
         inputs = len(sizes.levels.rows) * sizes.features
         widths = {"density": (inputs, WIDTH, GEOMETRY), "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)}
@@ -150,7 +151,7 @@ class NgpField(Field):
         return 2 * self.space.half * math.sqrt(3) / self.across
 
     def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
-        steps = Steps(near, self.step, CONE if self.space.cascades > 1 else 0.0)
+        steps = Steps(near, self.step, CONE / self.across if self.space.cascades > 1 else 0.0)
         shift = rays.origins.new_full((len(rays),), 0.5) if shifts is None else shifts[:, 0].contiguous()
         marched = march(rays, shift, self.space, self.occupied, steps)
         with torch.no_grad():  # which samples are worth it takes their densities alone
@@ -186,7 +187,7 @@ class NgpField(Field):
         return network(hash_features(self._with_time(coords, time), self.table, self.levels), self.density)
 
     def _with_time(self, coords: Tensor, time: float) -> Tensor:
-        return torch.cat([coords, coords.new_full((len(coords), 1), time)], 1) if self.sees_time else coords
+        return torch.cat([coords, coords.new_full((len(coords), 1), time * TIME_SPAN)], 1) if self.sees_time else coords
 
     def _density(self, geometry: Tensor) -> Tensor:
         """Return (M,) densities, per world unit; the published ones are per unit of a cube of half side 1.5."""

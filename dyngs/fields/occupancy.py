@@ -11,7 +11,7 @@ from dyngs.fields.ngp import NgpField
 from dyngs.ops.rays import Space
 from dyngs.tensor_checks import require_tensor
 
-EVERY, WARM_UP = 16, 256  # Steps between updates after the warm-up; in it all cells are looked at, ever less often
+EVERY, WARM_UP = 16, 256  # Steps between updates; up to which step all cells are looked at where it is a power of two
 DECAY = 0.95
 THRESHOLD = 1e-2
 """Opacity above which a cell counts as occupied, or the mean opacity if that is less: of a sample as long as published,
@@ -35,9 +35,7 @@ class Occupancy:
         self._values = torch.zeros(math.prod(space.shape), device="cpu")
 
     def is_due(self, step: int) -> bool:
-        if step > WARM_UP:
-            return step % EVERY == 0
-        return step > EVERY and step & (step - 1) == 0
+        return step > EVERY and step % EVERY == 0
 
     @torch.no_grad()
     def updated(self, field: NgpField, step: int, times: tuple[float, ...], generator: torch.Generator) -> Tensor:
@@ -55,8 +53,11 @@ class Occupancy:
         self._values = require_tensor("values", state["values"], tuple(self._values.shape)).clone()
 
     def _chosen(self, occupied: Tensor, step: int, generator: torch.Generator) -> Tensor:
-        """Return indices of cells: all while it warms up, then random ones and occupied ones, a quarter of all at most."""
-        if step <= WARM_UP:
+        """Return indices of cells: of all ever less often as it warms up, else random and occupied ones.
+
+        At most a quarter of all each.
+        """
+        if step <= WARM_UP and step & (step - 1) == 0:
             return self._cells
         drawn = self._cells[torch.randint(len(self._cells), (self._num_random,), generator=generator, device="cpu")]
         full, most = occupied.flatten().nonzero()[:, 0], -(-len(self._cells) // 4)

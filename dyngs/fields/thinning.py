@@ -1,7 +1,7 @@
 """Fewer samples for the networks: of those that hardly show, one in four, which stands for the others, too.
 
-R rays, M samples. A sample within an occupied cell but before or behind the surface costs as much as one that is seen, and
-says as little as its neighbours.
+R rays, M samples. A sample within an occupied cell but before or behind the surface costs as much as one that is seen,
+and says as little as its neighbours.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def reached_samples(densities: Tensor, samples: Samples) -> tuple[Samples, Tenso
 def thinned_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tuple[Samples, Tensor]:
     """As ``reached_samples``; of light ones each fourth is taken, four times as long around the same middle.
 
-    What rays see, and the gradients by densities, are on average those of all samples. ``shifts`` (R,) in [0, 1): random
-    numbers that say for each ray which of four it is.
+    What rays see, and the gradients by densities, are on average those of all samples. ``shifts`` (R,) in [0, 1): which
+    of four it is, at random for each ray.
     """
     through, _ = reached(densities, samples)
     weights = composite(densities, densities[:, None].expand(-1, 3).contiguous(), samples).weights

@@ -34,7 +34,7 @@ def rays_towards_it(count: int = 20) -> Rays:
 
 def test_sizes_are_for_a_cpu_or_as_published() -> None:
     own, published = NgpSizes.of(NgpModel()), NgpSizes.of(NgpModel(sizes="published"))
-    assert (len(own.levels.rows), own.features, max(own.levels.rows), own.num_samples) == (8, 4, 2**17, 2**14)
+    assert (len(own.levels.rows), own.features, max(own.levels.rows), own.num_samples) == (8, 4, 2**16, 2**14)
     assert (len(published.levels.rows), published.features, max(published.levels.rows)) == (16, 2, 2**19)
     assert published.num_samples == 2**18
     assert (own.across, published.across, max(published.levels.sizes)) == (1024, 1024, 4096)

@@ -59,6 +59,7 @@ def test_rays_see_the_same_on_average_with_the_same_gradients() -> None:
     full, full_grad = seen(*reached_samples(densities, samples))
     parts = [seen(*thinned_samples(densities, samples, torch.full((2,), (k + 0.5) / EVERY).double())) for k in range(4)]
     mean, mean_grad = (sum(x) / EVERY for x in zip(*parts, strict=True))
-    assert isinstance(mean, torch.Tensor) and isinstance(mean_grad, torch.Tensor)
+    assert isinstance(mean, torch.Tensor)
+    assert isinstance(mean_grad, torch.Tensor)
     assert (mean - full).abs().max() < 5e-3
     assert (mean_grad - full_grad).abs().max() < 0.05 * full_grad.abs().max()
