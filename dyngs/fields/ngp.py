@@ -157,7 +157,7 @@ class NgpField(Field):
         with torch.no_grad():  # which samples are worth it takes their densities alone
             coords = self._with_time(marched.coords, time)
             features = hash_features(coords, self.table, self.levels)
-            densities = self._density(network(features, self.density))
+            densities = self._density(network(features, self.density), marched.coords)
             if shifts is None:
                 samples, which = reached_samples(densities, marched)
             else:
@@ -166,11 +166,12 @@ class NgpField(Field):
         geometry = network(found, self.density)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
         colours = self._colours(geometry, basis[samples.rays])
-        drawn = composite(self._density(geometry), colours, samples)
+        drawn = composite(self._density(geometry, samples.coords), colours, samples)
         return Seen(drawn.colour, drawn.transmittance, drawn.depth, len(samples))
 
     def densities(self, points: Tensor, time: float) -> Tensor:
-        return self._density(self._geometry(self.space.unit(points), time))
+        coords = self.space.unit(points)
+        return self._density(self._geometry(coords, time), coords)
 
     def may_hold(self, points: Tensor) -> Tensor:
         """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
@@ -189,9 +190,16 @@ class NgpField(Field):
     def _with_time(self, coords: Tensor, time: float) -> Tensor:
         return torch.cat([coords, coords.new_full((len(coords), 1), time * TIME_SPAN)], 1) if self.sees_time else coords
 
-    def _density(self, geometry: Tensor) -> Tensor:
-        """Return (M,) densities, per world unit; the published ones are per unit of a cube of half side 1.5."""
-        return truncated_exp(geometry[:, 0] - 1) * (PUBLISHED_HALF / self.space.half)
+    def _density(self, geometry: Tensor, coords: Tensor) -> Tensor:
+        """Return (M,) densities, per world unit; the published ones are per unit of a cube of half side 1.5.
+
+        Outside of the innermost cube it is per unit of a cube on whose side the point lies, so that a field which has
+        learned nothing is as dense a mist in each.
+        """
+        found = truncated_exp(geometry[:, 0] - 1) * (PUBLISHED_HALF / self.space.half)
+        if self.space.cascades == 1:
+            return found
+        return found * (2 - 4 * (coords - 0.5).abs().amax(1)).clamp(max=1)  # 1 over the max-norm
 
     def _colours(self, geometry: Tensor, basis: Tensor) -> Tensor:
         return network(torch.cat([geometry, basis], 1), self.colour).sigmoid()

@@ -14,8 +14,8 @@ from dyngs.tensor_checks import require_tensor
 EVERY, WARM_UP = 16, 256  # Steps between updates; up to which step all cells are looked at where it is a power of two
 DECAY = 0.95
 THRESHOLD = 1e-2
-"""Opacity above which a cell counts as occupied, or the mean opacity if that is less: of a sample as long as published,
-a 1,024th of the cube's diagonal."""
+"""Opacity above which a cell counts as occupied, or the mean of its cube if that is less: of a sample as long as
+published, a 1,024th of the cube's diagonal."""
 CHUNK = 1 << 17  # Cells looked at together
 
 
@@ -31,6 +31,7 @@ class Occupancy:
         self._space = space
         self.seen = seen
         self._cells = seen.flatten().nonzero()[:, 0]
+        self._count = seen.flatten(1).sum(1).clamp_min(1)
         self._num_random = min(num_random, -(-len(self._cells) // 4))
         self._values = torch.zeros(math.prod(space.shape), device="cpu")
 
@@ -43,8 +44,9 @@ class Occupancy:
         cells = self._chosen(field.occupied, step, generator)
         found = torch.cat([self._opacities(field, x, times, generator) for x in cells.split(CHUNK)])
         self._values[cells] = torch.maximum(self._values[cells] * DECAY, found)
-        mean = float(self._values[self._cells].double().mean())
-        return (self._values > min(THRESHOLD, mean)).view(self._space.shape)
+        cubes = self._values.view(len(self._count), -1)
+        levels = (cubes.double().sum(1) / self._count).clamp(max=THRESHOLD)
+        return (cubes > levels[:, None]).view(self._space.shape)
 
     def state(self) -> dict[str, Tensor]:
         return {"values": self._values}

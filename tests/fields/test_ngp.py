@@ -92,3 +92,12 @@ def test_what_is_stored_is_restored(cells: int) -> None:
     for name, x in bad.items():
         with pytest.raises(ValueError, match=name.removeprefix("field.")):
             NgpField.restored(model, space, Checkpoint(info, checkpoint.tensors | {name: x}))
+
+
+def test_mist_is_as_thick_in_each_cube() -> None:
+    field = NgpField.new(SMALL, Space((0.1, 0.0, -0.2), 1.2, 4, 8), torch.Generator().manual_seed(0))
+    middle, side = torch.tensor([0.1, 0.0, -0.2]), torch.tensor([1.2, 0.3, -0.5])
+    points = torch.stack([middle + 0.4 * side, middle + side, middle + 2 * side, middle + 8 * side])
+    with torch.no_grad():
+        found = field.densities(points, 0.0)
+    assert (found / found[0]).tolist() == pytest.approx([1, 1, 1 / 2, 1 / 8], rel=0.01)

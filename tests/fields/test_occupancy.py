@@ -106,3 +106,12 @@ def test_all_cells_are_looked_at_ever_less_often() -> None:
         other.updated(field, step, (), generator)
         found.append(int((other.state()["values"] > 0).sum()) > 1)
     assert found == [True, False, True, False, True, False, True, False]
+
+
+def test_each_cube_has_a_mean_of_its_own() -> None:
+    """What is thin in an inner cube is not forgotten because it is thick in an outer one."""
+    field = ball(2)
+    thin = replace(field, height=0.1)
+    found = occupancy_of(field).updated(thin, 32, (), torch.Generator().manual_seed(0))
+    assert bool(found[0].any())
+    assert bool(found[1].any())
