@@ -14,7 +14,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyngs.fields.field import PUBLISHED_HALF, Field, Seen, network, truncated_exp
+from dyngs.fields.field import PUBLISHED_HALF, TIME, Field, Seen, network, truncated_exp, with_time
 from dyngs.fields.keys import NgpModel
 from dyngs.fields.thinning import reached_samples, thinned_samples
 from dyngs.initialisation import glorot
@@ -33,7 +33,6 @@ PUBLISHED_PIXELS = 800  # Along a side of the images of published figures
 ACROSS, FINEST = 1024 / PUBLISHED_PIXELS, 2.56
 """For a CPU, per pixel of an image's longest side: samples along the diagonal of the innermost cube, as published, and
 cells of the finest level along an axis, half as published; twice as many where the innermost cube is half of all."""
-TIME_SPAN = 1 / 8  # Part of the unit cube's side that all of time is, so that times share rows
 FIRST = 1e-4  # Rows of the grid begin within this of 0
 
 
@@ -55,7 +54,7 @@ class NgpSizes:
         log2_rows = model.log2_rows or (19 if published else 16)
         finest = model.finest or (4096 if published else min(max(64, round(FINEST * pixels * min(cascades, 2))), 4096))
         across = 1024 if published else min(max(128, round(ACROSS * pixels)), 1024)
-        grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows, dims=4 if model.time else 3)
+        grid = HashLevels.geometric(levels, 16, finest, 1 << log2_rows)
         return NgpSizes(grid, features, 1 << (model.log2_samples or (18 if published else LOG2_SAMPLES)), across)
 
 
@@ -89,11 +88,9 @@ class NgpField(Field):
         """
         sizes = NgpSizes.of(model, pixels, space.cascades)
         rows = torch.rand((sizes.levels.num_rows, sizes.features), generator=generator, device="cpu")
-        inputs = len(sizes.levels.rows) * sizes.features
-        density = (inputs, WIDTH, GEOMETRY)
-        colour = (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)
         weights = [
-            tuple(glorot(i, o, generator).requires_grad_() for i, o in pairwise(widths)) for widths in (density, colour)
+            tuple(glorot(i, o, generator).requires_grad_() for i, o in pairwise(widths))
+            for widths in _widths(sizes, model.time).values()
         ]
         occupied = torch.ones(space.shape, dtype=torch.bool, device="cpu")
         table = (FIRST * (2 * rows - 1)).requires_grad_()
@@ -106,14 +103,12 @@ class NgpField(Field):
         pixels = int(require_tensor("pixels", stored["pixels"], (1,), torch.int64))
         sizes = NgpSizes.of(model, pixels, space.cascades)
         table = require_tensor("table", stored["table"], (sizes.levels.num_rows, sizes.features)).clone()
-        inputs = len(sizes.levels.rows) * sizes.features
-        widths = {"density": (inputs, WIDTH, GEOMETRY), "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)}
         networks = {
             name: tuple(
                 require_tensor(f"{name}.{i}", stored[f"{name}.{i}"], (out, before)).clone()
                 for i, (before, out) in enumerate(pairwise(w))
             )
-            for name, w in widths.items()
+            for name, w in _widths(sizes, model.time).items()
         }
         count = math.prod(space.shape)
         bits = require_tensor("occupied", stored["occupied"], (-(-count // 8),), torch.uint8)
@@ -155,15 +150,13 @@ class NgpField(Field):
         shift = rays.origins.new_full((len(rays),), 0.5) if shifts is None else shifts[:, 0].contiguous()
         marched = march(rays, shift, self.space, self.occupied, steps)
         with torch.no_grad():  # which samples are worth it takes their densities alone
-            coords = self._with_time(marched.coords, time)
-            features = hash_features(coords, self.table, self.levels)
-            densities = self._density(network(features, self.density), marched.coords)
+            features = hash_features(marched.coords, self.table, self.levels)
+            densities = self._density(self._geometry(features, time), marched.coords)
             if shifts is None:
                 samples, which = reached_samples(densities, marched)
             else:
                 samples, which = thinned_samples(densities, marched, shifts[:, 1])
-        found = known_features(features, which, coords[which], self.table, self.levels)
-        geometry = network(found, self.density)
+        geometry = self._geometry(known_features(features, which, samples.coords, self.table, self.levels), time)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
         colours = self._colours(geometry, basis[samples.rays])
         drawn = composite(self._density(geometry, samples.coords), colours, samples)
@@ -171,7 +164,7 @@ class NgpField(Field):
 
     def densities(self, points: Tensor, time: float) -> Tensor:
         coords = self.space.unit(points)
-        return self._density(self._geometry(coords, time), coords)
+        return self._density(self._geometry(hash_features(coords, self.table, self.levels), time), coords)
 
     def may_hold(self, points: Tensor) -> Tensor:
         """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
@@ -181,14 +174,11 @@ class NgpField(Field):
         return self.occupied[0, z, y, x] | ((place < 0) | (place > n)).any(1)
 
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
-        geometry = self._geometry(self.space.unit(points), time)
+        geometry = self._geometry(hash_features(self.space.unit(points), self.table, self.levels), time)
         return self._colours(geometry, harmonics_basis(directions, DIRECTION_DEGREE))
 
-    def _geometry(self, coords: Tensor, time: float) -> Tensor:
-        return network(hash_features(self._with_time(coords, time), self.table, self.levels), self.density)
-
-    def _with_time(self, coords: Tensor, time: float) -> Tensor:
-        return torch.cat([coords, coords.new_full((len(coords), 1), time * TIME_SPAN)], 1) if self.sees_time else coords
+    def _geometry(self, features: Tensor, time: float) -> Tensor:
+        return network(with_time(features, time) if self.sees_time else features, self.density)
 
     def _density(self, geometry: Tensor, coords: Tensor) -> Tensor:
         """Return (M,) densities, per world unit; the published ones are per unit of a cube of half side 1.5.
@@ -203,6 +193,12 @@ class NgpField(Field):
 
     def _colours(self, geometry: Tensor, basis: Tensor) -> Tensor:
         return network(torch.cat([geometry, basis], 1), self.colour).sigmoid()
+
+
+def _widths(sizes: NgpSizes, sees_time: bool) -> dict[str, tuple[int, ...]]:
+    """Return how many features go into each layer of the networks, and come out of the last."""
+    inputs = len(sizes.levels.rows) * sizes.features + (TIME if sees_time else 0)
+    return {"density": (inputs, WIDTH, GEOMETRY), "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3)}
 
 
 def _packed(occupied: Tensor) -> Tensor:
