@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from dyngs.errors import DyngsError
 from dyngs.fields.frusta import seen_cells
 from dyngs.fields.keys import NgpModel
 from dyngs.fields.ngp import NgpField, NgpSizes
@@ -41,6 +42,11 @@ class NgpTraining(FieldTraining[NgpField]):
 
     def _new_occupancy(self, field: NgpField) -> Occupancy:
         seen = seen_cells(field.space, self._run.capture.splits["train"])
+        if not bool(seen.any()):
+            raise DyngsError(
+                f"{self._run.config.data.root}: no training camera sees anything of the cube that the field lies in: "
+                "give model.half_extent, or model.surroundings=always"
+            )
         return Occupancy(field.space, seen, LOOKED_AT * self._num_samples)
 
     @property
@@ -88,8 +94,10 @@ class NgpTraining(FieldTraining[NgpField]):
         return NgpField.restored(self._model, stored_space(checkpoint.part("field")), checkpoint)
 
     def restore(self, checkpoint: Checkpoint) -> None:
+        before = self._field.space
         super().restore(checkpoint)
         stored = checkpoint.part("occupancy")
-        self._occupancy = self._new_occupancy(self._field)
+        if self._field.space != before:  # to find what cameras see takes seconds
+            self._occupancy = self._new_occupancy(self._field)
         self._occupancy.load_state(stored)
         self._rays = min(MOST_RAYS, max(1, int(require_tensor("rays", stored["rays"], (1,), torch.int64))))
