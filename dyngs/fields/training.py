@@ -92,6 +92,11 @@ class FieldTraining(Model[FieldScene], Generic[F]):
         """Return the learning rate in ``step``."""
         raise NotImplementedError
 
+    @property
+    def betas(self) -> tuple[float, float]:
+        """How slowly Adam forgets."""
+        return 0.9, 0.999
+
     def counted(self, num_rays: int, num_samples: int) -> None:
         """Take in how many samples the rays of an image needed."""
 
@@ -115,7 +120,7 @@ class FieldTraining(Model[FieldScene], Generic[F]):
 
     def update(self, step: int) -> Updated:
         updates = [self._update_of(name, x, self.rate(step)) for name, x in self._field.parameters.items()]
-        return Updated(self._adam.steps_(updates, step=step))
+        return Updated(self._adam.steps_(updates, step=step, betas=self.betas))
 
     def _update_of(self, name: str, x: Tensor, rate: float) -> AdamUpdate | None:
         return self._adam.update(name, x, rate)
