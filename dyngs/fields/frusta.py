@@ -24,7 +24,7 @@ def seen_cells(space: Space, views: Sequence[View]) -> Tensor:
         outside = np.abs(middles).max(1) > 0.5 - 1 / space.cells + 1e-6 if cascade else np.ones(len(middles), bool)
         unseen = np.flatnonzero(outside)
         for view in views:  # those seen once are not looked at again
-            hidden = ~_sees(view, middles[unseen] * np.float32(half) + np.float32(space.centre), radius)
+            hidden = ~_sees(view, middles[unseen] * np.float32(half) + np.array(space.centre, np.float32), radius)
             seen[cascade].reshape(-1)[unseen[~hidden]] = True
             unseen = unseen[hidden]
     return torch.from_numpy(seen)

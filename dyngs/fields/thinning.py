@@ -38,7 +38,7 @@ def thinned_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tupl
     chosen = through & (~light | (place % EVERY == 0))
     more = light.to(densities) * ((EVERY - 1) / 2) * (samples.ends - samples.starts)
     counts = torch.zeros(samples.num_rays, dtype=torch.int64, device=densities.device)
-    counts.index_add_(0, samples.rays[chosen].long(), torch.ones_like(counts[:1]).expand(int(chosen.sum())))
+    counts.index_add_(0, samples.rays.long(), chosen.long())
     longer = replace(samples, starts=samples.starts - more, ends=samples.ends + more)
     return _chosen(longer, chosen, offsets_of(counts))
 
