@@ -72,7 +72,10 @@ def dense_points(views: Sequence[View], options: DataConfig, sparse: np.ndarray,
     small = options.model_copy(update={"downscale": 1.0, "longest_side": SWEEP_SIDE, "cache_mb": 0.0})
     loader = ImageLoader([views[i] for i in needed], small)
     shots = {i: _shot(loader, k) for k, i in enumerate(needed)}
-    maps = [(shots[first], _depth_map(shots[first], [shots[i] for i in others], sparse)) for first, *others in groups]
+    maps = [
+        (shots[first], _depth_map(shots[first], [shots[i] for i in others], _depth_range(views[first], sparse)))
+        for first, *others in groups
+    ]
     found = [_agreed(shot, depth, maps) for shot, depth in maps]
     if not found or sum(len(xyz) for xyz, _ in found) < MIN_POINTS:
         return None
@@ -115,10 +118,16 @@ def _shot(loader: ImageLoader, index: int) -> _Shot:
     return _Shot(rgb.mean(dim=2), rgb.numpy(), counts, pose.double().numpy(), intrinsics.double().numpy())
 
 
-def _depth_map(shot: _Shot, others: Sequence[_Shot], sparse: np.ndarray) -> np.ndarray:
+def _depth_range(view: View, sparse: np.ndarray) -> tuple[float, float]:
+    """Return the nearest and the farthest depth of the points (P, 3) that lie in the image, but for a few."""
+    depths = sparse[projected(sparse, view)[1]] @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+    near, far = np.percentile(depths, _RANGE)
+    return float(near), float(far)
+
+
+def _depth_map(shot: _Shot, others: Sequence[_Shot], depths: tuple[float, float]) -> np.ndarray:
     """Return (H, W) depths; NaN where nothing correlates, at the ends of the range, and where pixels do not count."""
-    local = sparse @ shot.cam_from_world[:3, :3].T + shot.cam_from_world[:3, 3]
-    near, far = np.percentile(local[local[:, 2] > 0, 2], _RANGE)
+    near, far = depths
     inverse = np.linspace(1 / (_MARGIN * far), _MARGIN / near, DEPTHS)
     score = _mean_of_best_two([_correlation(shot, other, inverse) for other in others]).numpy()
     at = score.argmax(axis=0)

@@ -64,6 +64,15 @@ def test_points_lie_on_the_plane_in_its_colours(tmp_path: Path) -> None:
     assert len(few.xyz) == 50
 
 
+def test_points_beside_the_images_do_not_say_how_deep_to_look(tmp_path: Path) -> None:
+    views, options = _views(tmp_path), DataConfig(root=tmp_path)
+    beside = np.stack([np.full(60, 50.0), _ACROSS, np.linspace(-1, 1, 60) - DISTANCE], axis=1)  # as near as cameras
+    expected, found = (dense_points(views, options, x, 1000) for x in (SPARSE, np.concatenate([SPARSE, beside])))
+    assert expected is not None
+    assert found is not None
+    assert np.array_equal(found.xyz, expected.xyz)
+
+
 def test_any_number_of_threads_finds_the_same_points(tmp_path: Path) -> None:
     views, options, before = _views(tmp_path, 4), DataConfig(root=tmp_path), torch.get_num_threads()
     found = []
