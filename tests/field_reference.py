@@ -10,24 +10,24 @@ from torch import Tensor
 from dyngs.ops.hash_grid import HashLevels
 from dyngs.ops.rays import Samples, Space, Steps
 
-PRIMES = 1, 2654435761, 805459861, 3674653429
+PRIMES = 1, 2654435761, 805459861
 
 
 def reference_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
     """The value of ``hash_features`` by its formula, any order of derivatives by the table."""
-    dims, found, first = coords.shape[1], [], 0
+    found, first = [], 0
     for scale, size, rows in zip(levels.scales, levels.sizes, levels.rows, strict=True):
         at = coords.clamp(0, 1) * scale + 0.5
         below = at.floor()
         total = torch.zeros(len(coords), table.shape[1], dtype=table.dtype)
-        for corner in product((0, 1), repeat=dims):
+        for corner in product((0, 1), repeat=3):
             index = (below.long() + torch.tensor(corner)).clamp(max=size - 1)
             weight = torch.where(torch.tensor(corner) == 1, at - below, 1 - (at - below)).prod(1)
-            if rows == size**dims:
-                row = sum(index[:, a] * size**a for a in range(dims))
+            if rows == size**3:
+                row = sum(index[:, a] * size**a for a in range(3))
             else:
                 row = torch.zeros(len(coords), dtype=torch.long)
-                for a in range(dims):
+                for a in range(3):
                     row ^= (index[:, a] * PRIMES[a]) & 0xFFFFFFFF
                 row %= rows
             total = total + weight[:, None] * table[first + row]

@@ -13,13 +13,13 @@ namespace {
 // Scale, samples along an axis, and rows of each level.
 using LevelSizes = std::vector<std::tuple<double, int64_t, int64_t>>;
 
-std::vector<HashLevel> hash_levels(const LevelSizes& sizes, int64_t dims) {
+std::vector<HashLevel> hash_levels(const LevelSizes& sizes) {
   std::vector<HashLevel> levels;
   int64_t first = 0;
   for (const auto& [scale, size, rows] : sizes) {
     if (size < 1 || size > 1 << 20 || !(scale >= 0 && scale <= size)) throw nb::value_error("hash grid: no such level");
     int64_t samples = 1;
-    for (int64_t a = 0; a < dims; ++a) samples = std::min(samples * size, int64_t{1} << 40);
+    for (int64_t a = 0; a < kHashAxes; ++a) samples = std::min(samples * size, int64_t{1} << 40);
     const bool dense = samples == rows;
     if (rows < 1 || rows >= int64_t{1} << 31 || (!dense && (rows & (rows - 1)) != 0))
       throw nb::value_error("hash grid: the rows of a level are neither all samples nor a power of two");
@@ -33,16 +33,15 @@ std::vector<HashLevel> hash_levels(const LevelSizes& sizes, int64_t dims) {
 template <class S>
 HashGrid<S> hash_grid(const Rows<const S>& coords, const std::vector<HashLevel>& levels, int64_t features,
                       int threads) {
-  const int64_t dims = coords.shape(1);
-  if (dims != 3 && dims != 4) throw nb::value_error("hash grid: coordinates of 3 or 4 axes");
+  if (coords.shape(1) != kHashAxes) throw nb::value_error("hash grid: coordinates of 3 axes");
   if (features != 1 && features != 2 && features != 4 && features != 8)
     throw nb::value_error("hash grid: 1, 2, 4 or 8 features per level");
-  return {levels, dims, features, coords.data(), static_cast<int64_t>(coords.shape(0)), threads};
+  return {levels, features, coords.data(), static_cast<int64_t>(coords.shape(0)), threads};
 }
 
 template <class S>
 void hash_forward(Rows<const S> coords, Rows<const S> table, const LevelSizes& sizes, Rows<S> features, int threads) {
-  const auto levels = hash_levels(sizes, coords.shape(1));
+  const auto levels = hash_levels(sizes);
   const HashGrid<S> grid = hash_grid(coords, levels, table.shape(1), threads);
   const S* from = checked(table, grid.rows(), grid.features, "hash grid: table");
   S* to = checked(features, grid.count, grid.width(), "hash grid: features");
@@ -53,7 +52,7 @@ void hash_forward(Rows<const S> coords, Rows<const S> table, const LevelSizes& s
 template <class S>
 void hash_backward(Rows<const S> coords, const LevelSizes& sizes, Rows<const S> g_features, Rows<S> g_table,
                    int threads) {
-  const auto levels = hash_levels(sizes, coords.shape(1));
+  const auto levels = hash_levels(sizes);
   const HashGrid<S> grid = hash_grid(coords, levels, g_table.shape(1), threads);
   const S* from = checked(g_features, grid.count, grid.width(), "hash grid: gradient");
   S* to = checked(g_table, grid.rows(), grid.features, "hash grid: gradient of the table");

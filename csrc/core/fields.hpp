@@ -1,10 +1,9 @@
-// The native interface of radiance fields, as core/api.hpp is that of Gaussians. Shape letters: M samples, R rays, D axes,
+// The native interface of radiance fields, as core/api.hpp is that of Gaussians. Shape letters: M samples, R rays,
 // L levels, F features per level. Samples of a ray lie next to each other: those of ray r are [offsets[r], offsets[r + 1]).
 #pragma once
 
 #include <cstdint>
 #include <span>
-#include <type_traits>
 
 #include "math/hash_grid.hpp"
 #include "math/volume.hpp"
@@ -16,9 +15,8 @@ namespace dyngs {
 template <class S>
 struct HashGrid {
   std::span<const HashLevel> levels;
-  int64_t dims;      // D, 3 or 4
   int64_t features;  // F, 1, 2, 4 or 8
-  const S* coords;   // (M, D) in [0, 1]
+  const S* coords;   // (M, 3) in [0, 1]
   int64_t count;     // M
   int threads;
 
@@ -26,19 +24,15 @@ struct HashGrid {
   int64_t width() const { return static_cast<int64_t>(levels.size()) * features; }
 };
 
-// f<D, F>() with the axes and features of a grid as constants.
+// f<F>() with the features of a grid as a constant.
 template <class Call>
-void with_grid_sizes(int64_t dims, int64_t features, const Call& f) {
-  const auto of = [&]<int kDims>(std::integral_constant<int, kDims>) {
-    switch (features) {
-      case 1: return f.template operator()<kDims, 1>();
-      case 2: return f.template operator()<kDims, 2>();
-      case 4: return f.template operator()<kDims, 4>();
-      default: return f.template operator()<kDims, 8>();
-    }
-  };
-  if (dims == 3) return of(std::integral_constant<int, 3>());
-  return of(std::integral_constant<int, 4>());
+void with_features(int64_t features, const Call& f) {
+  switch (features) {
+    case 1: return f.template operator()<1>();
+    case 2: return f.template operator()<2>();
+    case 4: return f.template operator()<4>();
+    default: return f.template operator()<8>();
+  }
 }
 
 // Writes features (M, L * F): the table's rows (rows, F) between which each sample lies, interpolated, level by level.

@@ -1,9 +1,9 @@
 // Look-up in a multiresolution hash grid (math/hash_grid.hpp), level by level, so that one table at a time is in the second-level
-// cache; one thread per sample. Backward, each sample writes the rows of its 2^D corners; these pairs are sorted by row, stably,
+// cache; one thread per sample. Backward, each sample writes the rows of its eight corners; these pairs are sorted by row, stably,
 // and lanes of a warp, or of all warps of a block where many pairs come to a row, add up what a row gets: no atomics, the same
 // bytes every time. Samples are taken some at a time, so that the workspace stays small.
 //
-// Limits, H100 (3.35 TB/s, L2 cache about 5.5 TB/s), D = 3, F = 4, one level. Forward, per sample: 28 bytes of its own and 8
+// Limits, H100 (3.35 TB/s, L2 cache about 5.5 TB/s), F = 4, one level. Forward, per sample: 28 bytes of its own and 8
 // rows, each a sector of 32 bytes of the L2 cache: 8 ps and 47 ps. Backward: 8 pairs, of which 12 bytes are written, three passes
 // of the sort at 20, and read again with their gradients, 12 + 32 from the L2 cache: 0.6 KB, 0.17 ns, and 0.35 KB, 64 ps. A row
 // with most of many pairs is one block's work, or, where the others of its level have few, one warp's.
@@ -19,26 +19,24 @@ namespace {
 constexpr int kThreads = 256, kWarps = kThreads / kWarpSize;
 constexpr int64_t kCrowded = 2 * kWarpSize;  // pairs per row of a level, from which a row gets all warps of a block
 
-template <int kDims>
-__device__ void locate_sample(const HashLevel& level, const float* coords, int64_t m,
-                              HashCorners<kDims, 1, float>& out) {
-  float at[kDims][1];
+__device__ void locate_sample(const HashLevel& level, const float* coords, int64_t m, HashCorners<1, float>& out) {
+  float at[kHashAxes][1];
   DYNGS_UNROLL
-  for (int a = 0; a < kDims; ++a) at[a][0] = global(coords)[m * kDims + a];
-  locate_hashed<kDims, 1, float>(level, at, out);
+  for (int a = 0; a < kHashAxes; ++a) at[a][0] = global(coords)[m * kHashAxes + a];
+  locate_hashed<1, float>(level, at, out);
 }
 
 // `rows`, `features`: from the level's first row and first feature on.
-template <int kDims, int kFeatures>
+template <int kFeatures>
 __global__ void __launch_bounds__(kThreads) hash_features_kernel(HashLevel level, const float* coords, int64_t count,
                                                                  const float* rows, int64_t width, float* features) {
   const int64_t m = int64_t{blockIdx.x} * kThreads + threadIdx.x;
   if (m >= count) return;
-  HashCorners<kDims, 1, float> corners;
-  locate_sample<kDims>(level, coords, m, corners);
+  HashCorners<1, float> corners;
+  locate_sample(level, coords, m, corners);
   float sum[kFeatures] = {};
   DYNGS_UNROLL
-  for (int c = 0; c < corners.kCorners; ++c) {
+  for (int c = 0; c < kHashCorners; ++c) {
     const Array<const float> row = global(rows) + int64_t{corners.rows[c][0]} * kFeatures;
     DYNGS_UNROLL
     for (int f = 0; f < kFeatures; ++f) sum[f] += corners.weights[c][0] * row[f];
@@ -47,17 +45,16 @@ __global__ void __launch_bounds__(kThreads) hash_features_kernel(HashLevel level
   for (int f = 0; f < kFeatures; ++f) global(features)[m * width + f] = sum[f];
 }
 
-// A pair is corner i % 2^D of sample i / 2^D; its key is the row.
-template <int kDims>
+// A pair is corner i % 8 of sample i / 8; its key is the row.
 __global__ void __launch_bounds__(kThreads)
     hash_pairs_kernel(HashLevel level, const float* coords, int64_t count, Pairs pairs, float* weights) {
   const int64_t m = int64_t{blockIdx.x} * kThreads + threadIdx.x;
   if (m >= count) return;
-  HashCorners<kDims, 1, float> corners;
-  locate_sample<kDims>(level, coords, m, corners);
+  HashCorners<1, float> corners;
+  locate_sample(level, coords, m, corners);
   DYNGS_UNROLL
-  for (int c = 0; c < corners.kCorners; ++c) {
-    const int64_t i = m * corners.kCorners + c;
+  for (int c = 0; c < kHashCorners; ++c) {
+    const int64_t i = m * kHashCorners + c;
     global(pairs.keys)[i] = corners.rows[c][0];
     global(pairs.values)[i] = static_cast<int32_t>(i);
     global(weights)[i] = corners.weights[c][0];
@@ -71,10 +68,10 @@ struct SortedPairs {
 };
 
 // `parts` warps for each row, whose sums are added in their order. `gradients`: of the level's features of the first sample on,
-// rows of `width`; a sample has 2^dims pairs.
+// rows of `width`; a sample has 8 pairs.
 template <int kFeatures>
 __global__ void __launch_bounds__(kThreads)
-    gather_rows_kernel(SortedPairs sorted, const float* gradients, int64_t width, int dims, int64_t rows, int parts,
+    gather_rows_kernel(SortedPairs sorted, const float* gradients, int64_t width, int64_t rows, int parts,
                        bool is_first, float* g_rows) {
   DYNGS_SHARED(float, sums, kWarps* kFeatures);
   const int lane = static_cast<int>(threadIdx.x) % kWarpSize, warp = static_cast<int>(threadIdx.x) / kWarpSize;
@@ -85,7 +82,7 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t k = begin + warp % parts * kWarpSize + lane; k < end; k += int64_t{parts} * kWarpSize) {
     const int64_t pair = global(sorted.pairs)[k];
     const float weight = global(sorted.weights)[pair];
-    const Array<const float> from = global(gradients) + (pair >> dims) * width;
+    const Array<const float> from = global(gradients) + pair / kHashCorners * width;
     DYNGS_UNROLL
     for (int f = 0; f < kFeatures; ++f) sum[f] += weight * from[f];
   }
@@ -110,11 +107,11 @@ struct BackwardBuffers {
   SortScratch sort;
   BackwardBuffers(Workspace& w, const HashGrid<float>& grid, int64_t most)
       : at_once(std::min(grid.count, std::max<int64_t>(most, 1))),
-        pairs{w.take<uint32_t>(at_once << grid.dims), w.take<int32_t>(at_once << grid.dims)},
-        other{w.take<uint32_t>(at_once << grid.dims), w.take<int32_t>(at_once << grid.dims)},
-        weights(w.take<float>(at_once << grid.dims)),
+        pairs{w.take<uint32_t>(kHashCorners * at_once), w.take<int32_t>(kHashCorners * at_once)},
+        other{w.take<uint32_t>(kHashCorners * at_once), w.take<int32_t>(kHashCorners * at_once)},
+        weights(w.take<float>(kHashCorners * at_once)),
         offsets(w.take<int32_t>(most_rows(grid) + 1)),
-        sort(w, at_once << grid.dims) {}
+        sort(w, kHashCorners * at_once) {}
 
   static int64_t most_rows(const HashGrid<float>& grid) {
     int64_t most = 0;
@@ -124,29 +121,28 @@ struct BackwardBuffers {
 };
 
 // Writes, or adds, what `count` samples give to the rows of a level; `coords`, `gradients`, `g_rows`: from the first of each on.
-template <int kDims, int kFeatures>
+template <int kFeatures>
 void gather_level(const HashLevel& level, const float* coords, int64_t count, const float* gradients, int64_t width,
                   bool is_first, float* g_rows, const BackwardBuffers& b, Stream stream) {
-  const int64_t pairs = count << kDims;
-  launch("hash_pairs", {blocks_for(count, kThreads), kThreads}, stream, hash_pairs_kernel<kDims>, level, coords, count,
+  const int64_t pairs = kHashCorners * count;
+  launch("hash_pairs", {blocks_for(count, kThreads), kThreads}, stream, hash_pairs_kernel, level, coords, count,
          b.pairs, b.weights);
   const Pairs& sorted = stable_sort(b.pairs, b.other, pairs, bits_for(level.rows), b.sort, stream);
   find_offsets(sorted.keys, pairs, level.rows, b.offsets, stream);
   const int parts = pairs >= kCrowded * level.rows ? kWarps : 1;
   launch("gather_rows", {blocks_for(level.rows, kWarps / parts), kThreads}, stream, gather_rows_kernel<kFeatures>,
-         SortedPairs{sorted.values, b.offsets, b.weights}, gradients, width, kDims, level.rows, parts, is_first,
-         g_rows);
+         SortedPairs{sorted.values, b.offsets, b.weights}, gradients, width, level.rows, parts, is_first, g_rows);
 }
 
 }  // namespace
 
 void hash_grid_forward(const HashGrid<float>& grid, const float* table, float* features, Stream stream) {
-  with_grid_sizes(grid.dims, grid.features, [&]<int kDims, int kFeatures>() {
+  with_features(grid.features, [&]<int kFeatures>() {
     for (size_t l = 0; l < grid.levels.size(); ++l) {
       const HashLevel& level = grid.levels[l];
-      launch("hash_features", {blocks_for(grid.count, kThreads), kThreads}, stream,
-             hash_features_kernel<kDims, kFeatures>, level, grid.coords, grid.count, table + level.first * kFeatures,
-             grid.width(), features + static_cast<int64_t>(l) * kFeatures);
+      launch("hash_features", {blocks_for(grid.count, kThreads), kThreads}, stream, hash_features_kernel<kFeatures>,
+             level, grid.coords, grid.count, table + level.first * kFeatures, grid.width(),
+             features + static_cast<int64_t>(l) * kFeatures);
     }
   });
 }
@@ -162,14 +158,14 @@ void hash_grid_backward(const HashGrid<float>& grid, const float* g_features, fl
   Workspace workspace(lent.memory, lent.bytes);
   const BackwardBuffers b(workspace, grid, at_once);
   const int64_t width = grid.width();
-  with_grid_sizes(grid.dims, grid.features, [&]<int kDims, int kFeatures>() {
+  with_features(grid.features, [&]<int kFeatures>() {
     for (size_t l = 0; l < grid.levels.size(); ++l) {
       int64_t first = 0;
       do {  // also of no samples: the gradients are 0 then
         const int64_t count = std::min(b.at_once, grid.count - first);
-        gather_level<kDims, kFeatures>(grid.levels[l], grid.coords + first * kDims, count,
-                                       g_features + first * width + static_cast<int64_t>(l) * kFeatures, width,
-                                       first == 0, g_table + grid.levels[l].first * kFeatures, b, stream);
+        gather_level<kFeatures>(grid.levels[l], grid.coords + first * kHashAxes, count,
+                                g_features + first * width + static_cast<int64_t>(l) * kFeatures, width, first == 0,
+                                g_table + grid.levels[l].first * kFeatures, b, stream);
         first += count;
       } while (first < grid.count);
     }

@@ -61,7 +61,7 @@ void motion() {
 }
 
 void fields() {
-  grid_on_cpu<float>(grid_case(levels_of({16, 64, 256}, 3, 1 << 14), 3, 4, 20'000));
+  grid_on_cpu<float>(grid_case(levels_of({16, 64, 256}, 1 << 14), 4, 20'000));
   march_on_cpu<float>(march_case(2'000, 3, 0.01));
   composite_on_cpu<float>(sample_case(std::vector<int64_t>(2'000, 20), 0.5, 1e-4));
 }

@@ -16,12 +16,12 @@ using namespace dyngs;
 // Hash grids ----------------------------------------------------------------------------------------------------------
 
 // Levels with `most_rows` at most; what is larger is hashed.
-inline std::vector<HashLevel> levels_of(const std::vector<int64_t>& sizes, int64_t dims, int64_t most_rows) {
+inline std::vector<HashLevel> levels_of(const std::vector<int64_t>& sizes, int64_t most_rows) {
   std::vector<HashLevel> levels;
   int64_t first = 0;
   for (const int64_t size : sizes) {
     int64_t samples = 1;
-    for (int64_t a = 0; a < dims; ++a) samples *= size;
+    for (int64_t a = 0; a < kHashAxes; ++a) samples *= size;
     const int64_t rows = std::min(samples, most_rows);
     levels.push_back({static_cast<double>(size) - 1, size, first, rows, rows == samples});
     first += rows;
@@ -31,21 +31,16 @@ inline std::vector<HashLevel> levels_of(const std::vector<int64_t>& sizes, int64
 
 struct GridCase {
   std::vector<HashLevel> levels;
-  int64_t dims, features;
-  Values coords, table, weights;  // (M, D), (rows, F), (M, L * F) of the features in a sum
+  int64_t features;
+  Values coords, table, weights;  // (M, 3), (rows, F), (M, L * F) of the features in a sum
 
-  int64_t count() const { return static_cast<int64_t>(coords.size()) / dims; }
+  int64_t count() const { return static_cast<int64_t>(coords.size()) / kHashAxes; }
 };
 
 // `count` points in and around the unit cube, or around its middle alone.
-inline GridCase grid_case(const std::vector<HashLevel>& levels, int64_t dims, int64_t features, int64_t count,
-                          double around = 0.6) {
+inline GridCase grid_case(const std::vector<HashLevel>& levels, int64_t features, int64_t count, double around = 0.6) {
   const int64_t rows = levels.back().first + levels.back().rows;
-  return {levels,
-          dims,
-          features,
-          uniforms(count * dims, 0.5 - around, 0.5 + around),
-          uniforms(rows * features, -1, 1),
+  return {levels, features, uniforms(count * kHashAxes, 0.5 - around, 0.5 + around), uniforms(rows * features, -1, 1),
           uniforms(count * static_cast<int64_t>(levels.size()) * features, -1, 1)};
 }
 
@@ -58,7 +53,7 @@ template <class S>
 GridResults<S> grid_on_cpu(const GridCase& c, int threads = 1) {
   const auto coords = as<S>(c.coords), table = as<S>(c.table), weights = as<S>(c.weights);
   GridResults<S> r{std::vector<S>(weights.size(), S(7)), std::vector<S>(table.size(), S(7))};
-  const HashGrid<S> grid{c.levels, c.dims, c.features, coords.data(), c.count(), threads};
+  const HashGrid<S> grid{c.levels, c.features, coords.data(), c.count(), threads};
   hash_grid_forward(grid, table.data(), r.features.data());
   hash_grid_backward(grid, weights.data(), r.by_table.data());
   return r;

@@ -20,7 +20,7 @@ constexpr double kNone = std::numeric_limits<double>::quiet_NaN();
 GridResults<float> grid_on_gpu(const GridCase& c, int64_t at_once = cuda::kHashSamples) {
   Memory<float> coords(as<float>(c.coords)), table(as<float>(c.table)), weights(as<float>(c.weights));
   Memory<float> features(weights.count()), by_table(table.count());
-  const HashGrid<float> grid{c.levels, c.dims, c.features, coords.get(), c.count(), 1};
+  const HashGrid<float> grid{c.levels, c.features, coords.get(), c.count(), 1};
   Memory<char> workspace(cuda::hash_grid_backward_workspace(grid, at_once));
   cuda::hash_grid_forward(grid, table.get(), features.get(), nullptr);
   cuda::hash_grid_backward(grid, weights.get(), by_table.get(), {workspace.get(), workspace.count()}, nullptr, at_once);
@@ -28,11 +28,9 @@ GridResults<float> grid_on_gpu(const GridCase& c, int64_t at_once = cuda::kHashS
 }
 
 // `around`: where points lie, see grid_case; a small one puts most into few rows, which whole blocks add up.
-void test_hash_grid(const std::vector<HashLevel>& levels, int64_t dims, int64_t features, int64_t count,
-                    double around) {
-  const GridCase c = grid_case(levels, dims, features, count, around);
-  const std::string what =
-      std::to_string(dims) + " axes, " + std::to_string(features) + " features, " + std::to_string(count) + " points";
+void test_hash_grid(const std::vector<HashLevel>& levels, int64_t features, int64_t count, double around) {
+  const GridCase c = grid_case(levels, features, count, around);
+  const std::string what = std::to_string(features) + " features, " + std::to_string(count) + " points";
   const auto cpu = grid_on_cpu<double>(c);
   const auto gpu = grid_on_gpu(c);
   expect_close("features, " + what, gpu.features, cpu.features, 2e-5);
@@ -47,8 +45,8 @@ void test_hash_grid(const std::vector<HashLevel>& levels, int64_t dims, int64_t 
 }
 
 void test_points_outside_and_spoilt() {
-  const auto levels = levels_of({1, 4, 30}, 3, 256);
-  GridCase c = grid_case(levels, 3, 2, 70, 3.0);
+  const auto levels = levels_of({1, 4, 30}, 256);
+  GridCase c = grid_case(levels, 2, 70, 3.0);
   c.coords[3 * 7 + 1] = kNone, c.coords[0] = 1e30, c.table[2] = kNone;
   const auto gpu = grid_on_gpu(c), cpu = grid_on_cpu<float>(c);
   for (size_t i = 0; i < gpu.features.size(); ++i)
@@ -59,7 +57,7 @@ void test_points_outside_and_spoilt() {
 }
 
 void test_no_points() {
-  const auto gpu = grid_on_gpu(grid_case(levels_of({4, 30}, 3, 256), 3, 2, 0));
+  const auto gpu = grid_on_gpu(grid_case(levels_of({4, 30}, 256), 2, 0));
   expect(std::all_of(gpu.by_table.begin(), gpu.by_table.end(), [](float x) { return x == 0; }), "no points");
 }
 
@@ -204,9 +202,9 @@ void test_known_rays() {
 
 int main() {
   skip_without_gpu();
-  const auto levels = levels_of({3, 6, 17, 24}, 3, 512), in_time = levels_of({3, 5, 9}, 4, 256);
-  test_hash_grid(levels, 3, 4, 700, 0.6), test_hash_grid(levels, 3, 1, 60, 0.6), test_hash_grid(levels, 3, 8, 90, 0.6);
-  test_hash_grid(in_time, 4, 2, 300, 0.6), test_hash_grid(levels_of({2, 40}, 3, 256), 3, 2, 900, 0.01);
+  const auto levels = levels_of({3, 6, 17, 24}, 512);
+  test_hash_grid(levels, 4, 700, 0.6), test_hash_grid(levels, 1, 60, 0.6), test_hash_grid(levels, 8, 90, 0.6);
+  test_hash_grid(levels_of({2, 40}, 256), 2, 900, 0.01);
   test_points_outside_and_spoilt(), test_no_points();
   test_march(1, 0), test_march(3, 0.0625), test_hard_rays();
   test_composition(0.5, 0), test_composition(3, 0.01), test_known_rays();

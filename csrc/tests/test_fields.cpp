@@ -19,7 +19,7 @@ constexpr double kNone = std::numeric_limits<double>::quiet_NaN(), kFar = std::n
 
 // The row of a level's sample, and the formula of the hash (Mueller et al. 2022, equation 4).
 int64_t plain_row(const HashLevel& level, const std::vector<int64_t>& index) {
-  const uint64_t primes[] = {1, 2654435761, 805459861, 3674653429};
+  const uint64_t primes[] = {1, 2654435761, 805459861};
   int64_t dense = 0, stride = 1;
   uint64_t hash = 0;
   for (size_t a = 0; a < index.size(); ++a) {
@@ -35,12 +35,13 @@ void for_each_term(const GridCase& c, const F& f) {
   const int64_t width = static_cast<int64_t>(c.levels.size()) * c.features;
   for (int64_t m = 0; m < c.count(); ++m)
     for (size_t l = 0; l < c.levels.size(); ++l)
-      for (int corner = 0; corner < 1 << c.dims; ++corner) {
+      for (int corner = 0; corner < kHashCorners; ++corner) {
         const HashLevel& level = c.levels[l];
         std::vector<int64_t> index;
         double weight = 1;
-        for (int64_t a = 0; a < c.dims; ++a) {
-          const double at = std::clamp(c.coords[m * c.dims + a], 0.0, 1.0) * level.scale + 0.5, below = std::floor(at);
+        for (int64_t a = 0; a < kHashAxes; ++a) {
+          const double at = std::clamp(c.coords[m * kHashAxes + a], 0.0, 1.0) * level.scale + 0.5,
+                       below = std::floor(at);
           const bool high = (corner >> a & 1) != 0;
           weight *= high ? at - below : 1 - (at - below);
           index.push_back(std::min(static_cast<int64_t>(below) + (high ? 1 : 0), level.size - 1));
@@ -57,10 +58,10 @@ Values plain_features(const GridCase& c, const Values& table) {
   return features;
 }
 
-void test_hash_grid(int64_t dims, int64_t features) {
-  const auto levels = levels_of({3, 6, 17, 24}, dims, 512);
-  const GridCase c = grid_case(levels, dims, features, 61);
-  const std::string what = std::to_string(dims) + " axes, " + std::to_string(features) + " features";
+void test_hash_grid(int64_t features) {
+  const auto levels = levels_of({3, 6, 17, 24}, 512);
+  const GridCase c = grid_case(levels, features, 61);
+  const std::string what = std::to_string(features) + " features";
   const auto d = grid_on_cpu<double>(c);
   Values by_table(c.table.size());
   for_each_term(c, [&](int64_t k, int64_t entry, double weight) { by_table[entry] += weight * c.weights[k]; });
@@ -75,7 +76,7 @@ void test_hash_grid(int64_t dims, int64_t features) {
 
 // Enough points for several tasks; 7 threads: several for one level.
 void test_hash_grid_threads() {
-  const GridCase c = grid_case(levels_of({3, 6, 17, 24}, 3, 512), 3, 4, 5000);
+  const GridCase c = grid_case(levels_of({3, 6, 17, 24}, 512), 4, 5000);
   const auto one = grid_on_cpu<float>(c);
   for (const int threads : {2, 4, 7}) {
     const auto other = grid_on_cpu<float>(c, threads);
@@ -86,8 +87,8 @@ void test_hash_grid_threads() {
 
 // At its samples a dense level has the values of their rows.
 void test_samples_of_a_level() {
-  const auto levels = levels_of({5}, 3, 125);
-  GridCase c = grid_case(levels, 3, 2, 0);
+  const auto levels = levels_of({5}, 125);
+  GridCase c = grid_case(levels, 2, 0);
   for (int64_t i = 1; i < 4; ++i)
     for (const int64_t at : {i, (i + 1) % 4 == 0 ? 1 : (i + 1) % 4, int64_t{2}})
       c.coords.push_back((static_cast<double>(at) - 0.5) / levels[0].scale);
@@ -101,8 +102,8 @@ void test_samples_of_a_level() {
 }
 
 void test_points_outside() {
-  const auto levels = levels_of({4, 40}, 3, 256);
-  GridCase c = grid_case(levels, 3, 4, 300, 3.0), inside = c;
+  const auto levels = levels_of({4, 40}, 256);
+  GridCase c = grid_case(levels, 4, 300, 3.0), inside = c;
   for (double& x : inside.coords) x = std::clamp(x, 0.0, 1.0);
   c.coords[0] = 1e30, inside.coords[0] = 1, c.coords[1] = -1e30, inside.coords[1] = 0;
   const auto one = grid_on_cpu<float>(c), other = grid_on_cpu<float>(inside);
@@ -111,8 +112,8 @@ void test_points_outside() {
 }
 
 void test_spoilt_points_and_rows() {
-  const auto levels = levels_of({4, 30}, 3, 256);
-  const GridCase good = grid_case(levels, 3, 2, 50, 0.45);
+  const auto levels = levels_of({4, 30}, 256);
+  const GridCase good = grid_case(levels, 2, 50, 0.45);
   const auto clean = grid_on_cpu<float>(good);
   for (const double bad : {kNone, kFar, -kFar}) {
     GridCase c = good;
@@ -141,8 +142,8 @@ void test_spoilt_points_and_rows() {
 }
 
 void test_no_points() {
-  const auto levels = levels_of({4, 30}, 4, 256);
-  const auto found = grid_on_cpu<float>(grid_case(levels, 4, 1, 0), 4);
+  const auto levels = levels_of({4, 30}, 256);
+  const auto found = grid_on_cpu<float>(grid_case(levels, 1, 0), 4);
   expect(std::all_of(found.by_table.begin(), found.by_table.end(), [](float x) { return x == 0; }), "no points");
 }
 
@@ -384,8 +385,7 @@ void test_known_rays() {
 
 int main() {
   skip_unless_supported();
-  for (const int64_t dims : {3, 4})
-    for (const int64_t features : {1, 2, 4, 8}) test_hash_grid(dims, features);
+  for (const int64_t features : {1, 2, 4, 8}) test_hash_grid(features);
   test_hash_grid_threads(), test_samples_of_a_level(), test_points_outside(), test_spoilt_points_and_rows(),
       test_no_points();
   test_march(1), test_march(3), test_growing_samples<double>(1e-11), test_growing_samples<float>(1e-5);

@@ -83,6 +83,8 @@ class Deadline:
         if self._since is None:
             self._begin(done, now)
             return total
+        if happened(config, done) != happened(config, done - 1):  # a step unlike those to come
+            self._begin(done, now)
         since, then = self._since
         pace = (now - then) / max(done - since, 1)
         if now + 2 * pace + self.save_seconds + reserve > given:
@@ -185,9 +187,10 @@ def fitting_steps(forecast: Forecast, config: Config, done: int, seconds: float,
 
 def same_phase(old: Config, new: Config, done: int) -> bool:
     """Return whether changing ``old`` to ``new`` after ``done`` neither omits nor repeats any one-time event."""
+    return happened(old, done) == happened(new, done)
 
-    def happened(config: Config) -> list[bool]:
-        once = motion_begins_after(config, config.train.steps), config.colour.measured_after(config.train.steps)
-        return [done >= step for step in once if step is not None]
 
-    return happened(old) == happened(new)
+def happened(config: Config, done: int) -> list[bool]:
+    """Return which of the one-time events of a run are over after ``done`` steps."""
+    once = motion_begins_after(config, config.train.steps), config.colour.measured_after(config.train.steps)
+    return [done >= step for step in once if step is not None]

@@ -29,6 +29,7 @@ from dyngs.static.training import start as start_static
 MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
 MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
 STEPS_PER_SHOT = 50  # Steps of the run for each: those take ten times as long as the search in one image
+SECONDS_PER_SHOT = 3.0  # Of train.minutes for each, where that is given, likewise
 
 
 def refusal(capture: Capture) -> str | None:
@@ -84,6 +85,8 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
 
     def shots(still: Gaussians) -> Shots | None:
         order, limit = one_camera(views), min(MAX_SHOTS, rates_of(config).steps // STEPS_PER_SHOT)
+        if config.train.minutes is not None:
+            limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_SHOT))
         if order is None or limit == 0 or len(set(images.sizes)) > 1:
             return None
         used = (images[order[i]] for i in evenly_spaced(len(order), limit))

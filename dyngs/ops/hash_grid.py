@@ -1,6 +1,6 @@
 """Features from a multiresolution hash grid (Müller et al. 2022, Instant Neural Graphics Primitives), differentiable.
 
-M points, D axes (3, or 4 with time), L levels, F features of each. A level has samples at (g - 0.5) / scale along each
+M points, L levels, F features of each. A level has samples at (g - 0.5) / scale along each
 axis, clamped at its last. Where all fit, each has a row of its own; else they share rows by a hash of their index.
 """
 
@@ -29,7 +29,7 @@ class HashLevels:
     rows: tuple[int, ...]
 
     @staticmethod
-    def geometric(num_levels: int, coarsest: int, finest: int, most_rows: int, dims: int = 3) -> HashLevels:
+    def geometric(num_levels: int, coarsest: int, finest: int, most_rows: int) -> HashLevels:
         """Return levels whose resolution grows by the same factor each time; ``most_rows`` of each is a power of two.
 
         The published formula: scale_l = coarsest b^l - 1, size_l = ceil(scale_l) + 1.
@@ -37,7 +37,7 @@ class HashLevels:
         growth = math.log(finest / coarsest) / max(num_levels - 1, 1)
         scales = tuple(coarsest * math.exp(growth * level) - 1 for level in range(num_levels))
         sizes = tuple(math.ceil(scale - 1e-9) + 1 for scale in scales)
-        rows = tuple(min(size**dims, most_rows) for size in sizes)
+        rows = tuple(min(size**3, most_rows) for size in sizes)
         return HashLevels(scales, sizes, rows)
 
     @property
@@ -83,14 +83,14 @@ hash_grid_op = register("hash_grid", _hash_grid, gradient=Gradient(_save, _backw
 
 
 def hash_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    """Return (M, L * F) features of points (M, D) in the unit cube, interpolated between rows of ``table``.
+    """Return (M, L * F) features of points (M, 3) in the unit cube, interpolated between rows of ``table``.
 
     Differentiable once, in the table. What lies outside of the cube counts as on its surface; a coordinate that is no
     finite number gives features of NaN. The same bits on any number of threads. Raises DyngsError: shapes or dtypes
     that do not fit.
     """
-    if coords.ndim != 2 or coords.shape[1] not in (3, 4):
-        raise DyngsError(f"hash grid: points must be (M, 3) or (M, 4), got {tuple(coords.shape)}")
+    if coords.ndim != 2 or coords.shape[1] != 3:
+        raise DyngsError(f"hash grid: points must be (M, 3), got {tuple(coords.shape)}")
     if table.ndim != 2 or len(table) != levels.num_rows or table.shape[1] not in WIDTHS:
         raise DyngsError(
             f"hash grid: the table must be ({levels.num_rows}, F) with F of 1, 2, 4 or 8, got {tuple(table.shape)}"
@@ -130,7 +130,7 @@ known_features_op = register("known_features", _known, gradient=Gradient(_save_k
 
 
 def known_features(features: Tensor, which: Tensor, coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    """Return the rows ``which`` (K,) of ``features``, as ``hash_features`` of the points ``coords`` (K, D) gives them.
+    """Return the rows ``which`` (K,) of ``features``, as ``hash_features`` of the points ``coords`` (K, 3) gives them.
 
     Differentiable in the table as if they had been looked up again.
     """

@@ -18,7 +18,7 @@ from dyngs.config import Config
 from dyngs.deform.schedule import motion_begins_after
 from dyngs.models.schedule import image_divisor, scaled
 
-FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 18.0, 300.0, 9e-4
+FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 6.0, 300.0, 7e-4
 """Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two cores."""
 MOTION = 2.0  # Factor by which steps cost more once things may move
 DETAIL = 0.5

@@ -28,6 +28,7 @@ from dyngs.budget.time import (
 from dyngs.config import AutoColour, Config, DataConfig, DynamicModel, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.data.read import read_capture
+from dyngs.deform.schedule import motion_begins_after
 from dyngs.errors import DyngsError
 from dyngs.kinds import assemble, prepared
 from dyngs.models.checkpoint import Checkpoint
@@ -99,6 +100,23 @@ def test_a_run_whose_steps_change_pace_fills_its_time(factor: float) -> None:
         if done >= found:
             break
         now += 0.02 * (factor if done > found / 3 else 1.0)
+    assert 85 <= now <= 100
+
+
+def test_a_step_unlike_the_others_is_not_taken_for_the_pace() -> None:
+    """The step in which motion begins searches the images: 30 seconds of 100."""
+    moving = PLAIN.model_copy(update={"model": DynamicModel(motion_from=0.05)})
+    deadline, config, now = simulated(100.0, 100_000, fits=True), with_steps(moving, 5000), 0.0
+    planned = list[int]()
+    for done in itertools.count(1):
+        now += 30.0 if done == motion_begins_after(config, config.train.steps) else 0.02
+        deadline._forecast.observe(config, done, now, 1000, 10_000)
+        found = deadline.steps(config, done, now)
+        config = with_steps(config, found)
+        planned.append(found)
+        if done >= found:
+            break
+    assert min(planned) > 2500  # 67 seconds are left for steps that take 0.02 to 0.04
     assert 85 <= now <= 100
 
 

@@ -24,10 +24,10 @@ from dyngs.ops.native import kernel_threads
 LEVELS = HashLevels.geometric(4, 3, 24, 64)
 
 
-def some(count: int, dims: int, seed: int = 0) -> torch.Tensor:
+def some(count: int, seed: int = 0) -> torch.Tensor:
     """Points inside and around the unit cube."""
     generator = torch.Generator().manual_seed(seed)
-    return torch.rand(count, dims, generator=generator, dtype=torch.float64) * 1.2 - 0.1
+    return torch.rand(count, 3, generator=generator, dtype=torch.float64) * 1.2 - 0.1
 
 
 def table_of(levels: HashLevels, features: int) -> torch.Tensor:
@@ -46,16 +46,15 @@ def test_levels_are_the_published_ones() -> None:
 
 
 @given(
-    dims=st.sampled_from([3, 4]),
     features=st.sampled_from([1, 2, 4, 8]),
     count=st.integers(0, 50),
     shape=st.tuples(st.integers(1, 4), st.integers(2, 6), st.integers(6, 30), st.integers(3, 8)),
 )
 @settings(max_examples=40, deadline=None)
-def test_double_equals_the_formula(dims: int, features: int, count: int, shape: tuple[int, int, int, int]) -> None:
+def test_double_equals_the_formula(features: int, count: int, shape: tuple[int, int, int, int]) -> None:
     number, coarsest, finest, log2_rows = shape
-    levels = HashLevels.geometric(number, coarsest, finest, 1 << log2_rows, dims)
-    coords, table = some(count, dims, count), table_of(levels, features)
+    levels = HashLevels.geometric(number, coarsest, finest, 1 << log2_rows)
+    coords, table = some(count, count), table_of(levels, features)
     found, expected = hash_features(coords, table, levels), reference_features(coords, table, levels)
     weights = torch.randn(found.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
@@ -65,7 +64,7 @@ def test_double_equals_the_formula(dims: int, features: int, count: int, shape: 
 
 def test_gradients_are_those_of_finite_differences() -> None:
     levels = HashLevels.geometric(2, 2, 4, 8)
-    coords, table = some(6, 3), table_of(levels, 2)
+    coords, table = some(6), table_of(levels, 2)
     sizes = list(levels.scales), list(levels.sizes), list(levels.rows)
     assert torch.autograd.gradcheck(lambda x: hash_grid_op(coords, x, *sizes), (table,))
 
@@ -73,7 +72,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
 @pytest.mark.parametrize("features", [2, 4])
 def test_the_same_bytes_on_any_number_of_threads(features: int) -> None:
     """More threads than levels share the rows of a level between them."""
-    coords, table = some(5000, 3).float(), table_of(LEVELS, features).detach().float().requires_grad_()
+    coords, table = some(5000).float(), table_of(LEVELS, features).detach().float().requires_grad_()
     weights = torch.randn(5000, 4 * features, generator=torch.Generator().manual_seed(3))
     results = []
     for threads in (1, 2, 7):
@@ -84,14 +83,14 @@ def test_the_same_bytes_on_any_number_of_threads(features: int) -> None:
 
 
 def test_single_precision_is_close() -> None:
-    coords, table = some(200, 3), table_of(LEVELS, 4).detach()
+    coords, table = some(200), table_of(LEVELS, 4).detach()
     exact, single = hash_features(coords, table, LEVELS), hash_features(coords.float(), table.float(), LEVELS)
     # weights are off by 24 cells times the rounding of a coordinate
     assert (single.double() - exact).abs().max() < 1e-4
 
 
 def test_known_features_have_the_gradient_of_a_look_up() -> None:
-    coords, table = some(40, 3), table_of(LEVELS, 2)
+    coords, table = some(40), table_of(LEVELS, 2)
     which = torch.tensor([3, 17, 39])
     known = known_features(hash_features(coords, table, LEVELS).detach(), which, coords[which], table, LEVELS)
     again = hash_features(coords[which], table, LEVELS)
@@ -102,7 +101,7 @@ def test_known_features_have_the_gradient_of_a_look_up() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_coordinate_that_is_no_number_shows(bad: float) -> None:
-    coords = some(5, 3)
+    coords = some(5)
     coords[2, 1] = bad
     found = hash_features(coords, table_of(LEVELS, 2), LEVELS)
     assert found.isfinite().all(1).tolist() == [True, True, False, True, True]
@@ -116,7 +115,7 @@ def test_nan_in_a_row_reaches_only_points_beside_it() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    coords, table = some(4, 3), table_of(LEVELS, 2)
+    coords, table = some(4), table_of(LEVELS, 2)
     for points, rows, message in (
         (coords[:, :2], table, r"\(M, 3\)"),
         (coords, table[1:], "table must be"),
@@ -129,7 +128,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 def test_the_ops_are_registered_as_torch_wants_them() -> None:
-    coords, table = some(6, 3), table_of(LEVELS, 2)
+    coords, table = some(6), table_of(LEVELS, 2)
     sizes = list(LEVELS.scales), list(LEVELS.sizes), list(LEVELS.rows)
     features = hash_features(coords, table, LEVELS).detach()
     torch.library.opcheck(hash_grid_op, (coords, table, *sizes))

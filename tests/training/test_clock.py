@@ -64,7 +64,8 @@ def sharpening(x: float) -> float:
 
 
 @pytest.mark.parametrize(
-    "machine", [(0.02, 3e-7, 1e-6, 1.8), (0.01, 2e-7, 6e-7, 2.0), (0.04, 6e-7, 2e-6, 1.9), (0.12, 2e-6, 4e-6, 1.6)]
+    "machine",
+    [(6e-3, 3e-7, 7e-7, 1.8), (3e-3, 2e-7, 4e-7, 2.0), (12e-3, 6e-7, 1.4e-6, 1.9), (36e-3, 2e-6, 3e-6, 1.6)],
 )
 def test_small_images_first(machine: tuple[float, float, float, float]) -> None:
     run = Run(dynamic(), sharpening, 854 * 480, *machine)
