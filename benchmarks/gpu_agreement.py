@@ -23,11 +23,13 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.adam import adam_step_
 from dyngs.ops.device import why_no_gpu
+from dyngs.ops.hash_grid import HashLevels, hash_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import rotation_matrices
+from dyngs.ops.rays import Samples, composite
 from dyngs.ops.skinning import blend_skinning
 
 COUNT, SIDE = 3000, 96
@@ -111,6 +113,22 @@ def decoded(given: Given) -> Found:
     return with_gradients(given, {"outputs": perceptron(given["features"], layers, skip=2)})
 
 
+def hashed(given: Given) -> Found:
+    """Features of a hash grid of eight levels."""
+    levels = HashLevels.geometric(8, 16, 256, 1 << 14)
+    return with_gradients(given, {"features": hash_features(given["places"], given["table"], levels)})
+
+
+def composited(given: Given) -> Found:
+    """Rays of 30 samples each."""
+    starts, count = given["starts"], torch.arange(COUNT // 30 + 1, device=given["starts"].device)
+    samples = Samples(
+        30 * count, count[:-1].repeat_interleave(30).int(), starts, starts + 0.05, starts[:, None].repeat(1, 3)
+    )
+    seen = composite(given["log_densities"].exp(), given["colours"], samples, 1e-6)
+    return with_gradients(given, {"colours": seen.colour, "transmittance": seen.transmittance, "depth": seen.depth})
+
+
 def network() -> Given:
     """Features, and the weights of 40-64-64-64-10."""
     given = {"features": numbers(COUNT, 40).requires_grad_()}
@@ -159,6 +177,21 @@ def cases() -> dict[str, tuple[Callable[[Given], Found], Given]]:
             },
         ),
         "network": (decoded, network()),
+        "hash grid": (
+            hashed,
+            {
+                "places": numbers(COUNT, 3).sigmoid(),
+                "table": trained(numbers(sum(HashLevels.geometric(8, 16, 256, 1 << 14).rows), 4, seed=1)),
+            },
+        ),
+        "rays": (
+            composited,
+            {
+                "starts": 2 + 0.05 * torch.arange(30).repeat(COUNT // 30),
+                "log_densities": trained(numbers(COUNT)),
+                "colours": trained(numbers(COUNT, 3, seed=1).sigmoid()),
+            },
+        ),
     }  # fmt: skip
 
 

@@ -15,9 +15,10 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
-from dyngs.errors import DyngsError, as_word, reading
+from dyngs.errors import DyngsError, as_word, counted, reading
 from dyngs.files.outputs import note_sources
 from dyngs.files.temporary import cache_folder
+from dyngs.files.wrong_place import command_for
 
 FEWEST_PHOTOS = 3
 
@@ -75,7 +76,7 @@ def with_poses(
 def is_unposed(data: DataConfig) -> bool:
     """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of captures knows.
 
-    Raises DyngsError: a folder of a single video: names it.
+    Raises DyngsError: a folder of a single video, which it names; one or two photos.
     """
     root = data.root
     if root.is_file():
@@ -87,6 +88,12 @@ def is_unposed(data: DataConfig) -> bool:
     videos = videos_in(root)
     if len(videos) == 1:
         raise DyngsError(f"{root}: holds one video; give that: data.root={as_word(videos[0])}")
+    photos = [] if videos or command_for(root, captures=False) is not None else photos_below(root)
+    if photos:
+        raise DyngsError(
+            f"{root}: holds {counted(len(photos), 'photo')} and no cameras; a scene needs at least {FEWEST_PHOTOS} "
+            "photos of it from different places, better 50, or a video"
+        )
     return bool(videos)
 
 

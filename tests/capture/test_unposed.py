@@ -125,7 +125,6 @@ def test_captures_and_other_folders_stay_as_they_are(tmp_path: Path, asked: list
         DataConfig(root=tmp_path / "capture"),
         DataConfig(root=tmp_path / "empty"),
         DataConfig(root=tmp_path / "nowhere"),
-        DataConfig(root=_photos(tmp_path / "two", 2)),
         DataConfig(root=_photos(tmp_path / "photos"), format="colmap"),
     ):
         assert with_poses(data, say=print) is data
@@ -140,6 +139,8 @@ def test_what_cannot_work_is_said_before_poses_are_estimated(tmp_path: Path, ask
         with_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
     with pytest.raises(DyngsError, match=r"one video; give that: data\.root=.*cam0\.mp4"):
         with_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
+    with pytest.raises(DyngsError, match=r"two: holds 2 photos and no cameras; a scene needs at least 3 photos"):
+        with_poses(DataConfig(root=_photos(tmp_path / "two", 2)))
     assert asked == []
     ordered = photos.model_copy(update={"times": "order"})
     assert with_poses(ordered, needs_times=True, say=lambda _: None).root != photos.root
