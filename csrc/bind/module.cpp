@@ -25,4 +25,5 @@ NB_MODULE(DYNGS_MODULE, module) {
   module.def("best_isa", dyngs::best_isa);
   dyngs::bind_ops(module);
   dyngs::bind_fields(module);
+  dyngs::bind_triangles(module);
 }
