@@ -55,51 +55,64 @@ def reference_visible(points: Tensor, cameras: Cameras, near: float, segments: i
     return ids, uv, depth
 
 
+Pixel = tuple[int, int]
+
+
+class _View:
+    """One view of ``reference_blend``."""
+
+    def __init__(self, means: Tensor, places: Places, rows: list[list[int]], radius: float) -> None:
+        self.means, self.rows, self.radius, self.search = means, rows, radius, math.ceil(radius) + 1
+        self.pixels = [(x, y) for y in range(len(rows)) for x in range(len(rows[0]))]
+        self.label = {(x, y): -1 if rows[y][x] < 0 else int(places.ids[rows[y][x]]) for x, y in self.pixels}
+        self.outline = {q for q in self.pixels if any(self.label[n] != self.label[q] for n in self.around(q, 1))}
+
+    def around(self, pixel: Pixel, half: int) -> list[Pixel]:
+        steps = range(-half, half + 1)
+        return [q for q in [(pixel[0] + i, pixel[1] + j) for j in steps for i in steps] if q in self.label]
+
+    def row(self, pixel: Pixel) -> int:
+        return self.rows[pixel[1]][pixel[0]]
+
+    def centre(self, pixel: Pixel) -> Tensor:
+        return self.means.new_tensor([pixel[0] + 0.5, pixel[1] + 0.5])
+
+    def mean(self, pixel: Pixel) -> Tensor:
+        return self.centre(pixel) if self.row(pixel) < 0 else self.means[self.row(pixel)]
+
+    def counts(self, pixel: Pixel, patch: int) -> Tensor:
+        """How much a patch counts at a pixel."""
+        inside, centre = self.label[pixel] == patch, self.centre(pixel)
+        near = [q for q in self.around(pixel, self.search) if q in self.outline and self.label[q] == patch]
+        distances = [(self.mean(q) - centre).square().sum().sqrt() for q in near]
+        least = min(range(len(near)), key=lambda i: float(distances[i].detach()), default=-1)
+        if least < 0 or distances[least] >= self.radius:
+            return centre.new_tensor(float(inside))
+        distance = distances[least].detach() if distances[least] < 0.1 else distances[least]
+        half = 0.5 * 2 ** (distance / self.radius)
+        return half if inside else 1 - half
+
+
 def reference_blend(
     means: Tensor, colours: Tensor, places: Places, sigma: float, radius: float
 ) -> tuple[Tensor, Tensor]:
     """As ``blend_patches``, by its definition."""
-    window, search = min(4, math.ceil(2.5 * sigma)), math.ceil(radius) + 1
-    images, through = [], []
+    window = min(4, math.ceil(2.5 * sigma))
+    images: list[Tensor] = []
+    through: list[Tensor] = []
     for rows in places.rows.tolist():
-        height, width = len(rows), len(rows[0])
-        pixels = [(x, y) for y in range(height) for x in range(width)]
-        label = {(x, y): -1 if rows[y][x] < 0 else int(places.ids[rows[y][x]]) for x, y in pixels}
-
-        def around(x: int, y: int, half: int, label: dict[tuple[int, int], int] = label) -> list[tuple[int, int]]:
-            found = [(x + i, y + j) for j in range(-half, half + 1) for i in range(-half, half + 1)]
-            return [q for q in found if q in label]
-
-        def mean(q: tuple[int, int], rows: list[list[int]] = rows) -> Tensor:
-            row = rows[q[1]][q[0]]
-            return means.new_tensor([q[0] + 0.5, q[1] + 0.5]) if row < 0 else means[row]
-
-        outline = {q for q in pixels if any(label[n] != label[q] for n in around(*q, 1))}
-        for x, y in pixels:
-            centre = means.new_tensor([x + 0.5, y + 0.5])
-
-            def counts(patch: int, x: int = x, y: int = y, centre: Tensor = centre) -> Tensor:
-                inside = label[(x, y)] == patch
-                near = [q for q in around(x, y, search) if q in outline and label[q] == patch]
-                distances = [(mean(q) - centre).square().sum().sqrt() for q in near]
-                least = min(range(len(near)), key=lambda i: float(distances[i].detach()), default=-1)
-                if least < 0 or distances[least] >= radius:
-                    return centre.new_tensor(float(inside))
-                distance = distances[least].detach() if distances[least] < 0.1 else distances[least]
-                half = 0.5 * 2 ** (distance / radius)
-                return half if inside else 1 - half
-
-            weights, sums, behind = [], torch.zeros(colours.shape[1], dtype=colours.dtype), means.new_zeros(())
-            for q in around(x, y, window):
-                value = (-0.5 * (mean(q) - centre).square().sum() / sigma**2).exp()
-                weights.append(value * counts(label[q]))
-                row = rows[q[1]][q[0]]
-                if row < 0:
-                    behind = behind + weights[-1]
+        view = _View(means, places, rows, radius)
+        for pixel in view.pixels:
+            seen, behind, total = colours.new_zeros(colours.shape[1]), means.new_zeros(()), means.new_zeros(())
+            for q in view.around(pixel, window):
+                value = (-0.5 * (view.mean(q) - view.centre(pixel)).square().sum() / sigma**2).exp()
+                weight = value * view.counts(pixel, view.label[q])
+                total = total + weight
+                if view.row(q) < 0:
+                    behind = behind + weight
                 else:
-                    sums = sums + weights[-1] * colours[row]
-            total = torch.stack(weights).sum()
-            images.append(sums / total)
+                    seen = seen + weight * colours[view.row(q)]
+            images.append(seen / total)
             through.append(behind / total)
     shape = places.rows.shape
     return torch.stack(images).view(*shape, -1), torch.stack(through).view(shape)

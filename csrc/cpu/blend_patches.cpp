@@ -45,6 +45,8 @@ class Labels {
   int32_t label(int64_t pixel) const { return labels_[pixel]; }
   int32_t row(int64_t pixel) const { return rows_[pixel]; }
   bool is_near(int64_t pixel) const { return near_[pixel]; }
+  // Whether all around a pixel shows nothing.
+  bool is_empty(int64_t pixel) const { return labels_[pixel] < 0 && !near_[pixel]; }
 
   // Where the Gaussian of a pixel is, relative to the centre of pixel (x, y).
   Vec2<S> offset(int64_t pixel, int x, int y) const {
@@ -169,6 +171,11 @@ template <class S>
 void blend_pixel(const PatchImage<S>& in, const Labels<S>& labels, int x, int y, PixelWeights<S>& weights,
                  const BlendedPatches<S>& out, int64_t at) {
   S sum = 0, behind = 0, colour[kMostPatchChannels] = {};
+  if (labels.is_empty(int64_t{y} * in.width + x)) {
+    std::fill_n(out.image + at * in.channels, in.channels, S(0));
+    out.transmittance[at] = S(1), out.sums[at] = S(0);
+    return;
+  }
   for_each_gaussian(in, labels, x, y, weights, [&](int64_t pixel, const Vec2<S>&, S value, int slot) {
     const S weight = slot < 0 ? value : value * weights.weight(slot);
     const int32_t row = labels.row(pixel);

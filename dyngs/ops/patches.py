@@ -1,8 +1,8 @@
 """Quadratic triangular Bezier patches: values at places on them, which of them images show, and images of these.
 
 P patches, N places, V views. A place is (u, v), w = 1 - u - v; control points (i, j, k), i + j + k = 2, belong to
-u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The blending is that of BG-Triangle (Wu et
-al. 2025) but for one thing: weights of patches at a pixel are normalised to one, because what a z-buffer shows does not
+u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The blending is that of BG-Triangle (Wu
+et al. 2025) but for one thing: weights of patches at a pixel are normalised to one, because what a z-buffer shows does not
 overlap; composited over each other, two halves on either side of an edge would let a quarter of the background through.
 """
 
@@ -36,7 +36,7 @@ def lattice_size(segments: int) -> int:
 
 
 def lattice(segments: int) -> tuple[Tensor, Tensor]:
-    """Return (K, 2) float64 places (u, v) of a lattice's points, in their order, and (segments^2, 3) faces, all facing alike."""
+    """Return (K, 2) float64 places of a lattice's points, in their order, and (segments^2, 3) faces, facing alike."""
     uv = [(i / segments, j / segments) for i in range(segments, -1, -1) for j in range(segments - i, -1, -1)]
 
     def index(i: int, j: int) -> int:
@@ -107,9 +107,7 @@ def _looked_up(values: Tensor, ids: Tensor, uv: Tensor, count: int, basis: int) 
 
 
 @torch.no_grad()
-def visible_patches(
-    points: Tensor, cameras: Cameras, near: float, segments: int = SEGMENTS
-) -> tuple[Tensor, Tensor]:
+def visible_patches(points: Tensor, cameras: Cameras, near: float, segments: int = SEGMENTS) -> tuple[Tensor, Tensor]:
     """Return (V, H, W) int32 patch that each pixel shows, -1 for none, and (V, H, W, 2) where on it.
 
     A z-buffer of flat faces: perspective-correct, both sides, cut at ``near``; of several as near the first is shown.

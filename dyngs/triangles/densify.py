@@ -1,7 +1,7 @@
 """Which triangles are split into four, and which removed (Wu et al. 2025), within a number of triangles.
 
-The published thresholds of gradients and edges depend on the images' size; here those that come first by both are split,
-as many as lead evenly to the number that is wanted. Thresholds of size are in half sides of the scene.
+The published thresholds of gradients and edges depend on the images' size; here those that come first by both are
+split, as many as lead evenly to the number that is wanted. Thresholds of size are in half sides of the scene.
 """
 
 from __future__ import annotations

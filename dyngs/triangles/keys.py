@@ -27,14 +27,19 @@ class BgTriangleModel(ModelSection):
         default=3, ge=1, le=16, description="segments of an edge of a triangle's texture, which is linear between them"
     )
     texture_from: Fraction = Field(
-        default=0.5, description="fraction of the run after which textures, and they alone, are learned"
+        default=0.5, description="fraction of the run after which textures are learned in place of colours"
     )
-    segments: int = Field(default=6, ge=1, le=16, description="segments of an edge: a triangle is drawn as their square")
+    moves_on: bool = Field(
+        default=True, description="control points are learned to the end; false: until textures begin, as published"
+    )
+    segments: int = Field(
+        default=6, ge=1, le=16, description="segments of an edge: a triangle is drawn as their square"
+    )
     supersampling: int = Field(default=2, ge=1, le=4, description="pixels are drawn as the mean of its square")
     outline: float = Field(default=2.0, ge=0.5, le=8, description="radius within which outlines are soft, drawn px")
     lr_position: Positive = Field(
         default=1.6e-3, le=1, description="learning rate of control points at first, in half sides of the scene"
     )
-    lr_position_final: Positive = Field(default=1.6e-4, le=1, description="the same when textures begin")
+    lr_position_final: Positive = Field(default=1.6e-4, le=1, description="the same at the end")
     lr_colour: Positive = Field(default=0.01, le=1, description="learning rate of colours; of harmonics a twentieth")
     near: Positive = Field(default=0.05, le=1e9, description="near plane, in half sides of the scene")

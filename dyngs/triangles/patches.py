@@ -105,7 +105,7 @@ def evaluated(values: Tensor, places: Tensor) -> Tensor:
 
 
 def quarters(values: Tensor) -> Tensor:
-    """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the four parts that middles of edges cut a triangle into."""
+    """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the parts that middles of edges cut a triangle into."""
     places, faces = lattice(2)
     corners = places[faces]  # (4, 3, 2)
     middles = torch.stack([(corners[:, i] + corners[:, j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))], 1)

@@ -77,10 +77,9 @@ def outlines(places: Places) -> Tensor:
 
 
 def slopes_of(image: Tensor) -> Tensor:
-    """Return (H, W): sizes of the slopes of ``image`` (H, W, 3) by Prewitt's operator, mean over channels; faint are 0."""
+    """Return (H, W): mean size of the slopes of ``image`` (H, W, 3) by Prewitt's operator; faint ones are 0."""
     across = torch.tensor([[-1.0, 0, 1]] * 3, device="cpu") / 3
     kernels = torch.stack([across, across.T])[:, None]
     channels = torch.nn.functional.pad(image.permute(2, 0, 1)[:, None], (1, 1, 1, 1), mode="replicate")
     sizes = conv2d(channels, kernels).norm(dim=1)
     return torch.where(sizes < FAINTEST_EDGE, 0.0, sizes).mean(0)
-

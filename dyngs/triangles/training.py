@@ -83,23 +83,29 @@ class TriangleTraining(Model[TriangleScene]):
         bad = self._adam.steps_(updates, step=step)
         for x in self.leaves:
             x.grad = None
-        texture_from = round(self._model.texture_from * steps)
-        if not self.is_textured and step >= texture_from and step < steps:
-            self._begin(patches.textured(self._model.texture))
+        if not self.is_textured and self._last_step_of_places <= step < steps:
+            self._texture()
             return Updated(bad, f"textures are learned from now on, on {len(patches):,} triangles", True)
         return self._changed(step, bad) if self._is_due(step) else Updated(bad)
 
     def _rates(self, step: int) -> dict[str, float]:
         """Return the learning rate of each tensor in ``step``."""
         steps, model = self._run.config.train.steps, self._model
-        first = max(1, round(model.texture_from * steps))
-        if self.is_textured:
-            fraction, position = (step - first) / max(1, steps - first), 0.0
-        else:
-            fraction = min(1.0, step / first)
-            position = self._unit * model.lr_position ** (1 - fraction) * model.lr_position_final**fraction
-        colour = model.lr_colour * LAST_COLOUR**fraction
-        return {"points": position, "colours": colour, "harmonics": colour / HARMONICS_SLOWER}
+        until = steps if model.moves_on else self._last_step_of_places
+        moved = min(1.0, step / max(1, until))
+        position = self._unit * model.lr_position ** (1 - moved) * model.lr_position_final**moved
+        begun = self._last_step_of_places if self.is_textured else 0
+        end = steps if self.is_textured else self._last_step_of_places
+        colour = model.lr_colour * LAST_COLOUR ** min(1.0, (step - begun) / max(1, end - begun))
+        stops = self.is_textured and not model.moves_on
+        return {"points": 0.0 if stops else position, "colours": colour, "harmonics": colour / HARMONICS_SLOWER}
+
+    def _texture(self) -> None:
+        """Learn textures from now on, with the moments of what stays as it is."""
+        before = self._adam
+        self._begin(self._patches.textured(self._model.texture))
+        for name in ("points", "harmonics"):
+            self._adam.exp_avg[name], self._adam.exp_avg_sq[name] = before.exp_avg[name], before.exp_avg_sq[name]
 
     @property
     def _interval(self) -> int:
