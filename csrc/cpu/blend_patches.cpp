@@ -48,23 +48,26 @@ class Labels {
   // Whether all around a pixel shows nothing.
   bool is_empty(int64_t pixel) const { return labels_[pixel] < 0 && !near_[pixel]; }
 
-  // Where the Gaussian of a pixel is, relative to the centre of pixel (x, y).
-  Vec2<S> offset(int64_t pixel, int x, int y) const {
+  // Where the Gaussian of a pixel at column i and row j is, relative to the centre of pixel (x, y).
+  Vec2<S> offset(int64_t pixel, int i, int j, int x, int y) const {
     const int32_t row = rows_[pixel];
-    if (row < 0) return {S(static_cast<int>(pixel % in_.width) - x), S(static_cast<int>(pixel / in_.width) - y)};
+    return row < 0 ? Vec2<S>{S(i - x), S(j - y)} : mean_from(row, x, y);
+  }
+  // The same of row `row` of the means.
+  Vec2<S> mean_from(int64_t row, int x, int y) const {
     return {in_.means[2 * row] - (S(x) + S(0.5)), in_.means[2 * row + 1] - (S(y) + S(0.5))};
   }
 
-  // f(pixel) of the pixels in the window of Gaussians, row by row.
+  // f(pixel, column, row) of the pixels in the window of Gaussians, row by row.
   template <class F>
   void for_window(int x, int y, F&& f) const {
     for_square(x, y, window_, f);
   }
-  // f(pixel) of those on an outline in the window that is searched for the nearest.
+  // The same of those on an outline in the window that is searched for the nearest.
   template <class F>
   void for_outline(int x, int y, F&& f) const {
-    for_square(x, y, search_, [&](int64_t pixel) {
-      if (outline_[pixel]) f(pixel);
+    for_square(x, y, search_, [&](int64_t pixel, int i, int j) {
+      if (outline_[pixel]) f(pixel, i, j);
     });
   }
 
@@ -72,21 +75,22 @@ class Labels {
   template <class F>
   void for_square(int x, int y, int half, F&& f) const {
     for (int j = std::max(0, y - half); j <= std::min(in_.height - 1, y + half); ++j) {
-      for (int i = std::max(0, x - half); i <= std::min(in_.width - 1, x + half); ++i) f(int64_t{j} * in_.width + i);
+      for (int i = std::max(0, x - half); i <= std::min(in_.width - 1, x + half); ++i)
+        f(int64_t{j} * in_.width + i, i, j);
     }
   }
   void mark_outline(int y) {
     for (int x = 0; x < in_.width; ++x) {
       const int64_t own = int64_t{y} * in_.width + x;
       bool differs = false;
-      for_square(x, y, 1, [&](int64_t pixel) { differs |= labels_[pixel] != labels_[own]; });
+      for_square(x, y, 1, [&](int64_t pixel, int, int) { differs |= labels_[pixel] != labels_[own]; });
       outline_[own] = differs;
     }
   }
   void mark_near(int y) {
     for (int x = 0; x < in_.width; ++x) {
       bool found = false;
-      for_square(x, y, reach(), [&](int64_t pixel) { found |= outline_[pixel] != 0; });
+      for_square(x, y, reach(), [&](int64_t pixel, int, int) { found |= outline_[pixel] != 0; });
       near_[int64_t{y} * in_.width + x] = found;
     }
   }
@@ -105,14 +109,17 @@ class PixelWeights {
   void find(const PatchImage<S>& in, const Labels<S>& labels, int x, int y) {
     count_ = 0;
     const int32_t own = labels.label(int64_t{y} * in.width + x);
-    labels.for_window(x, y, [&](int64_t pixel) {
+    int place = 0;
+    labels.for_window(x, y, [&](int64_t pixel, int, int) {
       const int32_t label = labels.label(pixel);
-      if (slot(label) < 0) labels_[count_] = label, square_[count_] = kLargest<S>, nearest_[count_++] = -1;
+      int at = slot(label);
+      if (at < 0) at = count_, labels_[at] = label, square_[at] = kLargest<S>, nearest_[at] = -1, ++count_;
+      slots_[place++] = at;
     });
-    labels.for_outline(x, y, [&](int64_t pixel) {
+    labels.for_outline(x, y, [&](int64_t pixel, int i, int j) {
       const int at = slot(labels.label(pixel));
       if (at < 0) return;
-      const Vec2<S> d = labels.offset(pixel, x, y);
+      const Vec2<S> d = labels.offset(pixel, i, j, x, y);
       const S square = d.x * d.x + d.y * d.y;
       if (square < square_[at]) square_[at] = square, nearest_[at] = pixel;
     });
@@ -122,12 +129,8 @@ class PixelWeights {
     }
   }
 
-  int slot(int32_t label) const {
-    for (int i = 0; i < count_; ++i) {
-      if (labels_[i] == label) return i;
-    }
-    return -1;
-  }
+  // The slot of the n-th pixel of the window.
+  int slot_at(int n) const { return slots_[n]; }
   S weight(int slot) const { return weights_[slot]; }
 
   // f(pixel, gradient by its mean) for each point of an outline that weights depend on; by_weight: of each slot.
@@ -138,13 +141,22 @@ class PixelWeights {
       const S distance = rho_[i] * in.radius;
       if (!(rho_[i] < S(1)) || labels_[i] < 0 || distance < S(kOnOutline)) continue;
       const S by_distance = by_weight[i] * outline_slope(labels_[i] == own, rho_[i]) / in.radius;
-      const Vec2<S> d = labels.offset(nearest_[i], x, y);
+      const Vec2<S> d = labels.mean_from(labels.row(nearest_[i]), x, y);
       f(nearest_[i], Vec2<S>{by_distance * d.x / distance, by_distance * d.y / distance});
     }
   }
 
  private:
+  // -1 where no pixel of the window has the label.
+  int slot(int32_t label) const {
+    for (int i = 0; i < count_; ++i) {
+      if (labels_[i] == label) return i;
+    }
+    return -1;
+  }
+
   int count_ = 0;
+  int slots_[kMostLabels];
   int32_t labels_[kMostLabels];
   int64_t nearest_[kMostLabels];
   S square_[kMostLabels], rho_[kMostLabels], weights_[kMostLabels];
@@ -161,9 +173,10 @@ void for_each_gaussian(const PatchImage<S>& in, const Labels<S>& labels, int x, 
                        F&& f) {
   const bool near = labels.is_near(int64_t{y} * in.width + x);
   if (near) weights.find(in, labels, x, y);
-  labels.for_window(x, y, [&](int64_t pixel) {
-    const Vec2<S> d = labels.offset(pixel, x, y);
-    f(pixel, d, gaussian(in, d), near ? weights.slot(labels.label(pixel)) : -1);
+  int place = 0;
+  labels.for_window(x, y, [&](int64_t pixel, int i, int j) {
+    const Vec2<S> d = labels.offset(pixel, i, j, x, y);
+    f(pixel, d, gaussian(in, d), near ? weights.slot_at(place++) : -1);
   });
 }
 

@@ -184,10 +184,6 @@ class Places:
         rows = torch.where(shown, shown.flatten().cumsum(0).view(ids.shape) - 1, -1).to(torch.int32)
         return Places(rows, ids[shown], uv[shown])
 
-    def views(self) -> Tensor:
-        """Return (N,) int64 the view of each."""
-        return (self.rows >= 0).nonzero()[:, 0]
-
 
 def blend_patches(
     means: Tensor, colours: Tensor, places: Places, sigma: float = SIGMA, radius: float = RADIUS
