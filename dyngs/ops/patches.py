@@ -2,8 +2,8 @@
 
 P patches, N places, V views. A place is (u, v), w = 1 - u - v; control points (i, j, k), i + j + k = 2, belong to
 u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The blending is that of BG-Triangle (Wu
-et al. 2025) but for one thing: weights of patches at a pixel are normalised to one, because what a z-buffer shows does not
-overlap; composited over each other, two halves on either side of an edge would let a quarter of the background through.
+et al. 2025) but for one thing: weights of patches at a pixel are normalised to one, because what a z-buffer shows does
+not overlap; composited over each other, two halves on either side of an edge would let light through.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def _save_values(ctx: Any, inputs: tuple[Any, ...], _: Tensor) -> None:
 
 
 def _values_gradient(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    return values_backward_op(*ctx.saved_tensors, grad.contiguous(), ctx.basis), None, None, None
+    values, ids, uv = ctx.saved_tensors
+    return values_backward_op(values, ids, uv, grad.contiguous(), ctx.basis), None, None, None
 
 
 values_op = register("patch_values", _values, devices=("cpu",), gradient=Gradient(_save_values, _values_gradient))

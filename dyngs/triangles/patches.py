@@ -101,7 +101,7 @@ def evaluated(values: Tensor, places: Tensor) -> Tensor:
     count = len(values)
     ids = torch.arange(count, dtype=torch.int32, device="cpu").repeat_interleave(len(places))
     uv = places.to(values.dtype).repeat(count, 1)
-    return patch_values(values, ids, uv).view(count, len(places), -1)
+    return patch_values(values, ids, uv).view(count, len(places), values.shape[2])
 
 
 def quarters(values: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ def test_a_flat_triangle_keeps_its_area_at_any_subdivision() -> None:
         a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
         normals = np.cross(b - a, c - a)
         np.testing.assert_allclose(normals.sum(0) / 2, [0, 0, 6], atol=1e-5)
-        assert (surface.colours == 0.25).all()
+        np.testing.assert_allclose(surface.colours, 0.25, rtol=1e-6)
 
 
 def test_triangles_do_not_share_vertices() -> None:

@@ -52,18 +52,14 @@ def solid(center: Rgb, radius: float, outward: np.ndarray, colours: Sequence[Rgb
 
     def paint(local: np.ndarray) -> np.ndarray:
         face = (local @ outward.T - distances).argmax(axis=1)
-        return f32(colours)[face % len(colours)]
+        return np.asarray(colours, np.float32)[face % len(colours)]
 
     return Solid(center, radius, paint, 0.0, outward=outward, reach=distances)
 
 
-def _plain(colour: Rgb) -> Paint:
-    return lambda local: np.tile(f32(colour), (len(local), 1))
-
-
 def _per_side(x: Rgb, y: Rgb, z: Rgb) -> Paint:
     """A box whose pairs of faces have a colour each."""
-    return lambda local: f32([x, y, z])[np.abs(local).argmax(axis=1)]
+    return lambda local: np.asarray([x, y, z], np.float32)[np.abs(local).argmax(axis=1)]
 
 
 def _around(count: int, turn: float) -> np.ndarray:
