@@ -23,7 +23,8 @@ TOLERANCE = 0.03  # Another minor version of the compiler changes less
 KERNELS = [
     *("project_forward", "project_backward", "harmonics_forward", "harmonics_backward", "bin_tiles"),
     *("rasterize_forward", "rasterize_backward", "l1_ssim_loss", "adam_step", "skinning_forward", "skinning_backward"),
-    *("nodes_at", "nodes_at_backward", "node_penalties"),
+    *("nodes_at", "nodes_at_backward", "node_penalties", "hash_grid_forward", "hash_grid_backward"),
+    *("march_count", "march_samples", "composite_forward", "composite_backward", "reached_samples"),
 ]
 LINE = re.compile(r"^\s*([\d,]+) .*\bdyngs::(\w+)(?:<float>)?\(")
 

@@ -47,14 +47,21 @@ class AdamState:
         """As ``steps_`` of one tensor, of which only the ``rows`` (N,) bool are updated; None: all."""
         return self.steps_([self.update(name, x, lr, rows)], step=step, eps=eps)
 
-    def steps_(self, updates: Sequence[AdamUpdate | None], *, step: int, eps: float = 1e-15) -> Count:
+    def steps_(
+        self,
+        updates: Sequence[AdamUpdate | None],
+        *,
+        step: int,
+        eps: float = 1e-15,
+        betas: tuple[float, float] = (0.9, 0.999),
+    ) -> Count:
         """Do the ``updates`` in place, those that are None left out, and return the number of rows left out.
 
         Rows whose gradient is not finite are left out. ``step``: the number of this update, from 1, for the bias
         correction.
         """
         wanted = [x for x in updates if x is not None]
-        return adam_steps_(wanted, step=step, eps=eps) if wanted else 0
+        return adam_steps_(wanted, step=step, eps=eps, betas=betas) if wanted else 0
 
     def update(self, name: str, x: Tensor, lr: float | Tensor, rows: Tensor | None = None) -> AdamUpdate | None:
         """Return the update of the leaf tensor ``x`` (N, ...), and drop its gradient; None where it has none."""

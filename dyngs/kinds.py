@@ -108,8 +108,7 @@ def assemble(
         exposures=exposures,
         refinement=refinement,
     )
-    anywhere = config.model.on_gpu or config.run.device != "auto"
-    trainer.place(device_for(config.run.device if anywhere else "cpu"))
+    trainer.place(device_for(config.run.device))
     return trainer
 
 

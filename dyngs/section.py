@@ -31,7 +31,6 @@ class ModelSection(Section):
         may_move: a field moves it over the times of the capture.
         draws_whole_images: in training; what needs these (priors, masks of what disagrees, refined cameras, exposures)
             does not go with a model that draws some pixels of an image.
-        on_gpu: it can be trained on a GPU.
     """
 
     made_of_gaussians: ClassVar[bool] = False
@@ -40,7 +39,6 @@ class ModelSection(Section):
     is_posed: ClassVar[bool] = False
     may_move: ClassVar[bool] = False
     draws_whole_images: ClassVar[bool] = True
-    on_gpu: ClassVar[bool] = True
     if TYPE_CHECKING:
         kind: Any = None
         """Name of the kind."""

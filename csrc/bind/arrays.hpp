@@ -67,7 +67,7 @@ auto checked(const std::optional<A>& array, Sizes... sizes) -> decltype(array->d
   return array ? checked(*array, sizes...) : nullptr;
 }
 
-// The bindings of all ops; those of fields and triangles are for the CPU alone.
+// The bindings of all ops.
 void bind_fields(nb::module_& module);
 void bind_nodes(nb::module_& module);
 void bind_offsets(nb::module_& module);
@@ -80,8 +80,8 @@ void bind_skinning(nb::module_& module);
 void bind_train(nb::module_& module);
 void bind_triangles(nb::module_& module);
 inline void bind_ops(nb::module_& module) {
-  for (const auto bind : {bind_nodes, bind_offsets, bind_perceptron, bind_planes, bind_posing, bind_rasterizer,
-                          bind_shading, bind_skinning, bind_train})
+  for (const auto bind : {bind_fields, bind_nodes, bind_offsets, bind_perceptron, bind_planes, bind_posing,
+                          bind_rasterizer, bind_shading, bind_skinning, bind_train, bind_triangles})
     bind(module);
 }
 

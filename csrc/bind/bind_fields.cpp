@@ -1,5 +1,4 @@
-// Python bindings of radiance fields: hash grids, marching and compositing. Argument unpacking only. For the CPU alone.
-#if !defined(DYNGS_GPU)
+// Python bindings of radiance fields: hash grids, marching and compositing. Argument unpacking only.
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
@@ -62,6 +61,11 @@ void hash_backward(Rows<const S> coords, const LevelSizes& sizes, Rows<const S> 
   hash_grid_backward(grid, from, to);
 }
 
+// Whether the samples of each ray lie within `count`, where offsets can be read, see bind/arrays.hpp.
+bool offsets_fit(const int64_t* offsets, int64_t rays, int64_t count) {
+  return kOnGpu || (offsets[0] == 0 && offsets[rays] == count && std::is_sorted(offsets, offsets + rays + 1));
+}
+
 // Arrays of S come first: a capsule is good for one look, and their type decides which overload is meant.
 
 // Centre, half side, cascades, cells.
@@ -109,8 +113,7 @@ void write_samples(Rows<const S> origins, Rows<const S> directions, Array<const 
   const March<S> march = march_of<S>(sizes, occupied, origins, directions, shifts, options, threads);
   const auto& [rays, starts, ends, coords] = samples;
   const int64_t count = rays.size(), *from = checked(offsets, march.rays + 1, "march: offsets");
-  if (from[0] != 0 || from[march.rays] != count || !std::is_sorted(from, from + march.rays + 1))
-    throw nb::value_error("march: offsets that do not fit the samples");
+  if (!offsets_fit(from, march.rays, count)) throw nb::value_error("march: offsets that do not fit the samples");
   const Samples<S> to{checked(rays, count, "march"), checked(starts, count, "march"), checked(ends, count, "march"),
                       checked(coords, count, 3, "march")};
   nb::gil_scoped_release release;
@@ -123,7 +126,7 @@ RaySamples<S> ray_samples(const Array<const S>& densities, const MaybeArray<cons
                           double transmittance_min, int threads) {
   const int64_t count = densities.size(), rays = static_cast<int64_t>(offsets.size()) - 1;
   const int64_t* from = offsets.data();
-  if (rays < 0 || from[0] != 0 || from[rays] != count || !std::is_sorted(from, from + rays + 1))
+  if (rays < 0 || !offsets_fit(from, rays, count))
     throw nb::value_error("composite: offsets that do not fit the samples");
   return {densities.data(),
           checked(colours, 3 * count, "composite: colours"),
@@ -190,4 +193,3 @@ void bind_fields(nb::module_& module) {
 }
 
 }  // namespace dyngs
-#endif

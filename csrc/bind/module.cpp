@@ -24,6 +24,4 @@ NB_MODULE(DYNGS_MODULE, module) {
   nb::register_exception_translator(refuse_for_memory);
   module.def("best_isa", dyngs::best_isa);
   dyngs::bind_ops(module);
-  dyngs::bind_fields(module);
-  dyngs::bind_triangles(module);
 }

@@ -1,4 +1,4 @@
-// The ops of core/api.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued where use_queue says, with memory
+// The ops of core/api.hpp and core/fields.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued where use_queue says, with memory
 // that torch lends. They compute in float32; dyngs/ops/native.py refuses float64.
 #include "core/api.hpp"
 
@@ -182,6 +182,45 @@ void node_penalties(const NodeGraph<float>& graph, double* penalties, float* by_
 template <>
 void shading_inputs(const Shading<float>& in, float* out) {
   cuda::shading_inputs(in, out, current_stream());
+}
+
+// Radiance fields -----------------------------------------------------------------------------------------------------
+
+template <>
+void hash_grid_forward(const HashGrid<float>& grid, const float* table, float* features) {
+  cuda::hash_grid_forward(grid, table, features, current_stream());
+}
+
+template <>
+void hash_grid_backward(const HashGrid<float>& grid, const float* g_features, float* g_table) {
+  const Borrowed memory(cuda::hash_grid_backward_workspace(grid));
+  cuda::hash_grid_backward(grid, g_features, g_table, memory.lent(), current_stream());
+}
+
+template <>
+void march_count(const March<float>& march, int64_t* counts) {
+  cuda::march_count(march, counts, current_stream());
+}
+
+template <>
+void march_samples(const March<float>& march, const int64_t* offsets, const Samples<float>& out) {
+  cuda::march_samples(march, offsets, out, current_stream());
+}
+
+template <>
+void composite_forward(const RaySamples<float>& in, const Composited<float>& out) {
+  cuda::composite_forward(in, out, current_stream());
+}
+
+template <>
+void composite_backward(const RaySamples<float>& in, const Composited<const float>& grads, float* g_densities,
+                        float* g_colours) {
+  cuda::composite_backward(in, grads, g_densities, g_colours, current_stream());
+}
+
+template <>
+void reached_samples(const RaySamples<float>& in, bool* reached, int64_t* counts) {
+  cuda::reached_samples(in, reached, counts, current_stream());
 }
 
 // Training ------------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@
 
 #include <cstdint>
 #include <span>
+#include <type_traits>
 
 #include "math/hash_grid.hpp"
 #include "math/volume.hpp"
@@ -24,6 +25,21 @@ struct HashGrid {
   int64_t rows() const { return levels.back().first + levels.back().rows; }
   int64_t width() const { return static_cast<int64_t>(levels.size()) * features; }
 };
+
+// f<D, F>() with the axes and features of a grid as constants.
+template <class Call>
+void with_grid_sizes(int64_t dims, int64_t features, const Call& f) {
+  const auto of = [&]<int kDims>(std::integral_constant<int, kDims>) {
+    switch (features) {
+      case 1: return f.template operator()<kDims, 1>();
+      case 2: return f.template operator()<kDims, 2>();
+      case 4: return f.template operator()<kDims, 4>();
+      default: return f.template operator()<kDims, 8>();
+    }
+  };
+  if (dims == 3) return of(std::integral_constant<int, 3>());
+  return of(std::integral_constant<int, 4>());
+}
 
 // Writes features (M, L * F): the table's rows (rows, F) between which each sample lies, interpolated, level by level.
 template <class S>

@@ -3,7 +3,6 @@
 // sample in order: no atomics, the same sums on any number of threads.
 #include <algorithm>
 #include <cstring>
-#include <utility>
 
 #include "core/fields.hpp"
 #include "cpu/parallel.hpp"
@@ -73,27 +72,12 @@ void level_backward(const HashGrid<S>& grid, const HashLevel& level, const S* g_
   }
 }
 
-// f with the axes and features of the grid as constants.
-template <class F>
-void with_sizes(int64_t dims, int64_t features, F&& f) {
-  const auto of = [&]<int kDims>(std::integral_constant<int, kDims>) {
-    switch (features) {
-      case 1: return f.template operator()<kDims, 1>();
-      case 2: return f.template operator()<kDims, 2>();
-      case 4: return f.template operator()<kDims, 4>();
-      default: return f.template operator()<kDims, 8>();
-    }
-  };
-  if (dims == 3) return of(std::integral_constant<int, 3>());
-  return of(std::integral_constant<int, 4>());
-}
-
 }  // namespace
 
 template <class S>
 void hash_grid_forward(const HashGrid<S>& grid, const S* table, S* features) {
   const int64_t blocks = (grid.count + kGrain - 1) / kGrain;
-  with_sizes(grid.dims, grid.features, [&]<int kDims, int kFeatures>() {
+  with_grid_sizes(grid.dims, grid.features, [&]<int kDims, int kFeatures>() {
     parallel_for(blocks * static_cast<int64_t>(grid.levels.size()), 1, grid.threads, [&](int64_t task, int64_t) {
       const int64_t l = task / blocks, begin = task % blocks * kGrain;
       level_forward<kDims, kFeatures>(grid, grid.levels[l], table, begin, std::min(grid.count, begin + kGrain),
@@ -105,7 +89,7 @@ void hash_grid_forward(const HashGrid<S>& grid, const S* table, S* features) {
 template <class S>
 void hash_grid_backward(const HashGrid<S>& grid, const S* g_features, S* g_table) {
   const int64_t levels = static_cast<int64_t>(grid.levels.size()), parts = (grid.threads + levels - 1) / levels;
-  with_sizes(grid.dims, grid.features, [&]<int kDims, int kFeatures>() {
+  with_grid_sizes(grid.dims, grid.features, [&]<int kDims, int kFeatures>() {
     parallel_for(levels * parts, 1, grid.threads, [&](int64_t task, int64_t) {
       const int64_t l = levels - 1 - task / parts, part = task % parts;  // the large ones first
       const HashLevel& level = grid.levels[l];

@@ -162,16 +162,21 @@ void tile_backward(const Splats<S>& s, const Entries& entries, const ImageGrads<
   for (int64_t at = begin + (end - begin - 1) / kChunk * kChunk; at >= begin; at -= kChunk) {
     const int count = static_cast<int>(std::min<int64_t>(kChunk, end - at));
     const int32_t chunk_begin = static_cast<int32_t>(at - begin);
-    load_chunk<D>(s, entries, frame, at, count, chunk);
     uint32_t open = 0;  // blocks that saw something of the chunk
     for (int b = 0; b < kBlocks; ++b) {
       if (state.last[b] <= chunk_begin) continue;
       open |= 1u << b;
       state.blocks[b].stop = relative_stop<S>(state.stop[b], chunk_begin);
     }
-    for (int i = count - 1; i >= 0; --i)
-      entry_backward<S, D, kAbsolute>(s, frame, chunk, i, chunk.masks[i] & open, lane, state,
-                                      slots + int64_t{entries.slots[at + i]} * fields);
+    if (open != 0) load_chunk<D>(s, entries, frame, at, count, chunk);
+    for (int i = count - 1; i >= 0; --i) {
+      S* slot = slots + int64_t{entries.slots[at + i]} * fields;
+      const uint32_t touched = open != 0 ? chunk.masks[i] & open : 0;
+      if (touched == 0)  // behind what the pixels see
+        std::fill(slot, slot + fields, S(0));
+      else
+        entry_backward<S, D, kAbsolute>(s, frame, chunk, i, touched, lane, state, slot);
+    }
   }
 }
 

@@ -1,11 +1,12 @@
-// The ops of core/api.hpp on a CUDA GPU, in float32: the same structs with pointers to the GPU's memory (`threads` is not
-// read), the same results up to rounding, and the same bytes whenever a call is repeated. Work is queued on `stream`; nothing
-// is allocated and nothing waits, but for the one number that bin_entries reads back. A function with a `workspace` takes
-// memory that the caller allocated, of at least as many bytes as its neighbour `..._workspace` says; its contents are of no use
-// afterwards. Errors of a launch are thrown as std::runtime_error.
+// The ops of core/api.hpp and core/fields.hpp on a CUDA GPU, in float32: the same structs with pointers to the GPU's memory
+// (`threads` is not read), the same results up to rounding, and the same bytes whenever a call is repeated. Work is queued on
+// `stream`; nothing is allocated and nothing waits, but for the one number that bin_entries reads back. A function with a
+// `workspace` takes memory that the caller allocated, of at least as many bytes as its neighbour `..._workspace` says; its
+// contents are of no use afterwards. Errors of a launch are thrown as std::runtime_error.
 #pragma once
 
 #include "core/api.hpp"
+#include "core/fields.hpp"
 
 namespace dyngs::cuda {
 
@@ -113,6 +114,24 @@ void add_offsets(const RowOffsets<float>& offsets, const MovedGaussians<float>& 
 void add_offsets_backward(const RowOffsets<float>& offsets, const float* quats, const OffsetGrads<float>& grads,
                           Stream stream);
 void shading_inputs(const Shading<float>& in, float* out, Stream stream);
+
+// Radiance fields -----------------------------------------------------------------------------------------------------
+
+inline constexpr int64_t kHashSamples = 1 << 18;
+
+// `levels` are an array of the host.
+void hash_grid_forward(const HashGrid<float>& grid, const float* table, float* features, Stream stream);
+// Of `at_once` samples at a time.
+int64_t hash_grid_backward_workspace(const HashGrid<float>& grid, int64_t at_once = kHashSamples);
+void hash_grid_backward(const HashGrid<float>& grid, const float* g_features, float* g_table, const Lent& workspace,
+                        Stream stream, int64_t at_once = kHashSamples);
+
+void march_count(const March<float>& march, int64_t* counts, Stream stream);
+void march_samples(const March<float>& march, const int64_t* offsets, const Samples<float>& out, Stream stream);
+void composite_forward(const RaySamples<float>& in, const Composited<float>& out, Stream stream);
+void composite_backward(const RaySamples<float>& in, const Composited<const float>& grads, float* g_densities,
+                        float* g_colours, Stream stream);
+void reached_samples(const RaySamples<float>& in, bool* reached, int64_t* counts, Stream stream);
 
 // Training ------------------------------------------------------------------------------------------------------------
 

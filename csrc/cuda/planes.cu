@@ -144,12 +144,6 @@ __global__ void __launch_bounds__(kThreads) cell_keys_kernel(Target target, Plan
   global(out.values)[m] = static_cast<int32_t>(m);
 }
 
-__global__ void __launch_bounds__(kThreads)
-    cell_offsets_kernel(const uint32_t* cells, int64_t count, int64_t num_cells, int32_t* offsets) {
-  const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
-  if (i <= num_cells) global(offsets)[i] = static_cast<int32_t>(first_of(cells, count, i));
-}
-
 // Points by cell, and the place of each cell's first one.
 struct Sorted {
   const int32_t *points, *offsets;
@@ -248,12 +242,9 @@ struct BackwardBuffers {
 void gather(const Target& target, const PlanePoints<float>& points, const float* from, int64_t channels, float* to,
             const BackwardBuffers& b, Stream stream) {
   const int64_t cells = target.samples(), blocks = blocks_for(points.count, kThreads);
-  const int bits = bits_for(cells);
   launch("cell_keys", {blocks, kThreads}, stream, cell_keys_kernel, target, points, b.pairs);
-  stable_sort(b.pairs, b.other, points.count, bits, b.sort, stream);
-  const Pairs& sorted = passes_for(bits) % 2 == 0 ? b.pairs : b.other;
-  launch("cell_offsets", {blocks_for(cells + 1, kThreads), kThreads}, stream, cell_offsets_kernel,
-         static_cast<const uint32_t*>(sorted.keys), points.count, cells, b.offsets);
+  const Pairs& sorted = stable_sort(b.pairs, b.other, points.count, bits_for(cells), b.sort, stream);
+  find_offsets(sorted.keys, points.count, cells, b.offsets, stream);
   launch("gather", {cells, kThreads}, stream, gather_kernel, target, points, Sorted{sorted.values, b.offsets}, from,
          channels, to);
 }

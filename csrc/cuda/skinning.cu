@@ -206,10 +206,8 @@ void skinning_backward(const SkinNodes<float>& nodes, const SkinPoints<float>& p
   const SortBuffers buffers(workspace, pairs);
   launch("node_keys", {blocks_for(pairs, kThreads), kThreads}, stream, node_keys_kernel, points.followed, pairs,
          buffers.pairs);
-  const int bits = bits_for(nodes.count);
-  stable_sort(buffers.pairs, buffers.other, pairs, bits, buffers.sort, stream);
-  launch("by_node", {nodes.count, kThreads}, stream, by_node_kernel, nodes, points,
-         passes_for(bits) % 2 == 0 ? buffers.pairs : buffers.other, g, grads);
+  const Pairs& sorted = stable_sort(buffers.pairs, buffers.other, pairs, bits_for(nodes.count), buffers.sort, stream);
+  launch("by_node", {nodes.count, kThreads}, stream, by_node_kernel, nodes, points, sorted, g, grads);
 }
 
 }  // namespace dyngs::cuda

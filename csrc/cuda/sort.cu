@@ -143,6 +143,12 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
+__global__ void __launch_bounds__(kThreads)
+    find_offsets_kernel(const uint32_t* keys, int64_t count, int64_t num_keys, int32_t* offsets) {
+  const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
+  if (i <= num_keys) global(offsets)[i] = static_cast<int32_t>(first_of(keys, count, i));
+}
+
 }  // namespace
 
 ScanScratch::ScanScratch(Workspace& workspace, int64_t count)
@@ -161,8 +167,8 @@ SortScratch::SortScratch(Workspace& workspace, int64_t count)
     : histogram(workspace.take<int32_t>(kDigits * blocks_for(count, kPiece))),
       scan(workspace, kDigits * blocks_for(count, kPiece)) {}
 
-void stable_sort(const Pairs& from, const Pairs& other, int64_t count, int bits, const SortScratch& scratch,
-                 Stream stream) {
+const Pairs& stable_sort(const Pairs& from, const Pairs& other, int64_t count, int bits, const SortScratch& scratch,
+                         Stream stream) {
   const int64_t blocks = blocks_for(count, kPiece);
   for (int pass = 0; pass < passes_for(bits); ++pass) {
     const Pairs &source = pass % 2 == 0 ? from : other, &target = pass % 2 == 0 ? other : from;
@@ -172,6 +178,12 @@ void stable_sort(const Pairs& from, const Pairs& other, int64_t count, int bits,
     launch("move_items", {blocks, kThreads}, stream, move_items_kernel, source, target, count, pass * kRadixBits,
            static_cast<const int32_t*>(scratch.histogram));
   }
+  return passes_for(bits) % 2 == 0 ? from : other;
+}
+
+void find_offsets(const uint32_t* keys, int64_t count, int64_t num_keys, int32_t* offsets, Stream stream) {
+  launch("find_offsets", {blocks_for(num_keys + 1, kThreads), kThreads}, stream, find_offsets_kernel, keys, count,
+         num_keys, offsets);
 }
 
 }  // namespace dyngs::cuda

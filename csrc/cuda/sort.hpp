@@ -39,9 +39,12 @@ inline int bits_for(int64_t keys) {  // of the largest of so many keys
 inline int passes_for(int bits) { return (bits + kRadixBits - 1) / kRadixBits; }
 
 // Sorts by the lowest `bits` bits, ties in the order they came. Passes go to and fro between `from` and `other`; the result
-// lies in `from` after an even number of them, else in `other`.
-void stable_sort(const Pairs& from, const Pairs& other, int64_t count, int bits, const SortScratch& scratch,
-                 Stream stream);
+// lies in `from` after an even number of them, else in `other`: in the one that is returned.
+const Pairs& stable_sort(const Pairs& from, const Pairs& other, int64_t count, int bits, const SortScratch& scratch,
+                         Stream stream);
+
+// Writes for each key below `num_keys` the place of its first one in a sorted list, and the number of all after that: (num_keys + 1).
+void find_offsets(const uint32_t* keys, int64_t count, int64_t num_keys, int32_t* offsets, Stream stream);
 
 // The place of the first key that is not below `key`.
 __device__ inline int64_t first_of(const uint32_t* keys, int64_t count, int64_t key) {

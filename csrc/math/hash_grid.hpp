@@ -15,7 +15,10 @@ struct HashLevel {
   bool dense;     // every sample has a row of its own; else rows are shared by a hash
 };
 
-inline constexpr uint32_t kHashPrimes[4] = {1u, 2654435761u, 805459861u, 3674653429u};
+// A function, as a GPU cannot read an array of the host.
+DYNGS_INLINE constexpr uint32_t hash_prime(int axis) {
+  return axis == 0 ? 1u : axis == 1 ? 2654435761u : axis == 2 ? 805459861u : 3674653429u;
+}
 
 // Rows within the level, and weights, of the corners of kCount points; bit a of a corner says which side along axis a.
 template <int kDims, int kCount, class S>
@@ -34,7 +37,7 @@ DYNGS_INLINE void locate_hashed(const HashLevel& level, const S (*coords)[kCount
   S frac[kDims][kCount];
   uint32_t stride = 1;
   for (int a = 0; a < kDims; ++a) {
-    const uint32_t factor = level.dense ? stride : kHashPrimes[a];
+    const uint32_t factor = level.dense ? stride : hash_prime(a);
     stride *= static_cast<uint32_t>(level.size);
     for (int i = 0; i < kCount; ++i) {
       const S x = coords[a][i], inside = x > S(0) ? (x < S(1) ? x : S(1)) : S(0), at = inside * scale + S(0.5);

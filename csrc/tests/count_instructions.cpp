@@ -1,5 +1,6 @@
 // Runs kernels of training once each on a random scene, on one thread: what benchmarks/instructions.py counts the
 // instructions of.
+#include "tests/fields.hpp"
 #include "tests/scene.hpp"
 
 namespace {
@@ -59,9 +60,15 @@ void motion() {
                            {{grads[0].data(), grads[1].data(), grads[2].data(), nullptr, grads[3].data()}}, 1);
 }
 
+void fields() {
+  grid_on_cpu<float>(grid_case(levels_of({16, 64, 256}, 3, 1 << 14), 3, 4, 20'000));
+  march_on_cpu<float>(march_case(2'000, 3, 0.01));
+  composite_on_cpu<float>(sample_case(std::vector<int64_t>(2'000, 20), 0.5, 1e-4));
+}
+
 }  // namespace
 
 int main() {
-  images(), training(), motion();
+  images(), training(), motion(), fields();
   return 0;
 }

@@ -5,6 +5,7 @@
 #include "math/covariance.hpp"
 #include "math/ellipse.hpp"
 #include "math/harmonics.hpp"
+#include "math/hash_grid.hpp"
 #include "math/planes.hpp"
 #include "math/posing.hpp"
 #include "math/projection.hpp"
@@ -14,6 +15,7 @@
 #include "math/skinning.hpp"
 #include "math/ssim.hpp"
 #include "math/vec.hpp"
+#include "math/volume.hpp"
 
 namespace dyngs {
 
@@ -140,6 +142,30 @@ __global__ void planes(Numbers<S> n) {
   n.put(second_difference_vjp(n.next(), n.next(), n.next(), n.next()) + distance_vjp(n.next(), n.next()));
 }
 
+// A field's samples as arrays that lie one after the other, and the sizes of its steps.
+template <class S>
+struct FieldArrays {
+  S *densities, *colours, *starts, *ends;
+  S transmittance_min, near, step, cone;
+  FieldSpace<S> space;
+  int64_t most;
+};
+
+template <class S>
+__global__ void fields(Numbers<S> n, FieldArrays<S> in, const bool* occupied, bool* reached) {
+  S coords[3][1] = {{n.next()}, {n.next()}, {n.next()}};
+  HashCorners<3, 1, S> corners;
+  locate_hashed<3, 1, S>({63, 64, 0, 1 << 14, false}, coords, corners);
+  n.put(corners.weights[7][0] + static_cast<S>(corners.rows[5][0]));
+  const S o[3] = {n.next(), n.next(), n.next()}, d[3] = {n.next(), n.next(), n.next()};
+  RaySteps<S> steps(in, o, d, n.next());
+  S start, end, x[3], unit[3];
+  while (steps.next(in, occupied, start, end, x)) unit_coords(in.space, x, unit), n.put(unit[0] + end - start);
+  const Sight<S> seen = composite_ray<S>(in, 0, 9, n.out);
+  composite_ray_vjp(in, seen, 0, 9, n.out, n.out + 9);
+  n.put(static_cast<S>(mark_reached<S>(in, 0, 9, reached)));
+}
+
 template <class S>
 __global__ void training(Numbers<S> n) {
   const SsimTerms<S> t = ssim_terms(n.next(), n.next(), n.next(), n.next());
@@ -152,6 +178,7 @@ template <class S>
 void launch_all(Numbers<S> n) {
   rotations<<<1, 1>>>(n), projection<<<1, 1>>>(n), harmonics<<<1, 1>>>(n), blending<<<1, 1>>>(n);
   deformation<<<1, 1>>>(n), posing<<<1, 1>>>(n), planes<<<1, 1>>>(n), training<<<1, 1>>>(n);
+  fields<<<1, 1>>>(n, FieldArrays<S>{}, nullptr, nullptr);
 }
 template void launch_all<float>(Numbers<float>);
 template void launch_all<double>(Numbers<double>);

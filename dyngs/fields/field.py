@@ -15,6 +15,9 @@ from dyngs.ops.rays import Rays, Space
 from dyngs.state import State
 
 LARGEST_EXPONENT = 15.0
+TIME_OCTAVES = 4
+TIME = 1 + 2 * TIME_OCTAVES
+"""Numbers that a time in [0, 1] is encoded in."""
 PUBLISHED_HALF = 1.5
 """Half the side of the cube of published figures: densities are per unit of a world in which the cube is as large."""
 
@@ -95,6 +98,20 @@ def truncated_exp(x: Tensor) -> Tensor:
     """Return exp(x), whose gradient does not grow beyond exp(15)."""
     result: Tensor = _TruncatedExp.apply(x)  # pyright: ignore[reportAssignmentType]
     return result
+
+
+def encoded(x: Tensor, octaves: int) -> Tensor:
+    """Return (M, D (1 + 2 octaves)): x, then the sines and cosines of 2^k x of each octave k, without pi (NeRF)."""
+    parts = [x]
+    for k in range(octaves):
+        parts += [(2.0**k * x).sin(), (2.0**k * x).cos()]
+    return torch.cat(parts, 1)
+
+
+def with_time(x: Tensor, time: float) -> Tensor:
+    """Return (M, K + TIME): the inputs (M, K) of a network, and ``time``, encoded (T-NeRF)."""
+    when = encoded(x.new_full((1, 1), time), TIME_OCTAVES)
+    return torch.cat([x, when.expand(len(x), -1)], 1)
 
 
 def network(x: Tensor, weights: Sequence[Tensor]) -> Tensor:

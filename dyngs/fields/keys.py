@@ -13,7 +13,6 @@ class FieldModel(ModelSection):
     """Keys that all fields share."""
 
     draws_whole_images: ClassVar[bool] = False
-    on_gpu: ClassVar[bool] = False
 
     time: bool = Field(default=False, description="time is an input, too: a moving scene (T-NeRF)")
     half_extent: float | None = Field(
@@ -38,13 +37,19 @@ class NgpModel(FieldModel):
     )
     sizes: Literal["cpu", "published"] = Field(
         default="cpu",
-        description="what the sizes below are unless given: 8 levels of 2^17 rows of 4 and 2^16 samples, or "
+        description="what the sizes below are unless given: 8 levels of 2^16 rows of 4 and 2^14 samples, or "
         "16 of 2^19 of 2 and 2^18",
     )
     levels: int | None = Field(default=None, ge=1, le=32, description="levels of the hash grid")
     features: Literal[1, 2, 4, 8] | None = Field(default=None, description="features per level")
     log2_rows: int | None = Field(default=None, ge=4, le=24, description="most rows of a level, as a power of two")
-    finest: int | None = Field(default=None, ge=16, le=2**17, description="cells of the finest level along an axis")
+    finest: int | None = Field(
+        default=None,
+        ge=16,
+        le=2**17,
+        description="cells of the finest level along an axis; null: 2.56 per pixel of an image's longest side, twice "
+        "as many with surroundings, or 4096 as published",
+    )
     log2_samples: int | None = Field(
         default=None, ge=8, le=22, description="samples per step, as a power of two; the number of rays follows"
     )

@@ -29,7 +29,9 @@ def start(run: RunStart) -> FieldTraining[Any]:
     except DyngsError as error:
         raise DyngsError(f"{run.config.data.root}: {error}") from None
     if isinstance(model, NgpModel):
-        return NgpTraining(run, NgpField.new(model, space, run.generator), model)
+        camera = run.images[0].cameras
+        field = NgpField.new(model, space, run.generator, max(camera.width, camera.height))
+        return NgpTraining(run, field, model)
     return NerfTraining(run, NerfField.new(model, space, run.generator), model)
 
 

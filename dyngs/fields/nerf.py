@@ -12,7 +12,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyngs.fields.field import PUBLISHED_HALF, Field, Seen
+from dyngs.fields.field import PUBLISHED_HALF, TIME, Field, Seen, encoded, with_time
 from dyngs.fields.keys import NerfModel
 from dyngs.fields.sampling import along, by_weights, evenly
 from dyngs.initialisation import glorot
@@ -23,16 +23,8 @@ from dyngs.state import Role, State, with_role
 from dyngs.tensor_checks import require_tensor
 
 DEPTH, SKIP = 8, 5  # Hidden layers of the trunk; the layer that sees the position again
-POSITION_OCTAVES, DIRECTION_OCTAVES, TIME_OCTAVES = 10, 4, 4
-POSITION, DIRECTION, TIME = 3 * (1 + 2 * POSITION_OCTAVES), 3 * (1 + 2 * DIRECTION_OCTAVES), 1 + 2 * TIME_OCTAVES
-
-
-def encoded(x: Tensor, octaves: int) -> Tensor:
-    """Return (M, D (1 + 2 octaves)): x, then the sines and cosines of 2^k x of each octave k, without pi."""
-    parts = [x]
-    for k in range(octaves):
-        parts += [(2.0**k * x).sin(), (2.0**k * x).cos()]
-    return torch.cat(parts, 1)
+POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
+POSITION, DIRECTION = 3 * (1 + 2 * POSITION_OCTAVES), 3 * (1 + 2 * DIRECTION_OCTAVES)
 
 
 @dataclass(frozen=True)
@@ -154,10 +146,7 @@ class NerfField(Field):
     def _places(self, coords: Tensor, time: float) -> Tensor:
         """Return encoded positions, in the unit of the published scenes, and time."""
         places = encoded((coords - 0.5) * (2 * PUBLISHED_HALF), POSITION_OCTAVES)
-        if not self.sees_time:
-            return places
-        when = encoded(coords.new_full((1, 1), time), TIME_OCTAVES)
-        return torch.cat([places, when.expand(len(places), -1)], 1)
+        return with_time(places, time) if self.sees_time else places
 
     def _densities(self, outputs: Tensor) -> Tensor:
         return outputs[:, 0].relu() * (PUBLISHED_HALF / self.space.half)

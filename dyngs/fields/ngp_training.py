@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from dyngs.errors import DyngsError
+from dyngs.fields.frusta import seen_cells
 from dyngs.fields.keys import NgpModel
 from dyngs.fields.ngp import NgpField, NgpSizes
 from dyngs.fields.occupancy import Occupancy
@@ -21,6 +23,7 @@ from dyngs.tensor_checks import require_tensor
 
 FIRST_SAMPLES = 256  # Samples that a ray is taken to need before any was counted
 MOST_RAYS = 1 << 15  # Of an image in a step
+LOOKED_AT = 2  # Random cells looked at in an update of the occupied ones, per sample of a step
 WARM_UP, FIRST_RATE = 100, 0.01  # Steps in which the rate rises from this fraction of itself
 DROPS, DROP = (0.5, 0.75, 0.9), 0.33  # Fractions of the run at which the rate falls by this factor
 
@@ -30,10 +33,25 @@ class NgpTraining(FieldTraining[NgpField]):
 
     def __init__(self, run: RunStart, field: NgpField, model: NgpModel) -> None:
         super().__init__(run, field, smooth_l1)
-        self._model, self._occupancy = model, Occupancy(field.space)
-        self._wanted = NgpSizes.of(model).num_samples // self._batch
+        self._model, self._num_samples = model, NgpSizes.of(model, field.pixels).num_samples
+        self._wanted = max(1, self._num_samples // self._batch)
+        self._occupancy = self._new_occupancy(field)
+        field.occupied.copy_(self._occupancy.seen)
         self._counted = torch.zeros(2, dtype=torch.float64, device="cpu")  # rays and samples of this step
         self._rays = max(1, self._wanted // FIRST_SAMPLES)
+
+    def _new_occupancy(self, field: NgpField) -> Occupancy:
+        seen = seen_cells(field.space, self._run.capture.splits["train"])
+        if not bool(seen.any()):
+            raise DyngsError(
+                f"{self._run.config.data.root}: no training camera sees anything of the cube that the field lies in: "
+                "give model.half_extent, or model.surroundings=always"
+            )
+        return Occupancy(field.space, seen, LOOKED_AT * self._num_samples)
+
+    @property
+    def betas(self) -> tuple[float, float]:
+        return 0.9, 0.99
 
     @property
     def num_rays(self) -> int:
@@ -76,8 +94,14 @@ class NgpTraining(FieldTraining[NgpField]):
         return NgpField.restored(self._model, stored_space(checkpoint.part("field")), checkpoint)
 
     def restore(self, checkpoint: Checkpoint) -> None:
+        before = self._field.space
         super().restore(checkpoint)
         stored = checkpoint.part("occupancy")
-        self._occupancy = Occupancy(self._field.space)
+        if self._field.space != before:  # to find what cameras see takes seconds
+            self._occupancy = self._new_occupancy(self._field)
         self._occupancy.load_state(stored)
         self._rays = min(MOST_RAYS, max(1, int(require_tensor("rays", stored["rays"], (1,), torch.int64))))
+
+    def place(self, device: torch.device) -> None:
+        super().place(device)
+        self._occupancy.place(device)

@@ -21,7 +21,7 @@ from dyngs.ops.rays import Rays, Space
 MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
 CELLS, FAR_CELLS = 128, 64  # Along an axis of a single cube, and of each of several: looking at all takes a while
 BESIDE = 1.25
-"""Half the side of the innermost cube of a real capture, in the farthest distances of a camera from its middle."""
+"""Half the side of an innermost cube that holds the cameras, in the farthest distances of one from its middle."""
 SEEN_FAR = 0.02  # Fraction of the sparse points that may lie outside of the outermost cube
 
 
@@ -29,7 +29,8 @@ def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
     """Return the space of the field of ``capture``.
 
     An object before a background lies in a cube around the point that the cameras look at, as large as what all of them
-    frame. Otherwise the innermost cube holds the cameras, and others around it what is far away.
+    frame. So does the innermost cube of other captures, with others around it for what is far away; where the cameras
+    do not look at one point it holds the cameras.
 
     Args:
         cells: of each cube along an axis; None: as suits their number.
@@ -55,7 +56,9 @@ def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
     middle = centres.mean(axis=0)
     if looked_at is not None and np.linalg.norm(looked_at - middle) < 2 * spread:
         middle = looked_at
-    half = model.half_extent or BESIDE * float(np.abs(centres - middle).max())
+    beside = BESIDE * float(np.abs(centres - middle).max())
+    framed = beside if middle is not looked_at else min(beside, _framed(views, middle))
+    half = model.half_extent or framed
     return _space(middle, half, _cascades(capture, middle, half), cells)
 
 

@@ -21,7 +21,8 @@ from dyngs.models.model import Drawn, Look, Loss, Model, Updated
 from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
 from dyngs.ops.adam import AdamUpdate
-from dyngs.state import State, prefixed
+from dyngs.ops.device import sent
+from dyngs.state import State, moved_to, prefixed
 
 NEAR = 0.05  # Nearest distance that is drawn, in units of half the side of the innermost cube
 
@@ -91,14 +92,21 @@ class FieldTraining(Model[FieldScene], Generic[F]):
         """Return the learning rate in ``step``."""
         raise NotImplementedError
 
+    @property
+    def betas(self) -> tuple[float, float]:
+        """How slowly Adam forgets."""
+        return 0.9, 0.999
+
     def counted(self, num_rays: int, num_samples: int) -> None:
         """Take in how many samples the rays of an image needed."""
 
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
-        generator, camera = self._run.generator, image.cameras
+        generator, device = self._run.generator, background.device
+        camera = image.cameras.to(device=device)
         pixels = torch.randint(camera.width * camera.height, (self.num_rays,), generator=generator, device="cpu")
+        shifts = torch.rand((len(pixels), self._field.num_shifts), generator=generator, device="cpu")
+        pixels, shifts = sent(pixels, device), sent(shifts, device)
         rays, z = rays_of(camera, pixels)
-        shifts = torch.rand((len(rays), self._field.num_shifts), generator=generator, device="cpu")
         seen = self._field.seen(rays, image.time or 0.0, near=self._like.options.near, shifts=shifts)
         self.counted(len(rays), seen.num_samples)
         part = part_of(image, pixels)
@@ -112,7 +120,7 @@ class FieldTraining(Model[FieldScene], Generic[F]):
 
     def update(self, step: int) -> Updated:
         updates = [self._update_of(name, x, self.rate(step)) for name, x in self._field.parameters.items()]
-        return Updated(self._adam.steps_(updates, step=step))
+        return Updated(self._adam.steps_(updates, step=step, betas=self.betas))
 
     def _update_of(self, name: str, x: Tensor, rate: float) -> AdamUpdate | None:
         return self._adam.update(name, x, rate)
@@ -133,5 +141,8 @@ class FieldTraining(Model[FieldScene], Generic[F]):
         self._adam = AdamState.restored(checkpoint.part("adam"), field.parameters)
 
     def place(self, device: torch.device) -> None:
-        if device.type != "cpu":
-            raise DyngsError(f"model.kind={self._run.config.model.kind} is trained on the CPU: give run.device=cpu")
+        field = moved_to(self._field, device)
+        for x in field.parameters.values():
+            x.detach_().requires_grad_()
+        self._field, self._adam = field, self._adam.to(device)
+        self._like = replace(self._like, field=field).to(device)

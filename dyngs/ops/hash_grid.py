@@ -63,7 +63,7 @@ def _hash_grid_backward(
     return g_table
 
 
-hash_grid_backward_op = register("hash_grid_backward", _hash_grid_backward, devices=("cpu",))
+hash_grid_backward_op = register("hash_grid_backward", _hash_grid_backward)
 """The gradient by the table."""
 
 
@@ -78,7 +78,7 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return None, hash_grid_backward_op(coords, table, grad.contiguous(), scales, sizes, rows), None, None, None
 
 
-hash_grid_op = register("hash_grid", _hash_grid, devices=("cpu",), gradient=Gradient(_save, _backward))
+hash_grid_op = register("hash_grid", _hash_grid, gradient=Gradient(_save, _backward))
 """Features (M, L * F)."""
 
 
@@ -126,9 +126,7 @@ def _backward_known(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return None, None, *_backward(ctx, grad)
 
 
-known_features_op = register(
-    "known_features", _known, devices=("cpu",), gradient=Gradient(_save_known, _backward_known)
-)
+known_features_op = register("known_features", _known, gradient=Gradient(_save_known, _backward_known))
 
 
 def known_features(features: Tensor, which: Tensor, coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:

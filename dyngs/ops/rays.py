@@ -97,36 +97,77 @@ class Steps:
     most: int = 1 << 16  # of a ray
 
 
+def _march_arguments(rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]) -> tuple[Any, ...]:
+    """Return what both kernels take: arrays (of rays: origins, directions, shifts), sizes, cells and options."""
+    x, y, z, half, cascades, cells = space
+    near, length, cone, most = steps
+    return *rays, ((x, y, z), half, int(cascades), int(cells)), occupied, (near, length, cone, int(most))
+
+
+def _march_counts(rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]) -> Tensor:
+    counts = rays[2].new_empty(rays[2].shape, dtype=torch.int64)
+    launch(rays[2], "march_count", *_march_arguments(rays, occupied, space, steps), counts, num_threads())
+    return counts
+
+
+march_counts_op = register("march_counts", _march_counts)
+"""The number (R,) of samples of each ray; ``rays``: origins, directions, shifts."""
+
+
+def _march_samples(
+    rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float], offsets: Tensor, count: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    like = rays[2]
+    which = like.new_empty(count, dtype=torch.int32)
+    samples = which, like.new_empty(count), like.new_empty(count), like.new_empty(count, 3)
+    given = _march_arguments(rays, occupied, space, steps)
+    launch(like, "march_samples", *given, offsets, samples, num_threads())
+    return samples
+
+
+march_samples_op = register("march_samples", _march_samples)
+"""Ray, start, end (M,) and coordinates (M, 3) of the M = ``count`` samples whose ``offsets`` (R + 1,) are given."""
+
+
 @torch.no_grad()
 def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: Steps) -> Samples:
     """Return the samples of rays whose middle lies in an occupied cell.
 
     Empty cells are skipped by whole steps. ``shifts`` (R,) in [0, 1): by which fraction of a step those of each ray are
-    shifted. ``occupied``: bool of ``space.shape``. The same samples on any number of threads.
+    shifted. ``occupied``: bool of ``space.shape``. The same samples on any number of threads. The host waits for the
+    number of samples.
     """
     if occupied.shape != space.shape or occupied.dtype != torch.bool:
         raise DyngsError(f"march: cells must be bool {space.shape}, got {occupied.dtype} {tuple(occupied.shape)}")
-    centre = tuple(float(x) for x in space.centre)
-    sizes = (centre, float(space.half), space.cascades, space.cells)
-    options = (float(steps.near), float(steps.length), float(steps.cone), steps.most)
-    given = (rays.origins.contiguous(), rays.directions.contiguous(), shifts, sizes, occupied, options)
-    counts = torch.empty(len(rays), dtype=torch.int64, device="cpu")
-    launch(shifts, "march_count", *given, counts, num_threads())
-    offsets = offsets_of(counts)
-    count = int(offsets[-1])
-    which = torch.empty(count, dtype=torch.int32, device="cpu")
-    starts, ends, coords = shifts.new_empty(count), shifts.new_empty(count), shifts.new_empty(count, 3)
-    launch(shifts, "march_samples", *given, offsets, (which, starts, ends, coords), num_threads())
-    return Samples(offsets, which, starts, ends, coords)
+    given = (
+        [rays.origins.contiguous(), rays.directions.contiguous(), shifts.contiguous()],
+        occupied,
+        [*map(float, space.centre), float(space.half), float(space.cascades), float(space.cells)],
+        [float(steps.near), float(steps.length), float(steps.cone), float(steps.most)],
+    )
+    offsets = offsets_of(march_counts_op(*given))
+    return Samples(offsets, *march_samples_op(*given, offsets, int(offsets[-1])))
+
+
+def _reached(
+    densities: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, transmittance_min: float
+) -> tuple[Tensor, Tensor]:
+    which = densities.new_empty(densities.shape, dtype=torch.bool)
+    counts = offsets.new_empty(offsets.shape[0] - 1)
+    given = densities, starts, ends, offsets, transmittance_min
+    launch(densities, "reached_samples", *given, which, counts, num_threads())
+    return which, counts
+
+
+reached_op = register("reached", _reached)
+"""Which samples (M,) are reached, and how many of each ray (R,)."""
 
 
 @torch.no_grad()
 def reached(densities: Tensor, samples: Samples, transmittance_min: float = TRANSMITTANCE_MIN) -> tuple[Tensor, Tensor]:
     """Return (M,) bool which samples light gets to through those before them, and the (R + 1,) offsets of these."""
-    which = torch.empty(len(samples), dtype=torch.bool, device="cpu")
-    counts = torch.empty(samples.num_rays, dtype=torch.int64, device="cpu")
     given = (densities.contiguous(), samples.starts, samples.ends, samples.offsets, transmittance_min)
-    launch(densities, "reached_samples", *given, which, counts, num_threads())
+    which, counts = reached_op(*given)
     return which, offsets_of(counts)
 
 
@@ -153,7 +194,7 @@ def _composite_backward(samples: list[Tensor], grads: list[Tensor], transmittanc
     return g_densities, g_colours
 
 
-composite_backward_op = register("composite_backward", _composite_backward, devices=("cpu",))
+composite_backward_op = register("composite_backward", _composite_backward)
 """Gradients by densities and colours; ``samples`` are the first five inputs of ``composite``."""
 
 
@@ -169,7 +210,7 @@ def _backward(ctx: Any, colour: Tensor, transmittance: Tensor, depth: Tensor, _:
     return by_densities, by_colours, None, None, None, None
 
 
-composite_op = register("composite", _composite, devices=("cpu",), gradient=Gradient(_save, _backward))
+composite_op = register("composite", _composite, gradient=Gradient(_save, _backward))
 """Colour (R, 3), transmittance (R,), sum of weight times distance (R,), and weights (M,)."""
 
 

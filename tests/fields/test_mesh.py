@@ -33,7 +33,9 @@ class Ball(NgpField):
 def scene() -> FieldScene:
     space = Space((0.1, 0.0, 0.0), 1.0, 2, 8)
     plain = NgpField.new(NgpModel(levels=2, log2_rows=6, finest=16), space, torch.Generator().manual_seed(0))
-    field = Ball(space, plain.levels, plain.table, plain.density, plain.colour, plain.occupied, plain.across)
+    field = Ball(
+        space, plain.pixels, plain.levels, plain.table, plain.density, plain.colour, plain.occupied, plain.across
+    )
     return FieldScene(field)
 
 

@@ -7,8 +7,9 @@ from itertools import pairwise
 import pytest
 import torch
 
+from dyngs.fields.field import encoded
 from dyngs.fields.keys import NerfModel
-from dyngs.fields.nerf import DIRECTION, POSITION, NerfField, NerfNetwork, encoded
+from dyngs.fields.nerf import DIRECTION, POSITION, NerfField, NerfNetwork
 from dyngs.ops.rays import Rays, Space
 
 SPACE = Space((0.0, 0.0, 0.0), 1.5, 1, 1)

@@ -34,9 +34,12 @@ def rays_towards_it(count: int = 20) -> Rays:
 
 def test_sizes_are_for_a_cpu_or_as_published() -> None:
     own, published = NgpSizes.of(NgpModel()), NgpSizes.of(NgpModel(sizes="published"))
-    assert (len(own.levels.rows), own.features, max(own.levels.rows), own.num_samples) == (8, 4, 2**17, 2**16)
+    assert (len(own.levels.rows), own.features, max(own.levels.rows), own.num_samples) == (8, 4, 2**16, 2**14)
     assert (len(published.levels.rows), published.features, max(published.levels.rows)) == (16, 2, 2**19)
     assert published.num_samples == 2**18
+    assert (own.across, published.across, max(published.levels.sizes)) == (1024, 1024, 4096)
+    small = NgpSizes.of(NgpModel(), pixels=200)
+    assert (small.across, max(small.levels.sizes)) == (256, 512), "as fine as the images"
     assert NgpSizes.of(NgpModel(sizes="published", levels=5, log2_samples=10)).num_samples == 2**10
 
 
@@ -89,3 +92,12 @@ def test_what_is_stored_is_restored(cells: int) -> None:
     for name, x in bad.items():
         with pytest.raises(ValueError, match=name.removeprefix("field.")):
             NgpField.restored(model, space, Checkpoint(info, checkpoint.tensors | {name: x}))
+
+
+def test_mist_is_as_thick_in_each_cube() -> None:
+    field = NgpField.new(SMALL, Space((0.1, 0.0, -0.2), 1.2, 4, 8), torch.Generator().manual_seed(0))
+    middle, side = torch.tensor([0.1, 0.0, -0.2]), torch.tensor([1.2, 0.3, -0.5])
+    points = torch.stack([middle + 0.4 * side, middle + side, middle + 2 * side, middle + 8 * side])
+    with torch.no_grad():
+        found = field.densities(points, 0.0)
+    assert (found / found[0]).tolist() == pytest.approx([1, 1, 1 / 2, 1 / 8], rel=0.01)

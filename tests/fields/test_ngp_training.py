@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from small_fields import NGP, config_of
 
 from dyngs.data.loader import ImageLoader
+from dyngs.data.read import read_capture
+from dyngs.errors import DyngsError
+from dyngs.fields.frusta import seen_cells
 from dyngs.fields.ngp import NgpField
 from dyngs.fields.ngp_training import NgpTraining
 from dyngs.fields.space import rays_of
@@ -61,6 +66,27 @@ def test_untouched_rows_stay_as_they_are(capture: Path) -> None:
         trainer.step()
     moved = (table.detach() != before).any(1)
     assert 0 < float(moved.float().mean()) < 1
+
+
+def test_cells_that_no_camera_sees_are_never_occupied(capture: Path) -> None:
+    config = config_of(capture, *NGP, "model.surroundings=always")
+    trainer = assemble(config)
+    field = trainer.model.scene.field
+    seen = seen_cells(field.space, trainer.capture.splits["train"])
+    assert torch.equal(field.occupied, seen)
+    assert not bool(seen.all())
+    for _ in range(34):
+        trainer.step()
+    assert not bool((field.occupied & ~seen).any())
+
+
+def test_a_cube_that_no_camera_sees_is_refused(capture: Path) -> None:
+    config = config_of(capture, *NGP, "model.half_extent=0.1")
+    read = read_capture(config.data)
+    away = np.diag([-1.0, 1.0, -1.0, 1.0])
+    views = [replace(view, cam_from_world=away @ view.cam_from_world) for view in read.splits["train"]]
+    with pytest.raises(DyngsError, match="no training camera sees anything of the cube"):
+        assemble(config, replace(read, splits={**read.splits, "train": views}))
 
 
 def test_several_views_share_a_step(capture: Path) -> None:

@@ -29,12 +29,18 @@ class Ball(NgpField):
 def ball(cascades: int) -> Ball:
     space = Space((0.2, 0.0, 0.0), 1.0, cascades, 16)
     plain = NgpField.new(MODEL, space, torch.Generator().manual_seed(0))
-    return Ball(space, plain.levels, plain.table, plain.density, plain.colour, plain.occupied, plain.across)
+    return Ball(
+        space, plain.pixels, plain.levels, plain.table, plain.density, plain.colour, plain.occupied, plain.across
+    )
+
+
+def occupancy_of(field: NgpField, num_random: int = 2**20) -> Occupancy:
+    return Occupancy(field.space, torch.ones(field.space.shape, dtype=torch.bool), num_random)
 
 
 def test_cells_of_all_cubes_are_found() -> None:
     field, generator = ball(2), torch.Generator().manual_seed(0)
-    found = Occupancy(field.space).updated(field, 16, (), generator)
+    found = occupancy_of(field).updated(field, 32, (), generator)
     for cascade, half in enumerate((1.0, 2.0)):
         middles = torch.stack(torch.meshgrid(*[(torch.arange(16) + 0.5) / 8 - 1] * 3, indexing="ij"), -1) * half
         distance, cell = middles.norm(dim=-1), half / 8 * 3**0.5 / 2
@@ -44,12 +50,12 @@ def test_cells_of_all_cubes_are_found() -> None:
 
 def test_what_is_gone_fades() -> None:
     field, generator = ball(1), torch.Generator().manual_seed(0)
-    occupancy = Occupancy(field.space)
-    before = occupancy.updated(field, 16, (), generator)
+    occupancy = occupancy_of(field)
+    before = occupancy.updated(field, 32, (), generator)
     empty = replace(field, height=0.0)
     first = occupancy.updated(empty, 32, (), generator)
     assert bool(first[before].all()), "not at once"
-    opacity = field.height * field.step
+    opacity = field.height * (2 * 3**0.5 / 1024)
     for _ in range(int(torch.tensor(THRESHOLD / opacity).log() / torch.tensor(DECAY).log()) + 2):
         last = occupancy.updated(empty, 32, (), generator)
     values = occupancy.state()["values"]
@@ -59,11 +65,53 @@ def test_what_is_gone_fades() -> None:
 
 def test_later_half_of_the_cells_at_most_are_looked_at() -> None:
     field, generator = ball(1), torch.Generator().manual_seed(0)
-    occupancy = Occupancy(field.space)
+    occupancy = occupancy_of(field)
     found = occupancy.updated(field, WARM_UP + 16, (), generator)
     seen = (occupancy.state()["values"] > 0).float().mean()
     assert 0 < float(seen) < 0.1, "half of a ball of a ninth of the cube"
-    other = Occupancy(field.space)
+    other = occupancy_of(field)
     other.load_state(occupancy.state())
     again = other.updated(field, WARM_UP + 32, (), torch.Generator().manual_seed(5))
     assert bool(again[found].all())
+
+
+def test_few_random_cells_are_looked_at_where_few_are_asked_for() -> None:
+    field, generator = ball(1), torch.Generator().manual_seed(0)
+    field.occupied.zero_()
+    occupancy = occupancy_of(field, 50)
+    occupancy.updated(field, WARM_UP + 16, (), generator)
+    assert 0 < int((occupancy.state()["values"] > 0).sum()) <= 50
+
+
+def test_what_no_camera_sees_is_never_occupied() -> None:
+    field, generator = ball(1), torch.Generator().manual_seed(0)
+    seen = torch.ones(field.space.shape, dtype=torch.bool)
+    seen[:, :8] = False
+    occupancy = Occupancy(field.space, seen, 2**20)
+    field.occupied.copy_(seen)
+    for step in (64, WARM_UP + 16):
+        found = occupancy.updated(field, step, (), generator)
+        assert bool(found.any())
+        assert not bool((found & ~seen).any())
+
+
+def test_all_cells_are_looked_at_ever_less_often() -> None:
+    field, generator = ball(1), torch.Generator().manual_seed(0)
+    field.occupied.zero_()
+    occupancy = occupancy_of(field, 1)
+    assert [step for step in range(1, 80) if occupancy.is_due(step)] == [32, 48, 64]
+    found = []
+    for step in (32, 48, 64, 80, 128, 144, 256, 512):
+        other = occupancy_of(field, 1)
+        other.updated(field, step, (), generator)
+        found.append(int((other.state()["values"] > 0).sum()) > 1)
+    assert found == [True, False, True, False, True, False, True, False]
+
+
+def test_each_cube_has_a_mean_of_its_own() -> None:
+    """What is thin in an inner cube is not forgotten because it is thick in an outer one."""
+    field = ball(2)
+    thin = replace(field, height=0.1)
+    found = occupancy_of(field).updated(thin, 32, (), torch.Generator().manual_seed(0))
+    assert bool(found[0].any())
+    assert bool(found[1].any())

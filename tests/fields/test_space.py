@@ -43,14 +43,21 @@ def test_a_real_capture_has_cubes_up_to_its_points(still: Capture) -> None:
     directions = np.random.default_rng(0).normal(size=(500, 3))
     directions /= np.abs(directions).max(axis=1, keepdims=True)
     near, far = (space_of(NgpModel(), 16, real(still, distance * directions)) for distance in (3.0, 60.0))
-    centres = np.stack([-v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3] for v in still.splits["train"]])
-    assert (np.abs(centres - near.centre) < near.half).all()
-    assert near.cascades == 2
+    assert near.half == pytest.approx(space_of(NgpModel(), 16, still).half), "what cameras frame that look at a point"
+    assert near.outermost >= 2 * 3.0
     assert far.outermost > 60
     assert space_of(NgpModel(), 16, real(still, None)).cascades == MOST_CASCADES
     assert space_of(NgpModel(surroundings="never"), 16, real(still, None)).cascades == 1
     with pytest.raises(DyngsError, match="times as far away"):
         space_of(NgpModel(), 16, real(still, 1e6 * directions))
+
+
+def test_cameras_that_look_outwards_lie_in_the_innermost_cube(still: Capture) -> None:
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    views = [replace(v, cam_from_world=turned @ v.cam_from_world) for v in still.splits["train"]]
+    space = space_of(NgpModel(), 16, replace(real(still, None), splits={"train": views}))
+    centres = np.stack([-v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3] for v in views])
+    assert (np.abs(centres - space.centre) < space.half).all()
 
 
 def test_one_camera_position_tells_no_depth(still: Capture) -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import torch
 from small_fields import NGP, config_of
 
-from dyngs.errors import DyngsError
 from dyngs.fields.training import masked_mean, smooth_l1
 from dyngs.kinds import assemble
 
@@ -28,8 +26,3 @@ def test_a_step_draws_pixels_of_one_image(capture: Path) -> None:
     trainer = assemble(config_of(capture, *NGP))
     report = trainer.step()
     assert report.truth.shape == report.rendered.shape == (1, 2**12 // 256, 3)
-
-
-def test_it_stays_on_the_cpu(capture: Path) -> None:
-    with pytest.raises(DyngsError, match=r"run\.device=cpu"):
-        assemble(config_of(capture, *NGP)).model.place(torch.device("cuda"))

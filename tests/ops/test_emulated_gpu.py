@@ -20,6 +20,7 @@ from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops import native
 from dyngs.ops.adam import adam_step_, seen_rows
 from dyngs.ops.checks import count_nonfinite_op
+from dyngs.ops.hash_grid import HashLevels, hash_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.nodes import HEAD_SIZES, node_penalties, spline_motion
 from dyngs.ops.perceptron import GPU_LAYERS, GPU_WIDTH, Layer, perceptron, perceptron_op
@@ -27,6 +28,7 @@ from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.rasterization import BlendOptions, Tally, rasterize, tally
+from dyngs.ops.rays import Rays, Space, Steps, composite, march, reached
 from dyngs.ops.shading import Sight, shading_inputs
 from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
 
@@ -208,6 +210,26 @@ def decoded() -> Made:
     return found
 
 
+def seen_along() -> Made:
+    """Samples of rays through occupied cells, their features in a hash grid, and what is seen, with gradients."""
+    generator = torch.Generator().manual_seed(0)
+    space, levels = Space((0.1, 0.2, -0.1), 1.0, 2, 8), HashLevels.geometric(3, 4, 24, 64)
+    origins = 3 * torch.nn.functional.normalize(torch.randn(40, 3, generator=generator))
+    aims = 0.6 * torch.randn(40, 3, generator=generator)
+    occupied = torch.rand(space.shape, generator=generator) < 0.4
+    rays = Rays(origins, torch.nn.functional.normalize(aims - origins))
+    samples = march(rays, torch.rand(40, generator=generator), space, occupied, Steps(0.05, 0.05, 0.01))
+    table = torch.randn(levels.num_rows, 4, generator=generator).requires_grad_()
+    features = hash_features(samples.coords, table, levels)
+    densities, colours = features[:, 0].exp(), features[:, 1:4].sigmoid()
+    which, offsets = reached(densities, samples, 0.1)
+    seen = composite(densities, colours, samples, 0.01)
+    loss = seen.colour.square().sum() + seen.transmittance.square().sum() + seen.depth.sum()
+    arrays = [samples.offsets, samples.rays, samples.starts, samples.ends, samples.coords, which, offsets]
+    found = [seen.colour, seen.transmittance, seen.depth, seen.weights]
+    return [*arrays, features, *found, *torch.autograd.grad(loss, table)]
+
+
 CASES: dict[str, Callable[[], Made]] = {
     "render": lambda: drawn(single().gaussians),
     "tally": tallied,
@@ -220,6 +242,7 @@ CASES: dict[str, Callable[[], Made]] = {
     "skinning": skinned,
     "posing": posed,
     "perceptron": decoded,
+    "field": seen_along,
 }
 
 

@@ -21,8 +21,11 @@ from dyngs.ops.rays import (
     composite_backward_op,
     composite_op,
     march,
+    march_counts_op,
+    march_samples_op,
     offsets_of,
     reached,
+    reached_op,
 )
 
 NESTED = Space((0.1, 0.2, -0.1), 1.0, 2, 8)
@@ -185,3 +188,10 @@ def test_the_ops_are_registered_as_torch_wants_them() -> None:
     torch.library.opcheck(composite_op, (*given, 0.0))
     grads = [torch.ones(2, 3, dtype=torch.float64), *torch.ones(2, 2, dtype=torch.float64).unbind()]
     torch.library.opcheck(composite_backward_op, ([x.detach() for x in given], grads, 0.0))
+    torch.library.opcheck(reached_op, (densities.detach(), *given[2:], 0.1))
+    rays = some_rays(3)
+    where = [rays.origins, rays.directions, shifts_of(rays)], torch.ones(NESTED.shape, dtype=torch.bool)
+    sizes = [*NESTED.centre, NESTED.half, float(NESTED.cascades), float(NESTED.cells)], [0.1, 0.05, 0.0, 100.0]
+    torch.library.opcheck(march_counts_op, (*where, *sizes))
+    offsets = offsets_of(march_counts_op(*where, *sizes))
+    torch.library.opcheck(march_samples_op, (*where, *sizes, offsets, int(offsets[-1])))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from pretend_gpu import GPU, OnGpu, pretend_gpu
+from small_fields import NERF, NGP
 from tiny_people import NET, people
 
 from dyngs.api.train import train
@@ -52,6 +53,9 @@ CASES = {
     "nodes": ("dynamic", "moving", DYNAMIC),
     "hexplane": ("dynamic", "moving", (*DYNAMIC, "model.deform.kind=hexplane", "model.deform.resolution=16")),
     "human": ("human", "person", ("train.steps=8", "model.resolution=24")),
+    "ngp": ("ngp", "still", (*NGP, "train.steps=36")),
+    "ngp in time": ("ngp", "moving", (*NGP, "train.steps=6", "model.time=true")),
+    "nerf": ("nerf", "still", (*NERF, "train.steps=6")),
 }
 """Preset, capture and overrides by name."""
 
@@ -63,12 +67,13 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     """The same kernels compute, so that not a bit may differ; an operator given tensors of both devices raises."""
     kind, capture, more = CASES[name]
     config = config_of(kind, request.getfixturevalue(capture), *more)
+    monkeypatch.setattr("dyngs.fields.occupancy.WARM_UP", 16)  # the second time only some cells are looked at
     expected = trained(config, monkeypatch, torch.device("cpu")).checkpoint().tensors
     with pretend_gpu():
         trainer = trained(config, monkeypatch, GPU)
-        assert all(isinstance(x, OnGpu) for x in trainer.model.scene.gaussians.tensors().values())
+        assert all(isinstance(x, OnGpu) for x in trainer.model.leaves)
         found = trainer.checkpoint().tensors
-        assert len(trainer.model.scene) != 100 or name not in ("growing", "mcmc", "mip"), "the set was to change"
+        assert name not in ("growing", "mcmc", "mip") or len(trainer.model.scene) != 100, "the set was to change"
     assert found.keys() == expected.keys()
     assert [key for key, x in expected.items() if not torch.equal(found[key], x)] == []
 
@@ -130,13 +135,17 @@ def test_a_run_goes_on_there_from_a_checkpoint(still: Path, monkeypatch: pytest.
     assert [key for key, x in expected.checkpoint().tensors.items() if not torch.equal(found[key], x)] == []
 
 
-@pytest.mark.parametrize("name", ["static", "nodes", "hexplane", "human"])
+@pytest.mark.parametrize("name", ["static", "nodes", "hexplane", "human", "ngp"])
 def test_how_often_the_host_waits_in_a_step(
     name: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once for the loss; the number of tile entries, which the kernels read back, is not seen here (docs/gpu.md)."""
+    """Once for the loss; the number of tile entries, which the kernels read back, is not seen here (docs/gpu.md).
+
+    Of a field also for the number of samples, and of those that are reached.
+    """
     kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
-    long = ("train.steps=40", "strategy.kind=fixed")  # nothing but steps happens in those that are looked at
+    sizes = {"item": 2, "nonzero": 2} if name == "ngp" else {}
+    long = ("train.steps=40", *([] if sizes else ["strategy.kind=fixed"]))  # nothing but steps happens in those counted
     config = config_of(kind, request.getfixturevalue(capture), *more, *long)
     with pretend_gpu() as gpu:
         monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)
@@ -147,7 +156,7 @@ def test_how_often_the_host_waits_in_a_step(
         for _ in range(2):
             trainer.step()
         queued = gpu.waits.pop("queued to the GPU")
-        assert gpu.waits == {"to the CPU": 2}
+        assert gpu.waits == {"to the CPU": 2} | sizes
         assert queued <= 2 * 12
 
 
@@ -165,6 +174,7 @@ SCORED = {
     "nodes": ("test", False, ("train.steps=25",)),
     "human": ("pose", True, ()),
     "robust": ("train", False, ()),
+    "ngp": ("test", False, ()),
 }
 """Split, whether poses are refined, and overrides by the name of a case."""
 

@@ -20,6 +20,11 @@ class PointsInit(Section):
         ge=0,
         description="images of one time step to triangulate points from where the capture has none; 0: do not",
     )
+    dense: int = Field(
+        default=0,
+        ge=0,
+        description="points of depth maps, added in still captures to fewer than half as many; preset static: 10000",
+    )
     num_random: int = Field(
         default=20_000, ge=1, description="number of random points; auto: where there are no others"
     )

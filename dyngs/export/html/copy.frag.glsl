@@ -2,7 +2,7 @@
 precision highp float;
 
 in vec2 vAt;
-uniform sampler2D uPicture;
+uniform sampler2D uImage;
 out vec4 color;
 
-void main() { color = vec4(texture(uPicture, vAt).rgb, 1.0); }
+void main() { color = vec4(texture(uImage, vAt).rgb, 1.0); }

@@ -23,6 +23,7 @@ from dyngs.ops.nodes import SPAN
 
 SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
 FEWEST_PIECES, MOST_PIECES = 8, 256
+ALWAYS_ALLOWED = 32  # Pieces, however few training times there are: between those a network moves as it likes
 CHECKED = 0.95  # Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance
 
 
@@ -69,10 +70,10 @@ def fitted_curves(
 ) -> tuple[dict[str, Tensor], float]:
     """Return control points (S, P, size), by attribute, of the splines nearest to offsets, and the error of places.
 
-    The number of pieces is doubled until the error is within ``tolerance``, or there are as many as training times.
+    The number of pieces is doubled until the error is within ``tolerance``, or there are two for each training time.
     """
     pieces = FEWEST_PIECES
-    most = min(max(num_times - 1, FEWEST_PIECES), MOST_PIECES)
+    most = min(max(2 * (num_times - 1), ALWAYS_ALLOWED), MOST_PIECES)
     while True:
         heads = _fit(offsets_at, pieces)
         error = _error(heads["means"], offsets_at, pieces)

@@ -33,7 +33,7 @@ uniform vec4 uBody;        // translation and scale of a body, applied after its
 uniform mat3 uTurn;        // of a body from rest to the world
 uniform vec3 uBox[2];      // centre and half sides of the network's box
 
-// Corners: place in clip space, and in standard deviations from the centre. Outside the picture where nothing is seen.
+// Corners: place in clip space, and in standard deviations from the centre. Outside the image where nothing is seen.
 out vec4 vCorner0;
 out vec4 vColor0;  // rgb, opacity
 out vec4 vCorner1;

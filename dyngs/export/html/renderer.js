@@ -253,7 +253,6 @@ class Renderer {
     gl.clearColor(...scene.background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(this.splat.program);
-    gl.uniform2fv(this.splat.at("uSize"), this.size);
     gl.uniform1f(this.splat.at("uLeast"), scene.alphaMin);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);

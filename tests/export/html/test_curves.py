@@ -61,4 +61,6 @@ def test_pieces_are_added_until_places_are_near() -> None:
     assert error <= 0.5
     assert smaller <= 0.001
     limited, _ = fitted_curves(swinging, 20, 0.0)
-    assert limited["means"].shape == (1, 19 + 3, 3)
+    assert limited["means"].shape == (1, 2 * 19 + 3, 3)
+    _, between_few_times = fitted_curves(swinging, 3, 0.01)
+    assert between_few_times <= 0.01

@@ -1,0 +1,200 @@
+"""Dense first points of a still scene: depth maps of some views by plane sweep, kept where several of them agree.
+
+For each depth of a view the neighbouring images are drawn as if everything lay that far away (Collins 1996); the depth
+at which windows around a pixel correlate best is the pixel's. A few hundred sparse points become thousands, so that
+training has less to add.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+from dyngs.config import DataConfig
+from dyngs.data.capture import PointCloud, View
+from dyngs.data.geometry import camera_center, inverse_rigid, projected
+from dyngs.data.loader import ImageLoader
+from dyngs.data.times import evenly_spaced
+
+SWEEP_SIDE = 120
+"""Longest side of the images that are compared, px; 200 gave no better points and took three times as long."""
+MAPS = 24
+"""Views, evenly spaced, whose depth is looked for."""
+NEIGHBOURS, MIN_NEIGHBOURS = 4, 2
+"""Views that each is compared with; the two that agree best count: before others there may be something else."""
+DEPTHS = 48
+"""Depths that are tried, evenly spaced in inverse depth."""
+WINDOW = 2  # pixels on each side of the middle
+MIN_CORRELATION = 0.8
+AGREEMENT, MIN_AGREEING = 0.02, 2
+"""Relative difference of depths up to which two maps agree on a point, and how many others must."""
+MIN_POINTS = 500  # with fewer the maps have found noise
+NEAR_ANGLE, BEST_ANGLE, FAR_ANGLE = 3.0, 12.0, 30.0
+"""Degrees between the lines of sight of neighbours to the middle of the points: from, best, up to."""
+_ANGLE_SPREAD = 10.0  # degrees from the best one within which others are nearly as good
+_RANGE, _MARGIN = (1.0, 99.0), 1.25  # percentiles of the points' depths that are searched, and by how much more
+_NOISE = 1e-4  # standard deviations of a window below which it has no texture
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A small image: grey (H, W) and rgb (H, W, 3) in [0, 1], counts (H, W) bool, pose and intrinsics in float64."""
+
+    grey: Tensor
+    rgb: np.ndarray
+    counts: np.ndarray
+    cam_from_world: np.ndarray
+    intrinsics: np.ndarray
+
+    @property
+    def rays(self) -> np.ndarray:
+        """Return (H, W, 3) positions at depth 1 that the pixels' centres look at, in camera axes."""
+        height, width = self.grey.shape
+        down, across = np.mgrid[:height, :width] + 0.5
+        return np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(self.intrinsics).T
+
+
+def dense_points(views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int) -> PointCloud | None:
+    """Return at most ``count`` points of surfaces that several views show, at random of all that were found.
+
+    ``sparse`` (P, 3) points say how deep to look and which views show the same things. None where hardly any points
+    are found: without texture, neighbours, or right poses.
+    """
+    groups = neighbours(views, sparse)
+    needed = sorted({i for group in groups for i in group})
+    small = options.model_copy(update={"downscale": 1.0, "longest_side": SWEEP_SIDE, "cache_mb": 0.0})
+    loader = ImageLoader([views[i] for i in needed], small)
+    shots = {i: _shot(loader, k) for k, i in enumerate(needed)}
+    maps = [
+        (shots[first], _depth_map(shots[first], [shots[i] for i in others], _depth_range(views[first], sparse)))
+        for first, *others in groups
+    ]
+    found = [_agreed(shot, depth, maps) for shot, depth in maps]
+    if not found or sum(len(xyz) for xyz, _ in found) < MIN_POINTS:
+        return None
+    xyz, rgb = (np.concatenate(x) for x in zip(*found, strict=True))
+    chosen = np.sort(np.random.default_rng(0).permutation(len(xyz))[:count])
+    return PointCloud(xyz[chosen], np.rint(255 * rgb[chosen]).astype(np.uint8))
+
+
+def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
+    """Return groups of indices of views: one whose depth is looked for, then up to ``NEIGHBOURS`` to compare it with.
+
+    Those that see many of the same points, from an angle that is neither too small to tell depths apart nor too large
+    for windows to look alike; a view with fewer than ``MIN_NEIGHBOURS`` of them has no group.
+    """
+    sees = np.stack([projected(sparse, view)[1] for view in views]).astype(np.float64)
+    centers = np.stack([camera_center(view.cam_from_world) for view in views])
+    groups = []
+    for i in evenly_spaced(len(views), MAPS):
+        if not sees[i].any():
+            continue
+        sight = centers - np.median(sparse[sees[i] > 0], axis=0)
+        sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-12)
+        angle = np.degrees(np.arccos(np.clip(sight @ sight[i], -1, 1)))
+        worth = (sees @ sees[i]) * np.exp(-(((angle - BEST_ANGLE) / _ANGLE_SPREAD) ** 2))
+        worth[(angle < NEAR_ANGLE) | (angle > FAR_ANGLE)] = 0.0
+        others = [int(j) for j in np.argsort(-worth, kind="stable")[:NEIGHBOURS] if worth[j] > 0]
+        if len(others) >= MIN_NEIGHBOURS:
+            groups.append([i, *others])
+    return groups
+
+
+def _shot(loader: ImageLoader, index: int) -> _Shot:
+    image = loader[index]
+    height, width = image.rgb_premultiplied.shape[:2]
+    counts = np.ones((height, width), bool) if image.mask is None else image.mask.numpy() >= 0.5
+    if image.alpha is not None:
+        counts &= image.alpha.numpy() >= 0.5
+    rgb = image.rgb_premultiplied.clamp(0, 1)
+    pose, intrinsics = image.cameras.cam_from_world[0], image.cameras.intrinsics[0]
+    return _Shot(rgb.mean(dim=2), rgb.numpy(), counts, pose.double().numpy(), intrinsics.double().numpy())
+
+
+def _depth_range(view: View, sparse: np.ndarray) -> tuple[float, float]:
+    """Return the nearest and the farthest depth of the points (P, 3) that lie in the image, but for a few."""
+    depths = sparse[projected(sparse, view)[1]] @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+    near, far = np.percentile(depths, _RANGE)
+    return float(near), float(far)
+
+
+def _depth_map(shot: _Shot, others: Sequence[_Shot], depths: tuple[float, float]) -> np.ndarray:
+    """Return (H, W) depths; NaN where nothing correlates, at the ends of the range, and where pixels do not count."""
+    near, far = depths
+    inverse = np.linspace(1 / (_MARGIN * far), _MARGIN / near, DEPTHS)
+    score = _mean_of_best_two([_correlation(shot, other, inverse) for other in others]).numpy()
+    at = score.argmax(axis=0)
+    inner = np.clip(at, 1, DEPTHS - 2)
+    before, middle, after = (np.take_along_axis(score, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    peak = np.clip(0.5 * (before - after) / np.minimum(before - 2 * middle + after, -1e-6), -0.5, 0.5)  # of a parabola
+    depth = 1 / (inverse[0] + (inner + peak) * (inverse[1] - inverse[0]))
+    return np.where((at == inner) & (middle > MIN_CORRELATION) & shot.counts, depth, np.nan)
+
+
+def _mean_of_best_two(correlations: Sequence[Tensor]) -> Tensor:
+    best = second = torch.full_like(correlations[0], -1.0)
+    for other in correlations:
+        second = torch.maximum(second, torch.minimum(best, other))
+        best = torch.maximum(best, other)
+    return (best + second) / 2
+
+
+def _correlation(shot: _Shot, other: _Shot, inverse: np.ndarray) -> Tensor:
+    """Return (D, H, W) normalised correlations of windows of two images, by inverse depth; -1 outside the other one."""
+    relative = other.cam_from_world @ inverse_rigid(shot.cam_from_world)
+    turned = torch.from_numpy(np.moveaxis(shot.rays @ (other.intrinsics @ relative[:3, :3]).T, 2, 0).copy()).float()
+    moved = torch.from_numpy(inverse[:, None] * (other.intrinsics @ relative[:3, 3])).float()
+    x, y, z = (turned[k] + moved[:, k, None, None] for k in range(3))  # homogeneous, times the inverse depth
+    height, width = other.grey.shape
+    scale = 2 / z.clamp_min(1e-6)
+    x, y = x * (scale / width) - 1, y * (scale / height) - 1
+    images = other.grey.expand(len(inverse), 1, height, width)
+    drawn = grid_sample(images, torch.stack([x, y], dim=-1), align_corners=False)[:, 0]
+    mean, mean_drawn = _window_mean(shot.grey), _window_mean(drawn)
+    variance = _window_mean(shot.grey * shot.grey) - mean * mean
+    variance_drawn = _window_mean(drawn * drawn) - mean_drawn * mean_drawn
+    product = _window_mean(drawn * shot.grey) - mean * mean_drawn
+    correlation = product / ((variance.clamp_min(0) * variance_drawn.clamp_min(0)).sqrt() + _NOISE)
+    is_inside = (torch.maximum(x.abs(), y.abs()) < 1) & (z > 1e-6)
+    return torch.where(is_inside, pad(correlation, [WINDOW] * 4, value=-1.0), -1.0)
+
+
+def _window_mean(x: Tensor) -> Tensor:
+    """Return (..., H - 2 WINDOW, W - 2 WINDOW) means of windows; ten times as fast as avg_pool2d."""
+    size = 2 * WINDOW + 1
+    height, width = x.shape[-2] - size + 1, x.shape[-1] - size + 1
+    rows = reduce(add, (x[..., k : k + height, :] for k in range(size)))
+    return reduce(add, (rows[..., k : k + width] for k in range(size))) / size**2
+
+
+def _agreed(shot: _Shot, depth: np.ndarray, maps: Sequence[tuple[_Shot, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (P, 3) of a depth map that ``MIN_AGREEING`` others have as well, in the world, and colours."""
+    is_known = np.isfinite(depth)
+    local = (shot.rays * depth[..., None])[is_known]
+    world_from_cam = inverse_rigid(shot.cam_from_world)
+    xyz = local @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    agreeing = np.zeros(len(xyz), np.int64)
+    for other, theirs in maps:
+        if other is not shot:
+            agreeing += _agrees(xyz, other, theirs)
+    keep = agreeing >= MIN_AGREEING
+    return xyz[keep], shot.rgb[is_known][keep]
+
+
+def _agrees(xyz: np.ndarray, other: _Shot, depth: np.ndarray) -> np.ndarray:
+    """Return (P,) bool: whether the depth map of another view has the points (P, 3) about where they are."""
+    local = xyz @ other.cam_from_world[:3, :3].T + other.cam_from_world[:3, 3]
+    z = np.where(local[:, 2] > 0, local[:, 2], np.nan)
+    across, down = (local @ other.intrinsics.T)[:, :2].T / z
+    height, width = depth.shape
+    is_inside = (across >= 0) & (across < width) & (down >= 0) & (down < height)  # False for NaN
+    seen = np.full(len(xyz), np.nan)
+    seen[is_inside] = depth[down[is_inside].astype(np.int64), across[is_inside].astype(np.int64)]
+    return np.abs(seen / z - 1) < AGREEMENT

@@ -1,0 +1,49 @@
+"""Fewer samples for the networks: of those that hardly show, one in four, which stands for the others, too.
+
+R rays, M samples. A sample within an occupied cell but before or behind the surface costs as much as one that is seen,
+and says as little as its neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dyngs.ops.rays import Samples, composite, offsets_of, reached
+
+LIGHT = 5e-3  # Weight below which a sample hardly shows
+EVERY = 4  # So many of those are one
+
+
+@torch.no_grad()
+def reached_samples(densities: Tensor, samples: Samples) -> tuple[Samples, Tensor]:
+    """Return the samples (K) that light gets to, and their indices (K,) among all."""
+    through, offsets = reached(densities, samples)
+    return _chosen(samples, through, offsets)
+
+
+@torch.no_grad()
+def thinned_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tuple[Samples, Tensor]:
+    """As ``reached_samples``; of light ones each fourth is taken, four times as long around the same middle.
+
+    What rays see, and the gradients by densities, are on average those of all samples. ``shifts`` (R,) in [0, 1): which
+    of four it is, at random for each ray.
+    """
+    through, _ = reached(densities, samples)
+    weights = composite(densities, densities[:, None].expand(-1, 3).contiguous(), samples).weights
+    place = torch.arange(len(samples), device=densities.device) + (shifts * EVERY).long()[samples.rays.long()]
+    light = weights < LIGHT
+    chosen = through & (~light | (place % EVERY == 0))
+    more = light.to(densities) * ((EVERY - 1) / 2) * (samples.ends - samples.starts)
+    counts = torch.zeros(samples.num_rays, dtype=torch.int64, device=densities.device)
+    counts.index_add_(0, samples.rays.long(), chosen.long())
+    longer = replace(samples, starts=samples.starts - more, ends=samples.ends + more)
+    return _chosen(longer, chosen, offsets_of(counts))
+
+
+def _chosen(samples: Samples, chosen: Tensor, offsets: Tensor) -> tuple[Samples, Tensor]:
+    which = chosen.nonzero()[:, 0]
+    rays = samples.rays[which].long()
+    return Samples(offsets, rays, samples.starts[which], samples.ends[which], samples.coords[which]), which

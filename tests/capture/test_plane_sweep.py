@@ -1,0 +1,146 @@
+"""Dense first points by plane sweep: on a tilted, textured plane whose depth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dyngs.capture import plane_sweep
+from dyngs.capture.first_points import with_first_points
+from dyngs.capture.plane_sweep import MIN_NEIGHBOURS, NEIGHBOURS, dense_points, neighbours
+from dyngs.config import DataConfig, PointsInit
+from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.geometry import projected
+from dyngs.files.write import write_image
+
+WIDTH, HEIGHT, FOCAL, SLOPE, DISTANCE = 64, 48, 66.0, 0.3, 4.0
+INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+_ACROSS = np.linspace(-1, 1, 60)
+SPARSE = np.stack([_ACROSS, 0.6 * np.sin(9 * _ACROSS), SLOPE * _ACROSS], axis=1)  # on the plane z = SLOPE x
+
+
+def _colour(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A texture without repetition, (..., 3) in [0, 1]."""
+    waves = [np.sin(a * x + b * y + c) for a, b, c in ((9, 4, 0), (-5, 13, 1), (17, 8, 2), (7, -19, 3), (2, 3, 4))]
+    grey = 0.5 + 0.09 * np.sum(waves, axis=0)
+    return np.stack([grey, 0.8 * grey, 0.5 * grey + 0.2], axis=-1)
+
+
+def _views(folder: Path, count: int = 7, contrast: float = 1.0) -> list[View]:
+    """Cameras on an arc of 8 degrees each around the plane's middle."""
+    views = []
+    down, across = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(INTRINSICS).T
+    for i in range(count):
+        angle = np.radians(8 * (i - count // 2))
+        pose = np.eye(4)
+        pose[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+        pose[2, 3] = DISTANCE
+        center, lines = -pose[:3, :3].T @ pose[:3, 3], rays @ pose[:3, :3]
+        depth = (SLOPE * center[0] - center[2]) / (lines[..., 2] - SLOPE * lines[..., 0])
+        x, y = (center[k] + depth * lines[..., k] for k in (0, 1))
+        path = folder / f"{i}.png"
+        write_image(path, (0.5 + contrast * (_colour(x, y) - 0.5)).astype(np.float32))
+        views.append(View(path.stem, path, pose, INTRINSICS, WIDTH, HEIGHT))
+    return views
+
+
+def test_points_lie_on_the_plane_in_its_colours(tmp_path: Path) -> None:
+    views, options = _views(tmp_path), DataConfig(root=tmp_path)
+    found = dense_points(views, options, SPARSE, 100_000)
+    assert found is not None
+    assert len(found.xyz) > 0.5 * len(views) * WIDTH * HEIGHT
+    x, y, z = found.xyz.T
+    error = np.abs(z - SLOPE * x)
+    assert np.median(error) < 0.002 * DISTANCE, "depths between those that are tried are interpolated"
+    assert np.quantile(error, 0.95) < 0.02 * DISTANCE
+    assert np.abs(found.rgb / 255 - _colour(x, y)).mean() < 0.02
+    few = dense_points(views, options, SPARSE, 50)
+    assert few is not None
+    assert len(few.xyz) == 50
+
+
+def test_points_beside_the_images_do_not_say_how_deep_to_look(tmp_path: Path) -> None:
+    views, options = _views(tmp_path), DataConfig(root=tmp_path)
+    beside = np.stack([np.full(60, 50.0), _ACROSS, np.linspace(-1, 1, 60) - DISTANCE], axis=1)  # as near as cameras
+    expected, found = (dense_points(views, options, x, 1000) for x in (SPARSE, np.concatenate([SPARSE, beside])))
+    assert expected is not None
+    assert found is not None
+    assert np.array_equal(found.xyz, expected.xyz)
+
+
+def test_any_number_of_threads_finds_the_same_points(tmp_path: Path) -> None:
+    views, options, before = _views(tmp_path, 4), DataConfig(root=tmp_path), torch.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(dense_points(views, options, SPARSE, 1000))
+    finally:
+        torch.set_num_threads(before)
+    first = found[0]
+    assert first is not None
+    assert all(x is not None and np.array_equal(x.xyz, first.xyz) and np.array_equal(x.rgb, first.rgb) for x in found)
+
+
+def test_pixels_that_do_not_count_give_no_points(tmp_path: Path) -> None:
+    views, mask = _views(tmp_path), np.ones((HEIGHT, WIDTH, 1), np.float32)
+    mask[:, : WIDTH // 2] = 0
+    write_image(tmp_path / "mask.png", mask)
+    masked = [replace(view, mask_path=tmp_path / "mask.png") for view in views]
+    found = dense_points(masked, DataConfig(root=tmp_path), SPARSE, 100_000)
+    assert found is not None
+    right_half = np.stack(
+        [(at[:, 0] >= 0.5 - 1 / WIDTH) & inside for at, inside in (projected(found.xyz, v) for v in views)]
+    )
+    assert right_half.any(axis=0).all()
+
+
+@pytest.mark.parametrize("fault", ["no texture", "wrong poses", "one view", "the same view", "no points seen"])
+def test_without_evidence_there_are_no_points(tmp_path: Path, fault: str) -> None:
+    views, sparse = _views(tmp_path, contrast=0.0 if fault == "no texture" else 1.0), SPARSE
+    if fault == "wrong poses":
+        tilts = np.radians([9, -7, 4, -11, 8, -5, 10])  # about the axis across the image
+        turns = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in tilts]
+        wrong = [np.block([[turn, np.zeros((3, 1))], [np.zeros((1, 3)), np.eye(1)]]) for turn in turns]
+        views = [replace(v, cam_from_world=turn @ v.cam_from_world) for v, turn in zip(views, wrong, strict=True)]
+    elif fault == "one view":
+        views = views[:1]
+    elif fault == "the same view":
+        views = [views[0]] * 5
+    elif fault == "no points seen":
+        sparse = SPARSE - (0, 0, 100)
+    assert dense_points(views, DataConfig(root=tmp_path), sparse, 1000) is None
+
+
+def test_neighbours_see_the_same_from_a_useful_angle(tmp_path: Path) -> None:
+    views = _views(tmp_path, 9)
+    groups = neighbours(views, SPARSE)
+    assert len(groups) == 9
+    for first, *others in groups:
+        assert MIN_NEIGHBOURS <= len(others) <= NEIGHBOURS
+        # 8 and 16 degrees away are better than 24; the angle is to the points seen, not to the middle.
+        assert all(1 <= abs(first - i) <= 3 for i in others)
+        assert abs(first - others[0]) == 1 or abs(first - others[0]) == 2
+
+
+def test_dense_points_join_few_sparse_ones_of_still_captures_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, options = _views(tmp_path, 4), DataConfig(root=tmp_path)
+    points = PointCloud(SPARSE, np.full(SPARSE.shape, 128, np.uint8))
+    capture = Capture(root=tmp_path, format="colmap", splits={"train": tuple(views)}, points=points)
+    joined, lines = with_first_points(capture, options, PointsInit(dense=1000))
+    assert joined.points is not None
+    assert len(joined.points.xyz) == len(SPARSE) + 1000
+    assert np.array_equal(joined.points.xyz[: len(SPARSE)], SPARSE)
+    assert lines == ["1,000 points of depth maps were added to 60 (init.dense)"]
+    monkeypatch.setattr(plane_sweep, "MAPS", 0)  # none can be found
+    for init in (PointsInit(dense=1000), PointsInit(), PointsInit(dense=120)):
+        same, lines = with_first_points(capture, options, init)
+        assert same.points is points
+        assert not lines
