@@ -55,64 +55,30 @@ def reference_visible(points: Tensor, cameras: Cameras, near: float, segments: i
     return ids, uv, depth
 
 
-Pixel = tuple[int, int]
+def reference_blend(colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
+    """As ``blend_patches``, by its definition; what a pixel shows is a row of colours and of how much is nothing."""
+    views, height, width = places.rows.shape
+    shown = torch.cat([colours, torch.zeros_like(colours[:, :1])], 1)
+    nothing = torch.nn.functional.pad(colours.new_zeros(colours.shape[1]), (0, 1), value=1.0)
+    pixels: list[Tensor] = []
+    for view in range(views):
 
+        def at(x: int, y: int, view: int = view) -> Tensor:
+            row = int(places.rows[view, y, x])
+            return nothing if row < 0 else shown[row]
 
-class _View:
-    """One view of ``reference_blend``."""
-
-    def __init__(self, means: Tensor, places: Places, rows: list[list[int]], radius: float) -> None:
-        self.means, self.rows, self.radius, self.search = means, rows, radius, math.ceil(radius) + 1
-        self.pixels = [(x, y) for y in range(len(rows)) for x in range(len(rows[0]))]
-        self.label = {(x, y): -1 if rows[y][x] < 0 else int(places.ids[rows[y][x]]) for x, y in self.pixels}
-        self.outline = {q for q in self.pixels if any(self.label[n] != self.label[q] for n in self.around(q, 1))}
-
-    def around(self, pixel: Pixel, half: int) -> list[Pixel]:
-        steps = range(-half, half + 1)
-        return [q for q in [(pixel[0] + i, pixel[1] + j) for j in steps for i in steps] if q in self.label]
-
-    def row(self, pixel: Pixel) -> int:
-        return self.rows[pixel[1]][pixel[0]]
-
-    def centre(self, pixel: Pixel) -> Tensor:
-        return self.means.new_tensor([pixel[0] + 0.5, pixel[1] + 0.5])
-
-    def mean(self, pixel: Pixel) -> Tensor:
-        return self.centre(pixel) if self.row(pixel) < 0 else self.means[self.row(pixel)]
-
-    def counts(self, pixel: Pixel, patch: int) -> Tensor:
-        """How much a patch counts at a pixel."""
-        inside, centre = self.label[pixel] == patch, self.centre(pixel)
-        near = [q for q in self.around(pixel, self.search) if q in self.outline and self.label[q] == patch]
-        distances = [(self.mean(q) - centre).square().sum().sqrt() for q in near]
-        least = min(range(len(near)), key=lambda i: float(distances[i].detach()), default=-1)
-        if least < 0 or distances[least] >= self.radius:
-            return centre.new_tensor(float(inside))
-        distance = distances[least].detach() if distances[least] < 0.1 else distances[least]
-        half = 0.5 * 2 ** (distance / self.radius)
-        return half if inside else 1 - half
-
-
-def reference_blend(
-    means: Tensor, colours: Tensor, places: Places, sigma: float, radius: float
-) -> tuple[Tensor, Tensor]:
-    """As ``blend_patches``, by its definition."""
-    window = min(4, math.ceil(2.5 * sigma))
-    images: list[Tensor] = []
-    through: list[Tensor] = []
-    for rows in places.rows.tolist():
-        view = _View(means, places, rows, radius)
-        for pixel in view.pixels:
-            seen, behind, total = colours.new_zeros(colours.shape[1]), means.new_zeros(()), means.new_zeros(())
-            for q in view.around(pixel, window):
-                value = (-0.5 * (view.mean(q) - view.centre(pixel)).square().sum() / sigma**2).exp()
-                weight = value * view.counts(pixel, view.label[q])
-                total = total + weight
-                if view.row(q) < 0:
-                    behind = behind + weight
-                else:
-                    seen = seen + weight * colours[view.row(q)]
-            images.append(seen / total)
-            through.append(behind / total)
-    shape = places.rows.shape
-    return torch.stack(images).view(*shape, -1), torch.stack(through).view(shape)
+        for y in range(height):
+            for x in range(width):
+                shares: list[tuple[Tensor, Tensor]] = []
+                for axis, (dx, dy) in enumerate(((1, 0), (0, 1))):
+                    if x + dx < width and y + dy < height:
+                        covered = (0.5 - crossings[view, axis, y, x]).clamp_min(0)
+                        shares.append((covered, at(x + dx, y + dy)))
+                    if x >= dx and y >= dy:
+                        covered = (crossings[view, axis, y - dy, x - dx] - 0.5).clamp_min(0)
+                        shares.append((covered, at(x - dx, y - dy)))
+                total = sum((share for share, _ in shares), colours.new_zeros(()))
+                mixed = (1 - total).clamp_min(0) * at(x, y) + sum((share * c for share, c in shares), nothing * 0)
+                pixels.append(mixed / total.clamp_min(1))
+    image = torch.stack(pixels).view(views, height, width, -1)
+    return image[..., :-1], image[..., -1]

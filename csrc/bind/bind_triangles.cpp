@@ -1,5 +1,4 @@
-// Python bindings of Bezier patches. Argument unpacking only, and indices checked. For the CPU alone.
-#if !defined(DYNGS_GPU)
+// Python bindings of Bezier patches. Argument unpacking only, and indices checked where they can be read.
 #include "bind/arrays.hpp"
 #include "core/triangles.hpp"
 
@@ -8,7 +7,7 @@ namespace {
 
 // Checks that all indices are in [lowest, end).
 void require_indices(const int32_t* indices, int64_t count, int64_t lowest, int64_t end, const char* message) {
-  for (int64_t i = 0; i < count; ++i) {
+  for (int64_t i = 0; !kOnGpu && i < count; ++i) {
     if (indices[i] < lowest || indices[i] >= end) throw nb::value_error(message);
   }
 }
@@ -67,56 +66,73 @@ void visible(Array<const S> points, Array<const S> viewmats, Array<const S> intr
   visible_patches(in, out);
 }
 
-// Standard deviation and radius, px.
-using BlendSizes = std::tuple<double, double>;
+using Indices = Array<const int32_t>;
 
 template <class S>
-PatchImage<S> patch_image(const Rows<const S>& means, const Rows<const S>& colours, const Values<const int32_t>& rows,
-                          const Array<const int32_t>& ids, const BlendSizes& sizes, int threads) {
-  const auto [sigma, radius] = sizes;
-  if (!(sigma > 0) || !(radius > 0) || radius > 8) throw nb::value_error("patches: sigma or radius");
+void ends(Array<const S> points, Array<const S> viewmats, Array<const S> intrinsics, Rows<const S> uv,
+          const std::tuple<Indices, Indices, Indices>& from, Array<bool> found,
+          const std::tuple<Array<S>, Rows<S>, Rows<S>>& out, int threads) {
+  const auto& [views, ids, directions] = from;
+  const int64_t count = uv.shape(0), patches = static_cast<int64_t>(points.size()) / (3 * kPatchPoints);
+  const int64_t cameras = static_cast<int64_t>(viewmats.size()) / 16;
+  PatchSteps<S> in{};
+  in.points = checked(points, 3 * kPatchPoints * patches, "patches: points");
+  in.viewmats = checked(viewmats, 16 * cameras, "patches: cameras");
+  in.intrinsics = checked(intrinsics, 9 * cameras, "patches: cameras");
+  in.views = checked(views, count, "patches: views"), in.ids = checked(ids, count, "patches: ids");
+  in.directions = checked(directions, count, "patches: directions");
+  in.uv = checked(uv, count, 2, "patches: places"), in.count = count, in.threads = threads;
+  require_indices(in.views, count, 0, cameras, "patches: a view that is not there");
+  require_indices(in.ids, count, -1, patches, "patches: an index that no patch has");
+  require_indices(in.directions, count, 0, kDirections, "patches: no such direction");
+  const auto& [steps, places, slopes] = out;
+  const PatchEnds<S> to{checked(found, count, "patches: ends"), checked(steps, count, "patches: ends"),
+                        checked(places, count, 2, "patches: ends"), checked(slopes, count, 2, "patches: ends")};
+  nb::gil_scoped_release release;
+  patch_ends(in, to);
+}
+
+template <class S>
+PatchImage<S> patch_image(const Rows<const S>& colours, const Array<const S>& crossings,
+                          const Values<const int32_t>& rows, const Indices& ids, int threads) {
   PatchImage<S> in{};
   in.count = ids.size(), in.views = rows.shape(0);
   in.height = static_cast<int>(rows.shape(1)), in.width = static_cast<int>(rows.shape(2));
   in.channels = static_cast<int>(colours.shape(1));
-  if (in.channels > kMostPatchChannels) throw nb::value_error("patches: too many channels");
   in.rows = rows.data(), in.ids = ids.data();
-  in.means = checked(means, in.count, 2, "patches: means");
   in.colours = checked(colours, in.count, in.channels, "patches: colours");
-  in.sigma = static_cast<S>(sigma), in.radius = static_cast<S>(radius), in.threads = threads;
+  in.crossings = checked(crossings, 2 * static_cast<int64_t>(rows.size()), "patches: crossings");
+  in.threads = threads;
   require_indices(in.rows, rows.size(), -1, in.count, "patches: a row that is not there");
   return in;
 }
 
 template <class S>
-void blend_forward(Rows<const S> means, Rows<const S> colours, Values<const int32_t> rows, Array<const int32_t> ids,
-                   const BlendSizes& sizes, const std::tuple<Array<S>, Array<S>, Array<S>>& out, int threads) {
-  const PatchImage<S> in = patch_image<S>(means, colours, rows, ids, sizes, threads);
-  const auto& [image, transmittance, sums] = out;
+void blend_forward(Rows<const S> colours, Array<const S> crossings, Values<const int32_t> rows, Indices ids,
+                   const std::tuple<Array<S>, Array<S>>& out, int threads) {
+  const PatchImage<S> in = patch_image<S>(colours, crossings, rows, ids, threads);
+  const auto& [image, transmittance] = out;
   const auto pixels = static_cast<int64_t>(rows.size());
   const BlendedPatches<S> to{checked(image, pixels * in.channels, "patches: image"),
-                             checked(transmittance, pixels, "patches: image"), checked(sums, pixels, "patches: image")};
+                             checked(transmittance, pixels, "patches: image")};
   nb::gil_scoped_release release;
   blend_patches_forward(in, to);
 }
 
 template <class S>
-void blend_backward(Rows<const S> means, Rows<const S> colours, Values<const int32_t> rows, Array<const int32_t> ids,
-                    const BlendSizes& sizes, const std::tuple<Array<const S>, Array<const S>, Array<const S>>& out,
-                    const std::tuple<Array<const S>, Array<const S>>& grads, Rows<S> g_means, Rows<S> g_colours,
-                    int threads) {
-  const PatchImage<S> in = patch_image<S>(means, colours, rows, ids, sizes, threads);
-  const auto& [image, transmittance, sums] = out;
+void blend_backward(Rows<const S> colours, Array<const S> crossings, Values<const int32_t> rows, Indices ids,
+                    const std::tuple<Array<const S>, Array<const S>>& grads,
+                    const std::tuple<Rows<S>, Rows<S>, Array<S>>& out, int threads) {
+  const PatchImage<S> in = patch_image<S>(colours, crossings, rows, ids, threads);
   const auto pixels = static_cast<int64_t>(rows.size());
-  const BlendedPatches<const S> from{checked(image, pixels * in.channels, "patches: image"),
-                                     checked(transmittance, pixels, "patches: image"),
-                                     checked(sums, pixels, "patches: image")};
-  const S* g_image = checked(std::get<0>(grads), pixels * in.channels, "patches: gradient");
-  const S* g_transmittance = checked(std::get<1>(grads), pixels, "patches: gradient");
-  S* by_means = checked(g_means, in.count, 2, "patches: gradient");
-  S* by_colours = checked(g_colours, in.count, in.channels, "patches: gradient");
+  const BlendedPatches<const S> from{checked(std::get<0>(grads), pixels * in.channels, "patches: gradient"),
+                                     checked(std::get<1>(grads), pixels, "patches: gradient")};
+  const auto& [means, by_colours, by_crossings] = out;
+  const PatchGrads<S> to{checked(means, in.count, 2, "patches: gradient"),
+                         checked(by_colours, in.count, in.channels, "patches: gradient"),
+                         checked(by_crossings, 2 * pixels, "patches: gradient")};
   nb::gil_scoped_release release;
-  blend_patches_backward(in, from, g_image, g_transmittance, by_means, by_colours);
+  blend_patches_backward(in, from, to);
 }
 
 template <class S>
@@ -127,10 +143,12 @@ void bind_scalar(nb::module_& module) {
              array("g_values"), nb::arg("threads"));
   module.def("visible_patches", visible<S>, array("points"), array("viewmats"), array("intrinsics"),
              nb::arg("segments"), nb::arg("near"), array("ids"), array("uv"), nb::arg("threads"));
-  module.def("blend_patches_forward", blend_forward<S>, array("means"), array("colours"), array("rows"), array("ids"),
-             nb::arg("sizes"), array("out"), nb::arg("threads"));
-  module.def("blend_patches_backward", blend_backward<S>, array("means"), array("colours"), array("rows"), array("ids"),
-             nb::arg("sizes"), array("out"), array("grads"), array("g_means"), array("g_colours"), nb::arg("threads"));
+  module.def("patch_ends", ends<S>, array("points"), array("viewmats"), array("intrinsics"), array("uv"),
+             array("from"), array("found"), array("out"), nb::arg("threads"));
+  module.def("blend_patches_forward", blend_forward<S>, array("colours"), array("crossings"), array("rows"),
+             array("ids"), array("out"), nb::arg("threads"));
+  module.def("blend_patches_backward", blend_backward<S>, array("colours"), array("crossings"), array("rows"),
+             array("ids"), array("grads"), array("out"), nb::arg("threads"));
 }
 
 }  // namespace
@@ -140,4 +158,3 @@ void bind_triangles(nb::module_& module) {
 }
 
 }  // namespace dyngs
-#endif

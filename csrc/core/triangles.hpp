@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#include "math/bezier.hpp"
+#include "math/outline.hpp"
 
 namespace dyngs {
 
@@ -34,7 +34,7 @@ struct PatchViews {
   const S* intrinsics;  // (V, 3, 3) px
   int64_t patches, views;
   int width, height;
-  int segments;  // n: a patch is drawn as n^2 flat faces
+  int segments;  // n: a patch is drawn as n^2 flat faces, or as fewer where these are as good
   S near;        // what is nearer is not drawn
   int threads;
 };
@@ -49,17 +49,40 @@ struct VisiblePatches {
 template <class S>
 void visible_patches(const PatchViews<S>& in, const VisiblePatches<S>& out);
 
+// N places on patches from where outlines are looked for.
+template <class S>
+struct PatchSteps {
+  const S* points;            // (P, 6, 3) control points, world
+  const S* viewmats;          // (V, 4, 4) cam_from_world
+  const S* intrinsics;        // (V, 3, 3) px
+  const int32_t* views;       // (N,) in [0, V)
+  const int32_t* ids;         // (N,) in [0, P), -1: no patch
+  const int32_t* directions;  // (N,) to the next pixel, math/outline.hpp
+  const S* uv;                // (N, 2)
+  int64_t count;              // N
+  int threads;
+};
+
+template <class S>
+struct PatchEnds {
+  bool* found;  // (N,) whether the patch ends before the next pixel; the rest is 0 where not
+  S* steps;     // (N,) where, in [0, 1] of the way there
+  S* uv;        // (N, 2) the place on its edge
+  S* slopes;    // (N, 2) change of the steps by the mean of that place, px
+};
+
+template <class S>
+void patch_ends(const PatchSteps<S>& in, const PatchEnds<S>& out);
+
 template <class S>
 struct PatchImage {
   const int32_t* rows;  // (V, H, W) row of what each pixel shows, -1: nothing
   const int32_t* ids;   // (N,) its patch
-  const S* means;       // (N, 2) px
   const S* colours;     // (N, C)
+  const S* crossings;   // (V, 2, H, W) where between a pixel and the next in its row, in its column, their outline is
   int64_t views;
   int64_t count;  // N
   int width, height, channels;
-  S sigma;   // of the Gaussians, px
-  S radius;  // of outlines, px
   int threads;
 };
 
@@ -69,17 +92,23 @@ template <class S>
 struct BlendedPatches {
   S* image;          // (V, H, W, C), before black
   S* transmittance;  // (V, H, W)
-  S* sums;           // (V, H, W) of the weights, for the vjp
 };
 
-// Each pixel is the mean of the Gaussians of the pixels around it, weighted by their value there and by how much their patch
-// counts there (math/outline.hpp). A pixel that shows nothing has a Gaussian of the background at its centre.
+template <class S>
+struct PatchGrads {
+  S* means;      // (N, 2) px
+  S* colours;    // (N, C)
+  S* crossings;  // (V, 2, H, W)
+};
+
+// Each pixel is the mean of what it shows and of what the four next to it show, by how much each covers of it
+// (math/outline.hpp).
 template <class S>
 void blend_patches_forward(const PatchImage<S>& in, const BlendedPatches<S>& out);
 
-// Gradients by means (N, 2) and colours (N, C) from those by image and transmittance.
+// Gradients from those by image and transmittance. The means of the places are at the pixels' centres; their gradient is that of
+// moving colours along, by differences of neighbours on the same patch.
 template <class S>
-void blend_patches_backward(const PatchImage<S>& in, const BlendedPatches<const S>& out, const S* g_image,
-                            const S* g_transmittance, S* g_means, S* g_colours);
+void blend_patches_backward(const PatchImage<S>& in, const BlendedPatches<const S>& grads, const PatchGrads<S>& out);
 
 }  // namespace dyngs

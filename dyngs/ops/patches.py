@@ -1,9 +1,9 @@
 """Quadratic triangular Bezier patches: values at places on them, which of them images show, and images of these.
 
 P patches, N places, V views. A place is (u, v), w = 1 - u - v; control points (i, j, k), i + j + k = 2, belong to
-u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The blending is that of BG-Triangle (Wu
-et al. 2025) but for one thing: weights of patches at a pixel are normalised to one, because what a z-buffer shows does
-not overlap; composited over each other, two halves on either side of an edge would let light through.
+u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The boundary-aware weights of BG-Triangle
+(Wu et al. 2025), 1 inside, a half at an outline, 0 outside, are those of pixels here, not of Gaussians on them: between
+two neighbours that show different patches lies an outline, whose place says how much of each the other one covers.
 """
 
 from __future__ import annotations
@@ -22,9 +22,8 @@ from dyngs.ops.registration import Gradient, empty_like, launch, register
 
 NUM_POINTS = 6  # of a quadratic patch
 SEGMENTS = 6  # Of an edge: 36 flat faces (Wu et al. 2025)
-SIGMA = 0.7  # Standard deviation of the Gaussians, px
-RADIUS = 2.0  # Of outlines, px
-MOST_SEGMENTS, MOST_CHANNELS, MOST_RADIUS = 64, 8, 8.0
+MOST_SEGMENTS = 64
+NO_CROSSING = 0.5  # Between pixels neither of which covers any of the other
 
 Along = Literal["u", "v"]
 _BASES: dict[Along | None, int] = {None: 0, "u": -1, "v": -2}
@@ -64,7 +63,7 @@ def _values_backward(like: Tensor, ids: Tensor, uv: Tensor, grad: Tensor, basis:
     return g_values
 
 
-values_backward_op = register("patch_values_backward", _values_backward, devices=("cpu",))
+values_backward_op = register("patch_values_backward", _values_backward)
 
 
 def _save_values(ctx: Any, inputs: tuple[Any, ...], _: Tensor) -> None:
@@ -77,7 +76,7 @@ def _values_gradient(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     return values_backward_op(values, ids, uv, grad.contiguous(), ctx.basis), None, None, None
 
 
-values_op = register("patch_values", _values, devices=("cpu",), gradient=Gradient(_save_values, _values_gradient))
+values_op = register("patch_values", _values, gradient=Gradient(_save_values, _values_gradient))
 
 
 def patch_values(values: Tensor, ids: Tensor, uv: Tensor, along: Along | None = None) -> Tensor:
@@ -132,42 +131,46 @@ def visible_patches(points: Tensor, cameras: Cameras, near: float, segments: int
     return ids, uv
 
 
-def _blend(
-    means: Tensor, colours: Tensor, rows: Tensor, ids: Tensor, sigma: float, radius: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    image = colours.new_empty(*rows.shape, colours.shape[1])
-    out = image, colours.new_empty(rows.shape), colours.new_empty(rows.shape)
-    launch(means, "blend_patches_forward", means, colours, rows, ids, (sigma, radius), out, num_threads())
+def _ends(
+    points: Tensor, cameras: list[Tensor], views: Tensor, ids: Tensor, uv: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    found = torch.empty(ids.shape, dtype=torch.bool, device=ids.device)
+    out = uv.new_empty(ids.shape), torch.empty_like(uv), torch.empty_like(uv)
+    launch(points, "patch_ends", points, *cameras, uv, (views, ids, directions), found, out, num_threads())
+    return found, *out
+
+
+ends_op = register("patch_ends", _ends)
+"""Whether and where patches end between places on them and the next pixels; ``cameras``: poses and intrinsics."""
+
+
+def _blend(means: Tensor, colours: Tensor, crossings: Tensor, rows: Tensor, ids: Tensor) -> tuple[Tensor, Tensor]:
+    out = colours.new_empty(*rows.shape, colours.shape[1]), colours.new_empty(rows.shape)
+    launch(colours, "blend_patches_forward", colours, crossings, rows, ids, out, num_threads())
     return out
 
 
-def _blend_backward(
-    inputs: list[Tensor], outputs: list[Tensor], grads: list[Tensor], sigma: float, radius: float
-) -> tuple[Tensor, Tensor]:
-    g_means, g_colours = empty_like(inputs[0]), empty_like(inputs[1])
-    sizes, given = (sigma, radius), (tuple(outputs), tuple(grads))
-    launch(inputs[0], "blend_patches_backward", *inputs, sizes, *given, g_means, g_colours, num_threads())
-    return g_means, g_colours
+def _blend_backward(inputs: list[Tensor], grads: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    colours, crossings, rows, ids = inputs
+    out = colours.new_empty(len(colours), 2), empty_like(colours), empty_like(crossings)
+    launch(colours, "blend_patches_backward", colours, crossings, rows, ids, tuple(grads), out, num_threads())
+    return out
 
 
-blend_backward_op = register("blend_patches_backward", _blend_backward, devices=("cpu",))
-"""Gradients by means and colours; ``inputs`` are the first four of ``blend_patches``."""
+blend_backward_op = register("blend_patches_backward", _blend_backward)
+"""Gradients by means, colours and crossings; ``inputs`` are the last four of ``blend_patches``."""
 
 
-def _save_blend(ctx: Any, inputs: tuple[Any, ...], outputs: tuple[Tensor, ...]) -> None:
-    *tensors, ctx.sigma, ctx.radius = inputs
-    ctx.mark_non_differentiable(outputs[2])
-    ctx.save_for_backward(*tensors, *outputs)
+def _save_blend(ctx: Any, inputs: tuple[Any, ...], _: tuple[Tensor, ...]) -> None:
+    ctx.save_for_backward(*inputs[1:])
 
 
-def _blend_gradient(ctx: Any, image: Tensor, transmittance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-    saved = list(ctx.saved_tensors)
+def _blend_gradient(ctx: Any, image: Tensor, transmittance: Tensor) -> tuple[Tensor | None, ...]:
     grads = [image.contiguous(), transmittance.contiguous()]
-    by_means, by_colours = blend_backward_op(saved[:4], saved[4:], grads, ctx.sigma, ctx.radius)
-    return by_means, by_colours, None, None, None, None
+    return *blend_backward_op(list(ctx.saved_tensors), grads), None, None
 
 
-blend_op = register("blend_patches", _blend, devices=("cpu",), gradient=Gradient(_save_blend, _blend_gradient))
+blend_op = register("blend_patches", _blend, gradient=Gradient(_save_blend, _blend_gradient))
 
 
 @dataclass(frozen=True)
@@ -186,27 +189,92 @@ class Places:
         return Places(rows, ids[shown], uv[shown])
 
 
-def blend_patches(
-    means: Tensor, colours: Tensor, places: Places, sigma: float = SIGMA, radius: float = RADIUS
-) -> tuple[Tensor, Tensor]:
-    """Return (V, H, W, C) images before black and (V, H, W) transmittance, differentiable once in means and colours.
+@dataclass(frozen=True)
+class Projected:
+    """Points of patches in an image, differentiable."""
 
-    There is one isotropic Gaussian per pixel that shows something. A pixel is the mean of the Gaussians around it,
-    weighted by their value there and by how much their patch counts there: 1 inside, a half at its outline, 0 outside,
-    within ``radius`` of its nearest outline. Outlines are pixels next to one of another patch, or of none. Gradients
-    reach the outlines' means. The same bits on any number of threads.
+    means: Tensor  # (N, 2) px
+    depths: Tensor  # (N,)
+
+
+def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> Projected:
+    """Return where ``points`` (N, 3) of the world are in the images of ``views`` (N,)."""
+    which = slice(0, 1) if len(cameras) == 1 else views
+    pose, inner = cameras.cam_from_world[which], cameras.intrinsics[which]
+    local = points @ pose[0, :3, :3].T if len(cameras) == 1 else (pose[:, :3, :3] * points[:, None]).sum(2)
+    x, y, z = (local + pose[:, :3, 3]).unbind(1)
+    across, down = inner[:, 0, 0] * x / z + inner[:, 0, 2], inner[:, 1, 1] * y / z + inner[:, 1, 2]
+    return Projected(torch.stack([across, down], 1), z)
+
+
+def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tensor:
+    """Return (V, 2, H, W): how far from a pixel's centre to the next in its row, in its column, their outline is.
+
+    ``NO_CROSSING`` where both show the same patch, or none of theirs ends in between: then what shows is a fold. Where
+    both end there it is the middle of the two ends. Differentiable in ``points`` (P, 6, 3).
+    """
+    shape = places.rows.shape
+    out = points.new_full((shape[0], 2, *shape[1:]), NO_CROSSING)
+    first, second, to, axis = _differing(places)
+    directions = torch.cat([2 * axis, 2 * axis + 1]).to(torch.int32)
+    rows = torch.cat([first, second])
+    at = places.rows.view(-1)[rows].long()
+    ids = torch.where(at >= 0, places.ids[at.clamp_min(0)], -1) if len(places.ids) else at.to(torch.int32)
+    if not len(places.ids):
+        return out
+    views = (rows // (shape[1] * shape[2])).to(torch.int32)
+    given = [cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()]
+    found, steps, uv, slopes = ends_op(
+        points.detach().contiguous(), given, views, ids, places.uv[at.clamp_min(0)].contiguous(), directions
+    )
+    ending = found.nonzero()[:, 0]
+    edges = patch_values(points, ids[ending], uv[ending])
+    means = project_points(edges, cameras, views[ending].long()).means
+    moved = steps[ending] + ((means - means.detach()) * slopes[ending]).sum(1)
+    a, b = steps.index_put((ending,), moved).view(2, -1)
+    of_a, of_b = found.view(2, -1)
+    middle = torch.where(of_b, 0.5 * (a + 1 - b), a)
+    crossing = torch.where(of_a, middle, torch.where(of_b, 1 - b, NO_CROSSING))
+    return out.view(-1).index_put((to,), crossing).view_as(out)
+
+
+def _differing(places: Places) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return indices of pixels that show another patch than the next one, of that one, and of the crossing; the axis."""
+    rows = places.rows
+    shown = places.ids[rows.clamp_min(0).long()] if len(places.ids) else rows
+    labels = torch.where(rows >= 0, shown, -1)
+    _, height, width = labels.shape
+    found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    for axis, stride in ((0, 1), (1, width)):
+        differs = torch.zeros(labels.shape, dtype=torch.bool, device=labels.device)
+        if axis == 0:
+            differs[:, :, :-1] = labels[:, :, 1:] != labels[:, :, :-1]
+        else:
+            differs[:, :-1] = labels[:, 1:] != labels[:, :-1]
+        first = differs.view(-1).nonzero()[:, 0]
+        to = first + (first // (height * width) + axis) * (height * width)
+        found.append((first, first + stride, to, torch.full_like(first, axis)))
+    one, other = found
+    return tuple(torch.cat(pair) for pair in zip(one, other, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def blend_patches(means: Tensor, colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
+    """Return (V, H, W, C) images before black and (V, H, W) transmittance, differentiable once.
+
+    A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel and the next one, by
+    ``crossings`` t steps apart from the first, max(0, 1/2 - t) of the first are the second's, and max(0, t - 1/2) of the
+    second the first's. Where neighbours would cover more than all of a pixel their shares are scaled to it. The same
+    bits on any number of threads.
 
     Args:
-        means: (N, 2) px, in the image that shows each place.
-        colours: (N, C), C up to 8.
-        sigma: standard deviation of the Gaussians, px.
+        means: (N, 2) px, of the places, which are at the centres of their pixels: not read. Their gradient is that of
+            moving what a patch shows along the image, by differences of neighbours on the same patch.
+        colours: (N, C).
+        crossings: (V, 2, H, W), see ``outline_crossings``.
     """
-    count = len(places.ids)
-    check_tensors("patches", {"means": (means, (count, 2)), "colours": (colours, (count, colours.shape[-1]))})
-    check_number("sigma", sigma, 1e-3, MOST_RADIUS)
-    check_number("radius", radius, 1e-3, MOST_RADIUS)
-    if means.dtype != colours.dtype or colours.shape[1] > MOST_CHANNELS:
-        raise DyngsError(f"patches: means and colours of one dtype, and at most {MOST_CHANNELS} channels")
-    given = means.contiguous(), colours.contiguous(), places.rows, places.ids
-    image, transmittance, _ = blend_op(*given, sigma, radius)
-    return image, transmittance
+    count, (views, height, width) = len(places.ids), places.rows.shape
+    checked = {"means": (means, (count, 2)), "colours": (colours, (count, colours.shape[-1]))}
+    check_tensors("patches", checked | {"crossings": (crossings, (views, 2, height, width))})
+    if not means.dtype == colours.dtype == crossings.dtype:
+        raise DyngsError("patches: means, colours and crossings of one dtype")
+    return blend_op(means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids)

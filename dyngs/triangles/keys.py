@@ -20,6 +20,12 @@ class BgTriangleModel(ModelSection):
     )
     max_triangles: int = Field(default=4000, ge=4, le=1_000_000, description="most triangles that a run ends with")
     num_first: int = Field(default=1000, ge=1, le=1_000_000, description="most triangles that it begins with")
+    gaussian_steps: int = Field(
+        default=800,
+        ge=0,
+        le=100_000,
+        description="steps of Gaussians whose surface triangles begin on; 0: they begin at the first points",
+    )
     sh_degree: int = Field(
         default=2, ge=0, le=4, description="degree of the harmonics that a triangle's colours share; 0: none"
     )
@@ -36,7 +42,6 @@ class BgTriangleModel(ModelSection):
         default=6, ge=1, le=16, description="segments of an edge: a triangle is drawn as their square"
     )
     supersampling: int = Field(default=2, ge=1, le=4, description="pixels are drawn as the mean of its square")
-    outline: float = Field(default=2.0, ge=0.5, le=8, description="radius within which outlines are soft, drawn px")
     lr_position: Positive = Field(
         default=1.6e-3, le=1, description="learning rate of control points at first, in half sides of the scene"
     )

@@ -1,4 +1,4 @@
-"""Curved triangles as something to draw: a z-buffer, and a Gaussian per pixel of what it shows."""
+"""Curved triangles as something to draw: a z-buffer whose edges are blended where they are."""
 
 from __future__ import annotations
 
@@ -15,7 +15,15 @@ from dyngs.conventions import SH_C0
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
 from dyngs.ops.harmonics import evaluate_harmonics
-from dyngs.ops.patches import RADIUS, SEGMENTS, Places, blend_patches, patch_values, visible_patches
+from dyngs.ops.patches import (
+    SEGMENTS,
+    Places,
+    blend_patches,
+    outline_crossings,
+    patch_values,
+    project_points,
+    visible_patches,
+)
 from dyngs.state import Role, State, StateTensor, prefixed
 from dyngs.tensor_checks import require_positive, require_tensor
 from dyngs.triangles.keys import BgTriangleModel
@@ -31,7 +39,6 @@ class TriangleOptions(DrawOptions):
 
     segments: int = SEGMENTS  # of an edge: a triangle is drawn as their square
     supersampling: int = 1  # a pixel is the mean of its square
-    outline: float = RADIUS  # radius within which outlines are soft, drawn px
 
 
 @dataclass(frozen=True)
@@ -89,13 +96,15 @@ class TriangleScene(Renderable):
         camera = camera.to(device=self.device)
         fine = camera.scaled(times)
         places = Places.of(*visible_patches(patches.points.detach(), fine, options.near, options.segments))
-        at = patch_values(patches.points, places.ids, places.uv)
-        means, z = _projected(at, fine)
+        at = project_points(patch_values(patches.points, places.ids, places.uv), fine, torch.zeros_like(places.ids))
         colours = patches.colours_at(places.ids, places.uv)
         if patches.harmonics.shape[1]:
             colours = colours + self._by_direction(camera)[places.ids.long()]
-        channels = torch.cat([colours.clamp_min(0), z[:, None]], 1) if options.depth != "none" else colours.clamp_min(0)
-        image, through = blend_patches(means, channels, places, radius=options.outline)
+        channels = colours.clamp_min(0)
+        if options.depth != "none":
+            channels = torch.cat([channels, at.depths[:, None]], 1)
+        crossings = outline_crossings(patches.points, fine, places)
+        image, through = blend_patches(at.means, channels, crossings, places)
         image, through = image[0], through[0]
         if times > 1:
             image = avg_pool2d(image.permute(2, 0, 1)[None], times)[0].permute(1, 2, 0)
@@ -125,21 +134,12 @@ def rendering_of(views: list[View], background: Tensor | None, options: Triangle
     return Rendering(rgb, through, depth)
 
 
-def _projected(points: Tensor, camera: Cameras) -> tuple[Tensor, Tensor]:
-    """Return (N, 2) px and (N,) z of ``points`` (N, 3) of the world."""
-    pose, inner = camera.cam_from_world[0], camera.intrinsics[0]
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    x, y, z = local.unbind(1)
-    return torch.stack([inner[0, 0] * x / z + inner[0, 2], inner[1, 1] * y / z + inner[1, 2]], 1), z
-
-
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     """Return how triangles of a scene of half side ``unit`` are drawn."""
     return TriangleOptions(
         near=model.near * unit,
         segments=model.segments,
         supersampling=model.supersampling,
-        outline=model.outline,
     )
 
 

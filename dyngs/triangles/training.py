@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -29,11 +29,17 @@ HARMONICS_SLOWER = 20.0  # than colours
 LAST_COLOUR = 0.1  # Of their learning rate, at the end of each stage
 
 
+First = Callable[[RunStart, BgTriangleModel], tuple[Patches, float]]
+"""What the first step begins with, in place of what was there before: triangles, and half the side of their scene."""
+
+
 class TriangleTraining(Model[TriangleScene]):
     """See the module."""
 
-    def __init__(self, run: RunStart, patches: Patches, unit: float, model: BgTriangleModel) -> None:
-        self._run, self._model, self._unit = run, model, unit
+    def __init__(
+        self, run: RunStart, patches: Patches, unit: float, model: BgTriangleModel, first: First | None = None
+    ) -> None:
+        self._run, self._model, self._unit, self._first = run, model, unit, first
         options = scene_options(model, unit)
         behind = evaluation_background(run.config.data.background, run.capture.has_alpha)[1]
         self._like = TriangleScene(patches, unit, options, behind)
@@ -61,7 +67,21 @@ class TriangleTraining(Model[TriangleScene]):
         """Whether textures are learned, and places no more."""
         return self._patches.texture > 0
 
+    def _begin_on_surface(self) -> None:
+        """Go on with what the first step begins with."""
+        if self._first is None:
+            return
+        patches, unit = self._first(self._run, self._model)
+        self._first = None
+        self._set_unit(unit)
+        self._begin(patches)
+
+    def _set_unit(self, unit: float) -> None:
+        self._unit = unit
+        self._like = replace(self._like, unit=unit, options=scene_options(self._model, unit))
+
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+        self._begin_on_surface()
         options = replace(self._like.options, depth="expected" if depth else "none")
         view = self.scene.view(image.cameras, options)
         if not self.is_textured:
@@ -137,8 +157,8 @@ class TriangleTraining(Model[TriangleScene]):
 
     def restore(self, checkpoint: Checkpoint) -> None:
         patches, unit = stored_triangles(checkpoint)
-        self._unit = unit
-        self._like = replace(self._like, unit=unit, options=scene_options(self._model, unit))
+        self._first = None
+        self._set_unit(unit)
         self._take(patches)
         self._adam = AdamState.restored(checkpoint.part("adam"), self._patches.tensors)
         self._tallies = Tallies.restored(checkpoint.part("tallies"), len(patches))

@@ -1,0 +1,147 @@
+"""Depths of several views as one surface, and that as few triangles.
+
+Signed distances along the rays are averaged on a grid (Curless and Levoy 1996), the surface is where they change their
+sign (marching cubes, Lorensen and Cline 1987), and its vertices are joined, cell by cell of a coarser grid, where the
+planes of their faces meet (Lindstrom 2000).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+
+BEHIND = 3.0  # Cells behind a surface that still count as seen
+OPAQUE = 0.5  # Of a pixel that shows a surface
+TRIALS = 24  # Sizes of cells that are tried for a number of triangles
+STIFFNESS = 0.02  # Of a vertex towards the mean of those joined, where planes do not say where they meet
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one camera sees."""
+
+    camera: Cameras
+    depth: Tensor  # (H, W) z
+    opacity: Tensor  # (H, W)
+    colour: Tensor  # (H, W, 3)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Flat triangles."""
+
+    vertices: np.ndarray  # (V, 3)
+    faces: np.ndarray  # (F, 3)
+
+
+def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int) -> Mesh | None:
+    """Return the surface in the box from ``low`` to ``high`` (3,); None where there is none.
+
+    Args:
+        cells: along the longest side of the box.
+    """
+    from skimage.measure import marching_cubes
+
+    size = float((high - low).max()) / cells
+    counts = ((high - low) / size).ceil().long() + 1
+    axes = [low[i] + size * torch.arange(int(counts[i]), device="cpu") for i in range(3)]
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
+    total, weight = torch.zeros(len(points), device="cpu"), torch.zeros(len(points), device="cpu")
+    for one in seen:
+        distance, counted = _distances(one, points, size)
+        total += torch.where(counted, distance, 0.0)
+        weight += counted
+    grid = torch.where(weight > 0, total / weight.clamp_min(1), -1.0).view(tuple(counts.tolist())).numpy()
+    if not grid.min() < 0 < grid.max():
+        return None
+    vertices, faces, _, _ = marching_cubes(grid, 0.0)
+    return Mesh(vertices * size + low.numpy(), faces)
+
+
+def _distances(one: Seen, points: Tensor, size: float) -> tuple[Tensor, Tensor]:
+    """Return (N,) signed distances before what a view shows, in cells, at most 1, and (N,) bool, where that counts."""
+    column, row, z, inside = _pixels(one.camera, points)
+    opaque = one.opacity[row, column] > OPAQUE
+    before = torch.where(opaque, (one.depth[row, column] - z) / (BEHIND * size), 1.0).clamp(max=1.0)
+    return before, inside & (before > -1)
+
+
+def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return columns, rows, and z of ``points`` (N, 3), and which of them lie in the image; others have pixel 0."""
+    pose, inner = camera.cam_from_world[0], camera.intrinsics[0]
+    x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+    safe = z.clamp_min(1e-6)
+    column = (inner[0, 0] * x / safe + inner[0, 2]).floor()
+    row = (inner[1, 1] * y / safe + inner[1, 2]).floor()
+    inside = (z > 1e-6) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return torch.where(inside, column, 0).long(), torch.where(inside, row, 0).long(), z, inside
+
+
+def colours_of(seen: Sequence[Seen], points: Tensor, tolerance: float) -> Tensor:
+    """Return (N, 3) mean colours of surface ``points`` (N, 3) in the views that show them; grey where none does.
+
+    Args:
+        tolerance: how far behind what a view shows a point may be, world units.
+    """
+    total, weight = torch.full((len(points), 3), 5e-4, device="cpu"), torch.full((len(points), 1), 1e-3, device="cpu")
+    for one in seen:
+        column, row, z, inside = _pixels(one.camera, points)
+        shown = inside & (one.opacity[row, column] > OPAQUE) & (z < one.depth[row, column] + tolerance)
+        total += torch.where(shown[:, None], one.colour[row, column], 0.0)
+        weight += shown[:, None]
+    return total / weight
+
+
+def simplified(mesh: Mesh, most: int) -> Mesh:
+    """Return a mesh of about ``most`` faces, no more."""
+    spread = float(np.ptp(mesh.vertices, axis=0).max())
+    fine, coarse = spread / 2048, spread
+    found = mesh
+    for _ in range(TRIALS if len(mesh.faces) > most else 0):
+        middle = (fine * coarse) ** 0.5
+        joined = _joined(mesh, middle)
+        if len(joined.faces) <= most:
+            coarse, found = middle, joined
+        else:
+            fine = middle
+    return found
+
+
+def _joined(mesh: Mesh, size: float) -> Mesh:
+    """Return the mesh with the vertices in each cell of ``size`` joined."""
+    cells = np.floor((mesh.vertices - mesh.vertices.min(0)) / size).astype(np.int64)
+    _, labels = np.unique(cells, axis=0, return_inverse=True)
+    labels = labels.reshape(-1)
+    faces = labels[mesh.faces]
+    kept = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    if not kept.any():
+        return Mesh(mesh.vertices[:0], faces[:0])
+    _, first = np.unique(np.sort(faces[kept], axis=1), axis=0, return_index=True)
+    return Mesh(_meeting_points(mesh, labels, size), faces[kept][np.sort(first)])
+
+
+def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
+    """Return (L, 3): per label of vertices the point nearest to the planes of their faces, within ``size`` of their mean."""
+    count = int(labels.max()) + 1
+    of = np.bincount(labels, minlength=count)[:, None]
+    means = np.stack([np.bincount(labels, mesh.vertices[:, i], count) for i in range(3)], 1) / of
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.maximum(areas, 1e-30)
+    left, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for corner in range(3):
+        label = labels[mesh.faces[:, corner]]
+        weight = areas * normals
+        np.add.at(left, label, weight[:, :, None] * normals[:, None])
+        height = (normals * (a - means[label])).sum(1, keepdims=True)
+        np.add.at(right, label, weight * height)
+    stiff = STIFFNESS * np.trace(left, axis1=1, axis2=2)[:, None, None] + 1e-30
+    moved = np.linalg.solve(left + stiff * np.eye(3), right[:, :, None])[:, :, 0]
+    return means + moved.clip(-size, size)
