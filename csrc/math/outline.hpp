@@ -16,8 +16,9 @@ DYNGS_HD Vec2<S> pixel_step(int direction) {
   return direction < 2 ? Vec2<S>{sign, S(0)} : Vec2<S>{S(0), sign};
 }
 
-// Least sine of the angle between an outline and a step, for gradients: along an outline its place says nothing.
-inline constexpr double kLeastSine = 0.1;
+// Least sine of the angle between an outline and a step: an upright one is looked for along rows, a level one along columns, so
+// that what each covers is counted once.
+inline constexpr double kLeastSine = 0.7071067811865476;
 // Steps beyond the next pixel that still count as at it, since patches are drawn as flat faces.
 inline constexpr double kEndSlack = 0.25;
 
@@ -88,10 +89,9 @@ DYNGS_HD PatchEnd<S> patch_end(const Pinhole<S>& cam, const P& control, S u, S v
   const S length = sqrt(along.x * along.x + along.y * along.y);
   const Vec2<S> normal{-along.y / length, along.x / length};
   const S sine = step.x * normal.x + step.y * normal.y;
-  const S least = sine < S(0) ? min(sine, S(-kLeastSine)) : max(sine, S(kLeastSine));
-  end.slope = {normal.x / least, normal.y / least};
+  end.slope = {normal.x / sine, normal.y / sine};
   end.t = (to.at.x - from.at.x) * end.slope.x + (to.at.y - from.at.y) * end.slope.y;
-  end.is_found = end.t <= S(1 + kEndSlack) && length < kLargest<S>;
+  end.is_found = end.t <= S(1 + kEndSlack) && abs(sine) >= S(kLeastSine);
   end.t = clamp(end.t, S(0), S(1));
   return end;
 }
