@@ -18,7 +18,8 @@ from dyngs.camera import Cameras
 
 BEHIND = 3.0  # Cells behind a surface that still count as seen
 OPAQUE = 0.5  # Of a pixel that shows a surface
-TRIALS = 24  # Sizes of cells that are tried for a number of triangles
+TRIALS = 10  # Sizes of cells that are tried for a number of triangles
+FINEST = 1024.0  # Cells along the surface, at most
 STIFFNESS = 0.02  # Of a vertex towards the mean of those joined, where planes do not say where they meet
 
 
@@ -100,48 +101,56 @@ def colours_of(seen: Sequence[Seen], points: Tensor, tolerance: float) -> Tensor
 
 def simplified(mesh: Mesh, most: int) -> Mesh:
     """Return a mesh of about ``most`` faces, no more."""
-    spread = float(np.ptp(mesh.vertices, axis=0).max())
-    fine, coarse = spread / 2048, spread
-    found = mesh
-    for _ in range(TRIALS if len(mesh.faces) > most else 0):
+    if len(mesh.faces) <= most:
+        return mesh
+    coarse = float(np.ptp(mesh.vertices, axis=0).max())
+    fine = coarse / FINEST
+    for _ in range(TRIALS):
         middle = (fine * coarse) ** 0.5
-        joined = _joined(mesh, middle)
-        if len(joined.faces) <= most:
-            coarse, found = middle, joined
+        if len(_joined_faces(mesh, _cells(mesh, middle))) <= most:
+            coarse = middle
         else:
             fine = middle
-    return found
+    labels = _cells(mesh, coarse)
+    return Mesh(_meeting_points(mesh, labels, coarse), _joined_faces(mesh, labels))
 
 
-def _joined(mesh: Mesh, size: float) -> Mesh:
-    """Return the mesh with the vertices in each cell of ``size`` joined."""
+def _cells(mesh: Mesh, size: float) -> np.ndarray:
+    """Return (V,) number of the cell that each vertex is in, of those that hold any."""
     cells = np.floor((mesh.vertices - mesh.vertices.min(0)) / size).astype(np.int64)
-    _, labels = np.unique(cells, axis=0, return_inverse=True)
-    labels = labels.reshape(-1)
+    _, labels = np.unique((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2], return_inverse=True)
+    return labels.reshape(-1)
+
+
+def _joined_faces(mesh: Mesh, labels: np.ndarray) -> np.ndarray:
+    """Return (F, 3) faces between joined vertices, each once."""
     faces = labels[mesh.faces]
-    kept = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    if not kept.any():
-        return Mesh(mesh.vertices[:0], faces[:0])
-    _, first = np.unique(np.sort(faces[kept], axis=1), axis=0, return_index=True)
-    return Mesh(_meeting_points(mesh, labels, size), faces[kept][np.sort(first)])
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    a, b, c = np.sort(faces, axis=1).T
+    _, first = np.unique((a << 42) + (b << 21) + c, return_index=True)
+    return faces[np.sort(first)]
 
 
 def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
     """Return (L, 3): per label of vertices the point nearest to the planes of their faces, within ``size`` of their mean."""
-    count = int(labels.max()) + 1
-    of = np.bincount(labels, minlength=count)[:, None]
-    means = np.stack([np.bincount(labels, mesh.vertices[:, i], count) for i in range(3)], 1) / of
+    means = _sums(labels, mesh.vertices) / _sums(labels, np.ones((len(labels), 1)))
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.maximum(areas, 1e-30)
-    left, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    squares = (normals[:, :, None] * normals[:, None]).reshape(-1, 9)
+    left, right = np.zeros((len(means), 9)), np.zeros((len(means), 3))
     for corner in range(3):
         label = labels[mesh.faces[:, corner]]
-        weight = areas * normals
-        np.add.at(left, label, weight[:, :, None] * normals[:, None])
-        height = (normals * (a - means[label])).sum(1, keepdims=True)
-        np.add.at(right, label, weight * height)
-    stiff = STIFFNESS * np.trace(left, axis1=1, axis2=2)[:, None, None] + 1e-30
-    moved = np.linalg.solve(left + stiff * np.eye(3), right[:, :, None])[:, :, 0]
+        heights = (normals * (a - means[label])).sum(1, keepdims=True)
+        left += _sums(label, areas * squares, len(means))
+        right += _sums(label, areas * heights * normals, len(means))
+    planes = left.reshape(-1, 3, 3)
+    stiff = STIFFNESS * np.trace(planes, axis1=1, axis2=2)[:, None, None] + 1e-30
+    moved = np.linalg.solve(planes + stiff * np.eye(3), right[:, :, None])[:, :, 0]
     return means + moved.clip(-size, size)
+
+
+def _sums(labels: np.ndarray, values: np.ndarray, count: int = 0) -> np.ndarray:
+    """Return (L, C) sums of ``values`` (N, C) by label; L is at least ``count``."""
+    return np.stack([np.bincount(labels, column, count) for column in values.T], 1)
