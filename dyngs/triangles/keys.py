@@ -43,8 +43,8 @@ class BgTriangleModel(ModelSection):
     )
     supersampling: int = Field(default=2, ge=1, le=4, description="pixels are drawn as the mean of its square")
     lr_position: Positive = Field(
-        default=1.6e-3, le=1, description="learning rate of control points at first, in half sides of the scene"
+        default=4e-3, le=1, description="learning rate of control points at first, in half sides of the scene"
     )
-    lr_position_final: Positive = Field(default=1.6e-4, le=1, description="the same at the end")
+    lr_position_final: Positive = Field(default=2e-4, le=1, description="the same at the end")
     lr_colour: Positive = Field(default=0.01, le=1, description="learning rate of colours; of harmonics a twentieth")
     near: Positive = Field(default=0.05, le=1e9, description="near plane, in half sides of the scene")
