@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <limits>
 
+#include "math/patch_faces.hpp"
 #include "tests/triangles.hpp"
 
 namespace {
