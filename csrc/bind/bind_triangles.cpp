@@ -143,8 +143,8 @@ void bind_scalar(nb::module_& module) {
              array("g_values"), nb::arg("threads"));
   module.def("visible_patches", visible<S>, array("points"), array("viewmats"), array("intrinsics"),
              nb::arg("segments"), nb::arg("near"), array("ids"), array("uv"), nb::arg("threads"));
-  module.def("patch_ends", ends<S>, array("points"), array("viewmats"), array("intrinsics"), array("uv"),
-             array("from"), array("found"), array("out"), nb::arg("threads"));
+  module.def("patch_ends", ends<S>, array("points"), array("viewmats"), array("intrinsics"), array("uv"), array("from"),
+             array("found"), array("out"), nb::arg("threads"));
   module.def("blend_patches_forward", blend_forward<S>, array("colours"), array("crossings"), array("rows"),
              array("ids"), array("out"), nb::arg("threads"));
   module.def("blend_patches_backward", blend_backward<S>, array("colours"), array("crossings"), array("rows"),

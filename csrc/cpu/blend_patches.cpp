@@ -31,41 +31,43 @@ struct ImageGrad {
   }
 };
 
-template <class S, class Star>
-void place_grads(const PatchImage<S>& in, const ImageGrad<S>& g, const Star& star, const PatchGrads<S>& out) {
-  if (star.row() < 0) return;
+// Not inlined: two copies, for one thread and for several, could round differently.
+template <class S>
+[[gnu::noinline]] void blend_pixel(const PatchImage<S>& in, const PixelStar<S, PatchImage<S>>& star,
+                                   const BlendedPatches<S>& out) {
+  for (int c = 0; c < in.channels; ++c) out.image[star.pixel() * in.channels + c] = star.blended(c);
+  out.transmittance[star.pixel()] = star.blended(in.channels);
+}
+
+template <class S>
+[[gnu::noinline]] void blend_pixel_vjp(const PatchImage<S>& in, const ImageGrad<S>& g,
+                                       const PixelStar<S, PatchImage<S>>& star, const PatchGrads<S>& out) {
   S by_mean[2] = {};
-  for (int c = 0; c < in.channels; ++c) {
+  for (int c = 0; star.row() >= 0 && c < in.channels; ++c) {
     const S by_colour = gathered(star, g, c);
     out.colours[star.row() * in.channels + c] = by_colour;
     for (int axis = 0; axis < 2; ++axis) by_mean[axis] -= by_colour * star.slope(axis, c);
   }
-  for (int axis = 0; axis < 2; ++axis) out.means[2 * star.row() + axis] = by_mean[axis];
+  for (int axis = 0; axis < 2; ++axis) {
+    if (star.row() >= 0) out.means[2 * star.row() + axis] = by_mean[axis];
+    out.crossings[star.crossing(2 * axis)] = star.has(2 * axis) ? crossing_grad(star, g, 2 * axis) : S(0);
+  }
 }
 
 }  // namespace
 
 template <class S>
 void blend_patches_forward(const PatchImage<S>& in, const BlendedPatches<S>& out) {
-  for_each_star(in, [&](const auto& star) {
-    for (int c = 0; c < in.channels; ++c) out.image[star.pixel() * in.channels + c] = star.blended(c);
-    out.transmittance[star.pixel()] = star.blended(in.channels);
-  });
+  for_each_star(in, [&](const auto& star) { blend_pixel(in, star, out); });
 }
 
 template <class S>
 void blend_patches_backward(const PatchImage<S>& in, const BlendedPatches<const S>& grads, const PatchGrads<S>& out) {
   const ImageGrad<S> g{grads.image, grads.transmittance, in.channels};
-  for_each_star(in, [&](const auto& star) {
-    place_grads(in, g, star, out);
-    for (int axis = 0; axis < 2; ++axis) {
-      const int k = 2 * axis;
-      out.crossings[star.crossing(k)] = star.has(k) ? crossing_grad(star, g, k) : S(0);
-    }
-  });
+  for_each_star(in, [&](const auto& star) { blend_pixel_vjp(in, g, star, out); });
 }
 
-#define DYNGS_INSTANTIATE(S)                                                          \
+#define DYNGS_INSTANTIATE(S)                                                              \
   template void blend_patches_forward<S>(const PatchImage<S>&, const BlendedPatches<S>&); \
   template void blend_patches_backward<S>(const PatchImage<S>&, const BlendedPatches<const S>&, const PatchGrads<S>&);
 DYNGS_INSTANTIATE(float)

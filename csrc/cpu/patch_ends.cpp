@@ -8,7 +8,7 @@ namespace {
 constexpr int64_t kGrain = 256;  // places
 
 template <class S>
-PatchEnd<S> end_from(const PatchSteps<S>& in, int64_t n) {
+[[gnu::noinline]] PatchEnd<S> end_from(const PatchSteps<S>& in, int64_t n) {
   if (in.ids[n] < 0) return {};
   const int64_t view = in.views[n];
   const Pinhole<S> cam = pinhole(in.viewmats + 16 * view, in.intrinsics + 9 * view, 0, 0);

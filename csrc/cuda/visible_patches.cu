@@ -107,7 +107,8 @@ __global__ void __launch_bounds__(kThreads)
     draw_tiles_kernel(PatchViews<float> in, int64_t view, Boxes b, VisiblePatches<float> out) {
   DYNGS_SHARED(int32_t, kept, kThreads);
   const int across = (in.width + kTile - 1) / kTile, thread = static_cast<int>(threadIdx.x);
-  const int tile_x = static_cast<int>(blockIdx.x) % across * kTile, tile_y = static_cast<int>(blockIdx.x) / across * kTile;
+  const int tile_x = static_cast<int>(blockIdx.x) % across * kTile,
+            tile_y = static_cast<int>(blockIdx.x) / across * kTile;
   const int x = tile_x + thread % kTile, y = tile_y + thread / kTile;
   const bool is_inside = x < in.width && y < in.height;
   const Pinhole<double> cam = camera_of(in, view);

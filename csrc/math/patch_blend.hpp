@@ -62,6 +62,11 @@ class PixelStar {
     const S t = in_.crossings[crossing(k)];
     return k % 2 == 0 ? covered_of_first(t) : covered_of_second(t);
   }
+  // How much the pixel covers of the neighbour `k`.
+  DYNGS_HD S covers(int k) const {
+    const S t = in_.crossings[crossing(k)];
+    return k % 2 == 0 ? covered_of_second(t) : covered_of_first(t);
+  }
   // Index of the crossing towards the neighbour `k`.
   DYNGS_HD int64_t crossing(int k) const {
     const int64_t plane = int64_t{in_.width} * in_.height;
@@ -93,10 +98,9 @@ template <class S, class In, class G>
 DYNGS_HD S gathered(const PixelStar<S, In>& star, const G& g, int c) {
   S sum = star.own() * g(star.pixel(), c);
   for (int k = 0; k < kDirections; ++k) {
-    if (!star.has(k)) continue;
+    if (!star.has(k) || !(star.covers(k) > S(0))) continue;
     const PixelStar<S, In> other = star.next(k);
-    const S share = other.share(k ^ 1);
-    if (share > S(0)) sum += share * g(other.pixel(), c);
+    sum += other.share(k ^ 1) * g(other.pixel(), c);
   }
   return sum;
 }
@@ -105,13 +109,14 @@ DYNGS_HD S gathered(const PixelStar<S, In>& star, const G& g, int c) {
 // covers at most one partly.
 template <class S, class In, class G>
 DYNGS_HD S crossing_grad(const PixelStar<S, In>& star, const G& g, int k) {
-  const S first = star.covered(k);
-  const PixelStar<S, In> other = star.next(k);
-  const S second = other.covered(k ^ 1);
+  const bool first = star.covered(k) > S(0), second = star.covers(k) > S(0);
   S sum = S(0);
-  for (int c = 0; c <= star.channels(); ++c) {
-    if (first > S(0)) sum -= g(star.pixel(), c) * star.by_covered(k, c);
-    if (second > S(0)) sum += g(other.pixel(), c) * other.by_covered(k ^ 1, c);
+  if (first) {
+    for (int c = 0; c <= star.channels(); ++c) sum -= g(star.pixel(), c) * star.by_covered(k, c);
+  }
+  if (second) {
+    const PixelStar<S, In> other = star.next(k);
+    for (int c = 0; c <= star.channels(); ++c) sum += g(other.pixel(), c) * other.by_covered(k ^ 1, c);
   }
   return sum;
 }

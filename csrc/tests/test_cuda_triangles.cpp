@@ -47,8 +47,16 @@ Shown<float> shown_on_gpu(const PatchCase& c) {
   Memory<float> points(as<float>(c.points)), viewmats(as<float>(c.viewmats)), intrinsics(as<float>(c.intrinsics));
   Memory<int32_t> ids(c.pixels());
   Memory<float> uv(2 * c.pixels());
-  const PatchViews<float> in{points.get(), viewmats.get(), intrinsics.get(), c.patches(), c.views(), c.width, c.height,
-                             c.segments, static_cast<float>(c.near), 1};
+  const PatchViews<float> in{points.get(),
+                             viewmats.get(),
+                             intrinsics.get(),
+                             c.patches(),
+                             c.views(),
+                             c.width,
+                             c.height,
+                             c.segments,
+                             static_cast<float>(c.near),
+                             1};
   Memory<char> workspace(cuda::visible_patches_workspace(in));
   cuda::visible_patches(in, {ids.get(), uv.get()}, {workspace.get(), workspace.count()}, nullptr);
   return {ids.values(), uv.values()};
@@ -107,8 +115,8 @@ Blended<float> blended_on_gpu(const ImageCase& c) {
   Memory<float> colours(as<float>(c.colours)), crossings(as<float>(c.crossings)), g_image(as<float>(c.g_image));
   Memory<float> g_transmittance(as<float>(c.g_transmittance)), image(g_image.count()), transmittance(c.pixels());
   Memory<float> g_means(2 * c.count()), g_colours(colours.count()), g_crossings(crossings.count());
-  const PatchImage<float> in{rows.get(), ids.get(),  colours.get(), crossings.get(), c.views,
-                             c.count(),  c.width, c.height,      c.channels,      1};
+  const PatchImage<float> in{rows.get(), ids.get(), colours.get(), crossings.get(), c.views,
+                             c.count(),  c.width,   c.height,      c.channels,      1};
   cuda::blend_patches_forward(in, {image.get(), transmittance.get()}, nullptr);
   cuda::blend_patches_backward(in, {g_image.get(), g_transmittance.get()},
                                {g_means.get(), g_colours.get(), g_crossings.get()}, nullptr);

@@ -61,9 +61,10 @@ void test_what_cannot_be_drawn() {
   const auto set = [&](int64_t patch, const Values& points) {
     for (int i = 0; i < 18; ++i) c.points[18 * patch + i] = points[i % points.size()];
   };
-  set(0, {0.25, 0.5, 0.125});                                                // one point
-  set(1, {0, 0, 0, 1, 0, 0, 2, 0, 0, 2, 0, 0, 3, 0, 0, 4, 0, 0});            // a line
-  set(2, {0, 0, 90, 1, 0, 90, 0, 1, 91}), set(3, {0, 0, -90, 1, 0, -90, 0, 1, -91});  // behind one camera each, far away
+  set(0, {0.25, 0.5, 0.125});                                      // one point
+  set(1, {0, 0, 0, 1, 0, 0, 2, 0, 0, 2, 0, 0, 3, 0, 0, 4, 0, 0});  // a line
+  set(2, {0, 0, 90, 1, 0, 90, 0, 1, 91}),
+      set(3, {0, 0, -90, 1, 0, -90, 0, 1, -91});  // behind one camera each, far away
   c.points[18 * 4 + 5] = kNone, c.points[18 * 5 + 11] = std::numeric_limits<double>::infinity();
   const auto shown = shown_on_cpu<float>(c);
   for (const int32_t id : shown.ids) expect(id == -1 || id == 2 || id == 3, "what is no triangle is not shown");

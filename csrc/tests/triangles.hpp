@@ -34,7 +34,8 @@ inline PatchCase patch_case(int64_t patches, int width, int height, double size)
   c.points = as<double>(as<float>(c.points));
   const double f = 1.25 * width;
   for (const double sign : {1.0, -1.0}) {
-    const Values view{sign, 0, 0, 0.125, 0, 1, 0, 0, 0, 0, sign, 3, 0, 0, 0, 1}, inner{f, 0, width / 2.0, 0, f, height / 2.0, 0, 0, 1};
+    const Values view{sign, 0, 0, 0.125, 0, 1, 0, 0, 0, 0, sign, 3, 0, 0, 0, 1},
+        inner{f, 0, width / 2.0, 0, f, height / 2.0, 0, 0, 1};
     c.viewmats.insert(c.viewmats.end(), view.begin(), view.end());
     c.intrinsics.insert(c.intrinsics.end(), inner.begin(), inner.end());
   }
@@ -112,8 +113,14 @@ struct ValueCase {
 
 inline ValueCase value_case(int64_t count, int64_t patches, int64_t channels, int basis) {
   const int64_t size = basis > 0 ? lattice_size(basis) : kPatchPoints;
-  ValueCase c{{},      uniforms(2 * count, 0, 0.5), uniforms(patches * size * channels, -1, 1), uniforms(count * channels, -1, 1),
-              patches, size,                        channels,                                   basis};
+  ValueCase c{{},
+              uniforms(2 * count, 0, 0.5),
+              uniforms(patches * size * channels, -1, 1),
+              uniforms(count * channels, -1, 1),
+              patches,
+              size,
+              channels,
+              basis};
   for (int64_t n = 0; n < count; ++n) c.ids.push_back(static_cast<int32_t>(n * n % patches));
   return c;
 }
@@ -166,8 +173,8 @@ Blended<S> blended_on_cpu(const ImageCase& c, int threads = 1) {
   const auto fill = [](size_t n) { return std::vector<S>(n, S(7)); };
   Blended<S> found{fill(c.g_image.size()), fill(c.rows.size()), fill(2 * c.ids.size()), fill(c.colours.size()),
                    fill(c.crossings.size())};
-  const PatchImage<S> in{c.rows.data(), c.ids.data(), colours.data(), crossings.data(), c.views, c.count(), c.width,
-                         c.height,      c.channels,   threads};
+  const PatchImage<S> in{c.rows.data(), c.ids.data(), colours.data(), crossings.data(), c.views,
+                         c.count(),     c.width,      c.height,       c.channels,       threads};
   blend_patches_forward<S>(in, {found.image.data(), found.transmittance.data()});
   blend_patches_backward<S>(in, {g_image.data(), g_transmittance.data()},
                             {found.g_means.data(), found.g_colours.data(), found.g_crossings.data()});

@@ -210,60 +210,68 @@ def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> Projected
 def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tensor:
     """Return (V, 2, H, W): how far from a pixel's centre to the next in its row, in its column, their outline is.
 
-    ``NO_CROSSING`` where both show the same patch, or none of theirs ends in between: then what shows is a fold. Where
-    both end there it is the middle of the two ends. Differentiable in ``points`` (P, 6, 3).
+    ``NO_CROSSING`` where both show the same patch, where the outline runs rather along the row or column than across
+    it, or where neither ends in between: then what shows is a fold. Where both end there it is the middle of the two
+    ends. Differentiable in ``points`` (P, 6, 3).
     """
-    shape = places.rows.shape
-    out = points.new_full((shape[0], 2, *shape[1:]), NO_CROSSING)
-    first, second, to, axis = _differing(places)
-    directions = torch.cat([2 * axis, 2 * axis + 1]).to(torch.int32)
-    rows = torch.cat([first, second])
-    at = places.rows.view(-1)[rows].long()
-    ids = torch.where(at >= 0, places.ids[at.clamp_min(0)], -1) if len(places.ids) else at.to(torch.int32)
+    views, height, width = places.rows.shape
+    out = points.new_full((views, 2, height, width), NO_CROSSING)
     if not len(places.ids):
         return out
-    views = (rows // (shape[1] * shape[2])).to(torch.int32)
-    given = [cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()]
-    found, steps, uv, slopes = ends_op(
-        points.detach().contiguous(), given, views, ids, places.uv[at.clamp_min(0)].contiguous(), directions
+    pairs = [_differing(places, axis) for axis in (0, 1)]
+    first, second, to = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+    axis = (to // (height * width)) % 2
+    steps, found = _ends_between(
+        points, cameras, places, torch.cat([first, second]), torch.cat([2 * axis, 2 * axis + 1])
     )
-    ending = found.nonzero()[:, 0]
-    edges = patch_values(points, ids[ending], uv[ending])
-    means = project_points(edges, cameras, views[ending].long()).means
-    moved = steps[ending] + ((means - means.detach()) * slopes[ending]).sum(1)
-    a, b = steps.index_put((ending,), moved).view(2, -1)
-    of_a, of_b = found.view(2, -1)
+    (a, b), (of_a, of_b) = steps.view(2, -1), found.view(2, -1)
     middle = torch.where(of_b, 0.5 * (a + 1 - b), a)
     crossing = torch.where(of_a, middle, torch.where(of_b, 1 - b, NO_CROSSING))
     return out.view(-1).index_put((to,), crossing).view_as(out)
 
 
-def _differing(places: Places) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return indices of pixels that show another patch than the next one, of that one, and of the crossing; the axis."""
+def _differing(places: Places, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return indices of pixels that show another patch than the next along x (axis 0) or y, of that, of the crossing."""
     rows = places.rows
-    shown = places.ids[rows.clamp_min(0).long()] if len(places.ids) else rows
-    labels = torch.where(rows >= 0, shown, -1)
-    _, height, width = labels.shape
-    found: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    for axis, stride in ((0, 1), (1, width)):
-        differs = torch.zeros(labels.shape, dtype=torch.bool, device=labels.device)
-        if axis == 0:
-            differs[:, :, :-1] = labels[:, :, 1:] != labels[:, :, :-1]
-        else:
-            differs[:, :-1] = labels[:, 1:] != labels[:, :-1]
-        first = differs.view(-1).nonzero()[:, 0]
-        to = first + (first // (height * width) + axis) * (height * width)
-        found.append((first, first + stride, to, torch.full_like(first, axis)))
-    one, other = found
-    return tuple(torch.cat(pair) for pair in zip(one, other, strict=True))  # pyright: ignore[reportReturnType]
+    _, height, width = rows.shape
+    labels = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1)
+    differs = torch.zeros(labels.shape, dtype=torch.bool, device=labels.device)
+    if axis == 0:
+        differs[:, :, :-1] = labels[:, :, 1:] != labels[:, :, :-1]
+    else:
+        differs[:, :-1] = labels[:, 1:] != labels[:, :-1]
+    first = differs.view(-1).nonzero()[:, 0]
+    return first, first + (1, width)[axis], first + (first // (height * width) + axis) * (height * width)
+
+
+def _ends_between(
+    points: Tensor, cameras: Cameras, places: Places, pixels: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return (N,) steps in ``directions`` from ``pixels`` to where what they show ends, and (N,) whether it does."""
+    rows = places.rows.view(-1)[pixels].long()
+    ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0)], -1)
+    views = (pixels // places.rows[0].numel()).to(torch.int32)
+    found, steps, uv, slopes = ends_op(
+        points.detach().contiguous(),
+        [cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()],
+        views,
+        ids,
+        places.uv[rows.clamp_min(0)].contiguous(),
+        directions.to(torch.int32),
+    )
+    which = found.nonzero()[:, 0]
+    edges = patch_values(points, ids[which], uv[which])
+    means = project_points(edges, cameras, views[which].long()).means
+    moved = steps[which] + ((means - means.detach()) * slopes[which]).sum(1)
+    return steps.index_put((which,), moved), found
 
 
 def blend_patches(means: Tensor, colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
     """Return (V, H, W, C) images before black and (V, H, W) transmittance, differentiable once.
 
-    A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel and the next one, by
-    ``crossings`` t steps apart from the first, max(0, 1/2 - t) of the first are the second's, and max(0, t - 1/2) of the
-    second the first's. Where neighbours would cover more than all of a pixel their shares are scaled to it. The same
+    A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel and the next one,
+    with an outline t steps from the first (``crossings``), max(0, 1/2 - t) of the first are the second's, and
+    max(0, t - 1/2) of the second the first's. Where neighbours would cover more than all of a pixel their shares are scaled to it. The same
     bits on any number of threads.
 
     Args:

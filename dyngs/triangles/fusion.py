@@ -132,7 +132,7 @@ def _joined_faces(mesh: Mesh, labels: np.ndarray) -> np.ndarray:
 
 
 def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
-    """Return (L, 3): per label of vertices the point nearest to the planes of their faces, within ``size`` of their mean."""
+    """Return (L, 3): per label of vertices where the planes of their faces meet, within ``size`` of their mean."""
     means = _sums(labels, mesh.vertices) / _sums(labels, np.ones((len(labels), 1)))
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)

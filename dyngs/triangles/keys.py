@@ -19,7 +19,7 @@ class BgTriangleModel(ModelSection):
         default="bg_triangle", description="curved triangles with sharp edges (BG-Triangle; docs/family.md)"
     )
     max_triangles: int = Field(default=4000, ge=4, le=1_000_000, description="most triangles that a run ends with")
-    num_first: int = Field(default=1000, ge=1, le=1_000_000, description="most triangles that it begins with")
+    num_first: int = Field(default=2000, ge=1, le=1_000_000, description="most triangles that it begins with")
     gaussian_steps: int = Field(
         default=800,
         ge=0,
@@ -39,7 +39,10 @@ class BgTriangleModel(ModelSection):
         default=True, description="control points are learned to the end; false: until textures begin, as published"
     )
     segments: int = Field(
-        default=6, ge=1, le=16, description="segments of an edge: a triangle is drawn as their square"
+        default=6,
+        ge=1,
+        le=16,
+        description="most segments of an edge: a triangle is drawn as their square, as few as it is flat enough for",
     )
     supersampling: int = Field(default=2, ge=1, le=4, description="pixels are drawn as the mean of its square")
     lr_position: Positive = Field(

@@ -68,12 +68,13 @@ class Tallies:
 
 
 def outlines(places: Places) -> Tensor:
-    """Return (N,) bool: which places lie within a drawn pixel of an outline, see ``blend_patches``."""
+    """Return (N,) bool: which places lie within two drawn pixels of an outline, see ``blend_patches``."""
     rows = places.rows[0]
-    ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1).float()[None, None]
-    differs = max_pool2d(ids, 3, 1, 1) != -max_pool2d(-ids, 3, 1, 1)
-    near = max_pool2d(differs.float(), 3, 1, 1) > 0
-    return near[0, 0][rows >= 0]
+    ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1)
+    differs = torch.zeros(rows.shape, device="cpu")
+    differs[:, :-1] += ids[:, 1:] != ids[:, :-1]
+    differs[:-1] += ids[1:] != ids[:-1]
+    return max_pool2d(differs[None, None], 3, 1, 1)[0, 0][rows >= 0] > 0
 
 
 def slopes_of(image: Tensor) -> Tensor:
@@ -81,5 +82,5 @@ def slopes_of(image: Tensor) -> Tensor:
     across = torch.tensor([[-1.0, 0, 1]] * 3, device="cpu") / 3
     kernels = torch.stack([across, across.T])[:, None]
     channels = torch.nn.functional.pad(image.permute(2, 0, 1)[:, None], (1, 1, 1, 1), mode="replicate")
-    sizes = conv2d(channels, kernels).norm(dim=1)
+    sizes = conv2d(channels, kernels).square().sum(1).sqrt()
     return torch.where(sizes < FAINTEST_EDGE, 0.0, sizes).mean(0)
