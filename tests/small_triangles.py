@@ -12,7 +12,13 @@ from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.triangles.patches import Patches, flat_triangles
 
-KEYS = ["model.kind=bg_triangle", "model.max_triangles=300", "model.num_first=150", "model.segments=3"]
+KEYS = [
+    "model.kind=bg_triangle",
+    "model.max_triangles=300",
+    "model.num_first=150",
+    "model.segments=3",
+    "model.gaussian_steps=60",
+]
 
 
 def config_of(capture: Path, *keys: str) -> Config:

@@ -231,7 +231,7 @@ def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tenso
 
 
 def _differing(places: Places, axis: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return indices of pixels that show another patch than the next along x (axis 0) or y, of that, of the crossing."""
+    """Return indices of pixels that show another patch than the next along x (axis 0) or y, of those, of crossings."""
     rows = places.rows
     _, height, width = rows.shape
     labels = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1)
@@ -271,8 +271,8 @@ def blend_patches(means: Tensor, colours: Tensor, crossings: Tensor, places: Pla
 
     A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel and the next one,
     with an outline t steps from the first (``crossings``), max(0, 1/2 - t) of the first are the second's, and
-    max(0, t - 1/2) of the second the first's. Where neighbours would cover more than all of a pixel their shares are scaled to it. The same
-    bits on any number of threads.
+    max(0, t - 1/2) of the second the first's. Where neighbours would cover more than all of a pixel their shares are
+    scaled to it. The same bits on any number of threads.
 
     Args:
         means: (N, 2) px, of the places, which are at the centres of their pixels: not read. Their gradient is that of

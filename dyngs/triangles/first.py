@@ -28,7 +28,7 @@ from dyngs.triangles.fusion import Mesh, Seen, colours_of, fused, simplified
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000
 VIEWS = 64  # Whose depths are fused
-CELLS = 128  # Along the scene
+CELLS = 128  # Along the scene, at most; no more than pixels along an image
 INNER = 0.005  # Fraction of the Gaussians on either side that does not count for where the scene is
 MARGIN = 0.02  # Of the scene's size, around it
 
@@ -74,14 +74,15 @@ def first_surface(run: RunStart, steps: int, most: int) -> FirstSurface:
     """
     trained = _trained(run, steps)
     seen, (low, high) = _views(run, trained), _box(trained.scene.gaussians)
-    mesh = fused(seen, low, high, CELLS)
+    cells = min(CELLS, max(max(one.depth.shape) for one in seen))
+    mesh = fused(seen, low, high, cells)
     mesh = None if mesh is None else simplified(mesh, most)
     if mesh is None or len(mesh.faces) == 0:
         raise DyngsError(
             f"{run.config.data.root}: {steps} steps of Gaussians show no surface for triangles to begin on: give more "
             "(model.gaussian_steps), or 0, to begin at points"
         )
-    return _coloured(mesh, seen, float((high - low).max()) / CELLS)
+    return _coloured(mesh, seen, float((high - low).max()) / cells)
 
 
 def _coloured(mesh: Mesh, seen: list[Seen], size: float) -> FirstSurface:

@@ -25,7 +25,7 @@ STEPS = ["train.steps=120", "train.save_every=60"]
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "triangles"
-    return dyngs.train(config_of(capture, *STEPS, f"run.dir={folder}"))
+    return dyngs.train(config_of(capture, *STEPS, "model.gaussian_steps=300", f"run.dir={folder}"))
 
 
 def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
@@ -85,7 +85,7 @@ def test_what_does_not_go_is_refused(
 
 
 def test_the_first_triangles_lie_at_the_first_points(capture: Path) -> None:
-    trainer: Any = build(config_of(capture, "model.num_first=40"))
+    trainer: Any = build(config_of(capture, "model.num_first=40", "model.gaussian_steps=0"))
     scene: TriangleScene = trainer.model.scene
     assert len(scene.patches) == 40
     assert 0.5 < scene.unit < 1.4
