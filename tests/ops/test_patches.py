@@ -14,6 +14,7 @@ from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.patches import (
     Places,
+    blend_backward_op,
     blend_op,
     blend_patches,
     ends_op,
@@ -23,6 +24,7 @@ from dyngs.ops.patches import (
     outline_crossings,
     patch_values,
     project_points,
+    values_backward_op,
     values_op,
     visible_patches,
 )
@@ -301,7 +303,11 @@ def test_the_ops_are_those_of_torch() -> None:
     values, (ids, uv) = random_patches(2), random_places(5, 2)
     torch.library.opcheck(values_op, (values.requires_grad_(), ids, uv, 0))
     means, colours, crossings, places = some_image(0)
+    torch.library.opcheck(values_backward_op, (values.detach(), ids, uv, torch.ones(5, 3, dtype=torch.float64), 0))
     torch.library.opcheck(blend_op, (means, colours, crossings, places.rows, places.ids))
+    inputs = [colours.detach(), crossings.detach(), places.rows, places.ids]
+    grads = [x.detach() for x in blend_patches(means, colours, crossings, places)]
+    torch.library.opcheck(blend_backward_op, (inputs, grads))
     at = [x.detach() for x in (camera().cam_from_world, camera().intrinsics)]
     torch.library.opcheck(ends_op, (values.detach(), at, torch.zeros_like(ids), ids, uv, torch.zeros_like(ids)))
 
