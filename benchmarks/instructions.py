@@ -25,6 +25,8 @@ KERNELS = [
     *("rasterize_forward", "rasterize_backward", "l1_ssim_loss", "adam_step", "skinning_forward", "skinning_backward"),
     *("nodes_at", "nodes_at_backward", "node_penalties", "hash_grid_forward", "hash_grid_backward"),
     *("march_count", "march_samples", "composite_forward", "composite_backward", "reached_samples"),
+    *("patch_values_forward", "patch_values_backward", "visible_patches", "patch_ends"),
+    *("blend_patches_forward", "blend_patches_backward"),
 ]
 LINE = re.compile(r"^\s*([\d,]+) .*\bdyngs::(\w+)(?:<float>)?\(")
 

@@ -1,4 +1,4 @@
-// The ops of core/api.hpp and core/fields.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued where use_queue says, with memory
+// The ops of core/api.hpp, core/fields.hpp and core/triangles.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued where use_queue says, with memory
 // that torch lends. They compute in float32; dyngs/ops/native.py refuses float64.
 #include "core/api.hpp"
 
@@ -221,6 +221,41 @@ void composite_backward(const RaySamples<float>& in, const Composited<const floa
 template <>
 void reached_samples(const RaySamples<float>& in, bool* reached, int64_t* counts) {
   cuda::reached_samples(in, reached, counts, current_stream());
+}
+
+// Curved triangles ----------------------------------------------------------------------------------------------------
+
+template <>
+void patch_values_forward(const PatchPlaces& places, const float* uv, const float* values, float* out) {
+  cuda::patch_values_forward(places, uv, values, out, current_stream());
+}
+
+template <>
+void patch_values_backward(const PatchPlaces& places, const float* uv, const float* g_out, float* g_values) {
+  const Borrowed memory(cuda::patch_values_backward_workspace(places));
+  cuda::patch_values_backward(places, uv, g_out, g_values, memory.lent(), current_stream());
+}
+
+template <>
+void visible_patches(const PatchViews<float>& in, const VisiblePatches<float>& out) {
+  const Borrowed memory(cuda::visible_patches_workspace(in));
+  cuda::visible_patches(in, out, memory.lent(), current_stream());
+}
+
+template <>
+void patch_ends(const PatchSteps<float>& in, const PatchEnds<float>& out) {
+  cuda::patch_ends(in, out, current_stream());
+}
+
+template <>
+void blend_patches_forward(const PatchImage<float>& in, const BlendedPatches<float>& out) {
+  cuda::blend_patches_forward(in, out, current_stream());
+}
+
+template <>
+void blend_patches_backward(const PatchImage<float>& in, const BlendedPatches<const float>& grads,
+                            const PatchGrads<float>& out) {
+  cuda::blend_patches_backward(in, grads, out, current_stream());
 }
 
 // Training ------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-// The ops of core/api.hpp and core/fields.hpp on a CUDA GPU, in float32: the same structs with pointers to the GPU's memory
+// The ops of core/api.hpp, core/fields.hpp and core/triangles.hpp on a CUDA GPU, in float32: the same structs with pointers to the GPU's memory
 // (`threads` is not read), the same results up to rounding, and the same bytes whenever a call is repeated. Work is queued on
 // `stream`; nothing is allocated and nothing waits, but for the one number that bin_entries reads back. A function with a
 // `workspace` takes memory that the caller allocated, of at least as many bytes as its neighbour `..._workspace` says; its
@@ -7,6 +7,7 @@
 
 #include "core/api.hpp"
 #include "core/fields.hpp"
+#include "core/triangles.hpp"
 
 namespace dyngs::cuda {
 
@@ -132,6 +133,20 @@ void composite_forward(const RaySamples<float>& in, const Composited<float>& out
 void composite_backward(const RaySamples<float>& in, const Composited<const float>& grads, float* g_densities,
                         float* g_colours, Stream stream);
 void reached_samples(const RaySamples<float>& in, bool* reached, int64_t* counts, Stream stream);
+
+// Curved triangles ----------------------------------------------------------------------------------------------------
+
+void patch_values_forward(const PatchPlaces& places, const float* uv, const float* values, float* out, Stream stream);
+int64_t patch_values_backward_workspace(const PatchPlaces& places);
+void patch_values_backward(const PatchPlaces& places, const float* uv, const float* g_out, float* g_values,
+                           const Lent& workspace, Stream stream);
+int64_t visible_patches_workspace(const PatchViews<float>& in);
+void visible_patches(const PatchViews<float>& in, const VisiblePatches<float>& out, const Lent& workspace,
+                     Stream stream);
+void patch_ends(const PatchSteps<float>& in, const PatchEnds<float>& out, Stream stream);
+void blend_patches_forward(const PatchImage<float>& in, const BlendedPatches<float>& out, Stream stream);
+void blend_patches_backward(const PatchImage<float>& in, const BlendedPatches<const float>& grads,
+                            const PatchGrads<float>& out, Stream stream);
 
 // Training ------------------------------------------------------------------------------------------------------------
 

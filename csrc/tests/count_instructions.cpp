@@ -2,6 +2,7 @@
 // instructions of.
 #include "tests/fields.hpp"
 #include "tests/scene.hpp"
+#include "tests/triangles.hpp"
 
 namespace {
 
@@ -66,9 +67,17 @@ void fields() {
   composite_on_cpu<float>(sample_case(std::vector<int64_t>(2'000, 20), 0.5, 1e-4));
 }
 
+void triangles() {
+  const PatchCase c = patch_case(2'000, 200, 160, 0.1);
+  const auto shown = shown_on_cpu<float>(c);
+  ends_on_cpu<float>(c, step_case(c, shown));
+  blended_on_cpu<float>(image_case(c, shown, 4));
+  values_on_cpu<float>(value_case(40'000, 2'000, 3, 0));
+}
+
 }  // namespace
 
 int main() {
-  images(), training(), motion(), fields();
+  images(), training(), motion(), fields(), triangles();
   return 0;
 }

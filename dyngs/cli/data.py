@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
-SYNTHETIC_SCENES = ("still", "spin", "wave", "merge", "room", "roll", "collide", "chain", "enter", "human")
+SYNTHETIC_SCENES = ("still", "polyhedra", "spin", "wave", "merge", "room", "roll", "collide", "chain", "enter", "human")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
+_STILL = "still", "polyhedra"
 _OF_A_FIT = {
     "keypoints": ("PATH", "key points: a folder of OpenPose files, or a COCO file"),
     "masks": ("DIR", "masks of the person (white), named as the images"),
@@ -124,7 +125,8 @@ def _add_synth(verbs: args.Commands) -> None:
         run_synth,
         "write a small synthetic scene as a capture",
         "Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it moves. still: a "
-        "still life. spin: a turning die and a rolling ball. wave: a rippling cloth. merge: balls that appear, merge "
+        "still life. polyhedra: flat faces and letters, with true edges and close-ups. spin: a turning die and a "
+        "rolling ball. wave: a rippling cloth. merge: balls that appear, merge "
         "and vanish. room: videos of a static room with one hopping ball, from fixed cameras. roll: a striped ball "
         "rolls alone. collide: two balls bounce off each other. chain: a finger of five links bends. enter: a die "
         "slides into a room and out again. human: a walking person from all around, with exact body parameters; with "
@@ -304,9 +306,9 @@ def run_synth(arguments: argparse.Namespace) -> int:
     if size < 1 or views < 1 or seed < 0:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
     style = arguments.style or ("fixed" if arguments.cameras is not None else None)
-    if arguments.cameras is not None and (cameras < 1 or scene == "still" or style != "fixed"):
+    if arguments.cameras is not None and (cameras < 1 or scene in _STILL or style != "fixed"):
         raise DyngsError("--cameras must be at least 1, and is for scenes that move, with fixed cameras")
-    if arguments.style is not None and (scene == "still" or (scene == "human" and style != "teleport")):
+    if arguments.style is not None and (scene in _STILL or (scene == "human" and style != "teleport")):
         raise DyngsError("--style is for scenes that move; for human only teleport")
     if (arguments.varied and not by_poses) or (arguments.usual_clothes and scene != "human"):
         raise DyngsError("--varied and --usual-clothes are for the scene human only, --varied without --style")
@@ -321,9 +323,11 @@ def run_synth(arguments: argparse.Namespace) -> int:
             write_walking_capture(out, replace(options, num_test=min(12, views - 1)))
     elif scene == "still":
         synthetic.write_still_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
+    elif scene == "polyhedra":
+        synthetic.write_polyhedra_capture(out, synthetic.StillOptions(size=size, num_train=views, seed=seed))
     else:
         moving = synthetic.DynamicOptions(size=size, num_times=views, num_cameras=cameras, seed=seed, style=style)
         synthetic.write_dynamic_capture(scene, out, moving)
-    preset = "human" if by_poses else "static" if scene == "still" else "dynamic"
+    preset = "human" if by_poses else {"still": "static", "polyhedra": "bg_triangle"}.get(scene, "dynamic")
     print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")
     return 0

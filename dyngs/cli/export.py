@@ -35,8 +35,7 @@ _UNFIT: dict[str, dict[str, str]] = {
         "sh_degree": "the page has the colours of the run",
     },
     "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up") | _FOR_DYNGS,
-    "surface": dict.fromkeys(("times", "motion", *_PARTS, *_AXES), "the file has the surface of a field at one time")
-    | _FOR_DYNGS,
+    "surface": dict.fromkeys(("times", "motion", *_PARTS, *_AXES), "the file has the surface at one time") | _FOR_DYNGS,
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
     "tracks": _FOR_SPLATS,
@@ -93,6 +92,8 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--max-change", type=float, metavar="X", help=about)
     about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
     parser.add_argument("--level", type=float, metavar="X", help=about)
+    about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
+    parser.add_argument("--segments", type=int, metavar="N", help=about)
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "what moves rigidly as animated nodes of a .glb; the rest stands as at --time"
@@ -111,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
-    kind = "surface" if kind == "mesh" and _is_field(arguments) else kind
+    kind = "surface" if kind == "mesh" and _has_surface(arguments) else kind
     _require_fitting(arguments, kind)
     writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
     writers["surface"] = _export_surface
@@ -119,6 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
         return _export_bodies(arguments)
     if arguments.level is not None and kind != "surface":
         raise DyngsError("--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)")
+    if arguments.segments is not None and (kind != "surface" or not 1 <= arguments.segments <= 64):
+        raise DyngsError("--segments, 1 to 64, goes with --format mesh of curved triangles (model.kind=bg_triangle)")
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
@@ -383,23 +386,25 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
     return 0
 
 
-def _is_field(arguments: argparse.Namespace) -> bool:
-    """Return whether the run is a radiance field, whose surface is a mesh."""
+def _has_surface(arguments: argparse.Namespace) -> bool:
+    """Return whether the run is a radiance field or of curved triangles, whose surface is a mesh."""
     from dyngs.config.io import load_resolved
     from dyngs.fields.keys import FieldModel
+    from dyngs.triangles.keys import BgTriangleModel
 
-    return arguments.run_dir.is_dir() and isinstance(load_resolved(arguments.run_dir).model, FieldModel)
+    kinds = FieldModel, BgTriangleModel
+    return arguments.run_dir.is_dir() and isinstance(load_resolved(arguments.run_dir).model, kinds)
 
 
 def _export_surface(arguments: argparse.Namespace) -> int:
-    """Write the surface of a radiance field."""
+    """Write the surface of a radiance field, or curved triangles."""
     from dyngs.export.surface_file import write_surface
     from dyngs.runs.opened import open_scene
 
     out: Path = arguments.out or arguments.run_dir / "mesh.ply"
     opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
     time = 0.0 if arguments.time is None else arguments.time
-    surface = write_surface(opened, out, time=time, level=arguments.level)
+    surface = write_surface(opened, out, time=time, level=arguments.level, segments=arguments.segments)
     args.print_notes((f"{counted(len(surface.faces), 'triangle')} with colours of {len(surface.vertices):,} vertices",))
     args.print_written(out)
     return 0

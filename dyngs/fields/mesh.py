@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,21 +9,13 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.fields.field import PUBLISHED_HALF
 from dyngs.fields.scene import FieldScene
+from dyngs.models.surface import Surface
 
 CELLS = 192  # Along an axis of the innermost cube, unless asked otherwise
 LEVEL = 25.0
 """Density at the surface, unless asked otherwise, per unit of a world whose innermost cube has half side 1.5: half of
 the light is lost in a 36th of a unit."""
 CHUNK = 1 << 17  # Points looked at together
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Triangles with colours, in the world of the field."""
-
-    vertices: np.ndarray  # (V, 3)
-    faces: np.ndarray  # (F, 3) int, anticlockwise from outside
-    colours: np.ndarray  # (V, 3) in [0, 1], seen from straight ahead
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from dyngs.fields.keys import NerfModel, NgpModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import ModelSection
 from dyngs.static.keys import StaticModel
+from dyngs.triangles.keys import BgTriangleModel
 
 if TYPE_CHECKING:
     import torch
@@ -70,6 +71,7 @@ KINDS: tuple[Kind, ...] = (
     Kind(HumanPredictorModel, "dyngs.training.prediction"),
     Kind(NgpModel, "dyngs.fields.kind"),
     Kind(NerfModel, "dyngs.fields.kind"),
+    Kind(BgTriangleModel, "dyngs.triangles.kind"),
 )
 
 

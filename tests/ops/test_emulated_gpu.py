@@ -23,6 +23,7 @@ from dyngs.ops.checks import count_nonfinite_op
 from dyngs.ops.hash_grid import HashLevels, hash_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.nodes import HEAD_SIZES, node_penalties, spline_motion
+from dyngs.ops.patches import Places, blend_patches, outline_crossings, patch_values, visible_patches
 from dyngs.ops.perceptron import GPU_LAYERS, GPU_WIDTH, Layer, perceptron, perceptron_op
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
@@ -230,6 +231,25 @@ def seen_along() -> Made:
     return [*arrays, features, *found, *torch.autograd.grad(loss, table)]
 
 
+def curved() -> Made:
+    """Two views of bent triangles, with gradients by control points and colours."""
+    generator = torch.Generator().manual_seed(0)
+    points = (
+        torch.rand(6, 1, 3, generator=generator) - 0.5 + 0.3 * torch.randn(6, 6, 3, generator=generator)
+    ).requires_grad_()
+    colours = torch.rand(6, 6, 3, generator=generator).requires_grad_()
+    pose = torch.eye(4).repeat(2, 1, 1)
+    pose[:, 2, 3], pose[1, 0, 3] = 3.0, 0.2
+    inner = torch.tensor([[25.0, 0, 12], [0, 25, 10], [0, 0, 1]]).repeat(2, 1, 1)
+    cameras = Cameras(pose, inner, 24, 20)
+    places = Places.of(*visible_patches(points, cameras, 0.2))
+    shown, crossings = patch_values(colours, places.ids, places.uv), outline_crossings(points, cameras, places)
+    at = patch_values(points, places.ids, places.uv)
+    image, through = blend_patches(at[:, :2].contiguous(), shown, crossings, places)
+    loss = image.square().sum() + (through * crossings[:, 0]).sum()
+    return [places.ids, crossings, image, through, *torch.autograd.grad(loss, [points, colours])]
+
+
 CASES: dict[str, Callable[[], Made]] = {
     "render": lambda: drawn(single().gaussians),
     "tally": tallied,
@@ -243,6 +263,7 @@ CASES: dict[str, Callable[[], Made]] = {
     "posing": posed,
     "perceptron": decoded,
     "field": seen_along,
+    "triangles": curved,
 }
 
 

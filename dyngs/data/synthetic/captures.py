@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from dyngs.data.synthetic.polyhedra import polyhedra, true_edges
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X, Scene, is_seen, render_scene, render_things
 from dyngs.data.synthetic.scenes import CORNERS, SceneName, scene_at, still_life
 from dyngs.data.tracks import TrueTracks, write_true_tracks
@@ -96,6 +97,31 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
         for split, poses in splits.items():
             shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
             _write_split(started, split, shots, lambda _: scene, options)
+    return out
+
+
+CLOSE = 0.4  # Distance of close-ups, in that of the other cameras
+
+
+def write_polyhedra_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
+    """Write images of ``polyhedra`` as ``write_still_capture`` does; returns ``out``.
+
+    The split val has as many close-ups as test has images, from 40 % of the distance. ``edges/SPLIT/r_000.png`` is
+    white where the true edges of the images of test and val are.
+    """
+    scene, close = polyhedra(), CLOSE * options.distance
+    splits = {
+        "train": hemisphere_cameras(options.num_train, options.distance, options.seed),
+        "val": orbit_cameras(options.num_test, close, elevation_deg=33.0, start_deg=10.0),
+        "test": orbit_cameras(options.num_test, options.distance, elevation_deg=28.0, start_deg=0.0),
+    }
+    with new_folder(out) as started:
+        for split, poses in splits.items():
+            shots = [_Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            _write_split(started, split, shots, lambda _: scene, options)
+            for shot in shots if split != "train" else ():
+                edges = true_edges(scene, shot.world_from_cam, options.size, options.samples)
+                write_image(started / "edges" / f"{shot.name}.png", edges)
     return out
 
 

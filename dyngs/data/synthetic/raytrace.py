@@ -292,7 +292,7 @@ def render_scene(scene: Scene, world_from_cam: np.ndarray, size: int, samples: i
     color = np.zeros((size * size, 3), np.float32)
     hits = np.zeros(size * size, np.float32)
     origin = world_from_cam[:3, 3].astype(np.float32)
-    for (x, y), directions in _sampled_rays(world_from_cam, size, samples):
+    for (x, y), directions in sampled_rays(world_from_cam, size, samples):
         lamp = f32(scene.lamp) + f32([_LAMP_SIZE * (x - 0.5), _LAMP_SIZE * (y - 0.5), 0.0])
         hit, rgb = _trace(scene, origin, directions, lamp)
         color[hit] += rgb
@@ -317,8 +317,8 @@ def render_things(scene: Scene, world_from_cam: np.ndarray, size: int, samples: 
     """
     counts = np.zeros((1 + len(scene.movers), size * size), np.int64)  # the first row stays 0: none
     origin = world_from_cam[:3, 3].astype(np.float32)
-    for _, directions in _sampled_rays(world_from_cam, size, samples):
-        nearest, distance = _nearest(scene, origin, directions)
+    for _, directions in sampled_rays(world_from_cam, size, samples):
+        nearest, distance = nearest_things(scene, origin, directions)
         counts[1:] += (nearest == np.array(scene.movers)[:, None]) & np.isfinite(distance)
     return counts.argmax(axis=0).astype(np.uint8).reshape(size, size)
 
@@ -328,11 +328,11 @@ def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.
     origin = world_from_cam[:3, 3]
     offset = np.nan_to_num(points - origin)
     distance = np.maximum(np.sqrt(_dot(offset, offset)), 1e-6)
-    _, nearest = _nearest(scene, f32(origin), (offset / distance[:, None]).astype(np.float32))
+    _, nearest = nearest_things(scene, f32(origin), (offset / distance[:, None]).astype(np.float32))
     return np.isfinite(points).all(axis=1) & (nearest > distance - _SURFACE)
 
 
-def _nearest(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_things(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return, per ray, the primitive that it hits first and the distance to it, inf where it hits none."""
     distances = np.stack([p.intersect(origin[None], directions) for p in scene.primitives])
     return distances.argmin(axis=0), distances.min(axis=0)
@@ -340,7 +340,7 @@ def _nearest(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tuple[
 
 def _trace(scene: Scene, origin: np.ndarray, directions: np.ndarray, lamp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return indices of the rays that hit something (R_hit,), and the colours there: sRGB (R_hit, 3)."""
-    nearest, distance = _nearest(scene, origin, directions)
+    nearest, distance = nearest_things(scene, origin, directions)
     hit = np.flatnonzero(np.isfinite(distance))
     nearest, directions = nearest[hit], directions[hit]
     points = origin + distance[hit, None] * directions
@@ -381,7 +381,7 @@ def _shade(
     return rgb + direct * shine[:, None]
 
 
-def _sampled_rays(
+def sampled_rays(
     world_from_cam: np.ndarray, size: int, samples: int
 ) -> Iterator[tuple[tuple[float, float], np.ndarray]]:
     """Yield positions in a pixel, and (size * size, 3) float32 unit directions in the world through them, by rows."""

@@ -211,12 +211,13 @@ def test_an_interrupted_command_leaves_nothing_and_may_be_repeated(
 
 
 def test_the_command_knows_all_scenes() -> None:
-    assert ("still", *get_args(SceneName), "human") == SYNTHETIC_SCENES
+    assert ("still", "polyhedra", *get_args(SceneName), "human") == SYNTHETIC_SCENES
 
 
 @pytest.mark.parametrize(
     ("words", "images", "preset"),
     [
+        (["polyhedra", "--views", "3"], 3, "bg_triangle"),
         (["spin", "--views", "3"], 3, "dynamic"),
         (["room", "--views", "2", "--cameras", "3"], 6, "dynamic"),
         (["room", "--views", "2", "--style", "moving"], 2, "dynamic"),

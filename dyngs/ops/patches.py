@@ -1,0 +1,288 @@
+"""Quadratic triangular Bezier patches: values at places on them, which of them images show, and images of these.
+
+P patches, N places, V views. A place is (u, v), w = 1 - u - v; control points (i, j, k), i + j + k = 2, belong to
+u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The boundary-aware weights of BG-Triangle
+(Wu et al. 2025), 1 inside, a half at an outline, 0 outside, are those of pixels here, not of Gaussians on them: between
+two neighbours that show different patches lies an outline, whose place says how much of each the other one covers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
+from dyngs.ops.checks import check_number, check_size, check_tensors
+from dyngs.ops.native import num_threads
+from dyngs.ops.registration import Gradient, empty_like, launch, register
+
+NUM_POINTS = 6  # of a quadratic patch
+SEGMENTS = 6  # Of an edge: 36 flat faces (Wu et al. 2025)
+MOST_SEGMENTS = 64
+NO_CROSSING = 0.5  # Between pixels neither of which covers any of the other
+
+Along = Literal["u", "v"]
+_BASES: dict[Along | None, int] = {None: 0, "u": -1, "v": -2}
+
+
+def lattice_size(segments: int) -> int:
+    """Return the number of points of a triangular lattice with so many segments along an edge."""
+    return (segments + 1) * (segments + 2) // 2
+
+
+def lattice(segments: int) -> tuple[Tensor, Tensor]:
+    """Return (K, 2) float64 places of a lattice's points, in their order, and (segments^2, 3) faces, facing alike."""
+    uv = [(i / segments, j / segments) for i in range(segments, -1, -1) for j in range(segments - i, -1, -1)]
+
+    def index(i: int, j: int) -> int:
+        row = segments - i
+        return row * (row + 1) // 2 + row - j
+
+    faces: list[tuple[int, int, int]] = []
+    for i in range(segments):
+        for j in range(segments - i):
+            faces.append((index(i, j), index(i + 1, j), index(i, j + 1)))
+            if i + j + 2 <= segments:
+                faces.append((index(i + 1, j + 1), index(i, j + 1), index(i + 1, j)))
+    return torch.tensor(uv, dtype=torch.float64, device="cpu"), torch.tensor(faces, device="cpu")
+
+
+def _values(values: Tensor, ids: Tensor, uv: Tensor, basis: int) -> Tensor:
+    out = values.new_empty(ids.shape[0], values.shape[2])
+    launch(values, "patch_values_forward", uv, ids, values, basis, out, num_threads())
+    return out
+
+
+def _values_backward(like: Tensor, ids: Tensor, uv: Tensor, grad: Tensor, basis: int) -> Tensor:
+    g_values = empty_like(like)
+    launch(grad, "patch_values_backward", uv, ids, grad, basis, g_values, num_threads())
+    return g_values
+
+
+values_backward_op = register("patch_values_backward", _values_backward)
+
+
+def _save_values(ctx: Any, inputs: tuple[Any, ...], _: Tensor) -> None:
+    values, ids, uv, ctx.basis = inputs
+    ctx.save_for_backward(values, ids, uv)
+
+
+def _values_gradient(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    values, ids, uv = ctx.saved_tensors
+    return values_backward_op(values, ids, uv, grad.contiguous(), ctx.basis), None, None, None
+
+
+values_op = register("patch_values", _values, gradient=Gradient(_save_values, _values_gradient))
+
+
+def patch_values(values: Tensor, ids: Tensor, uv: Tensor, along: Along | None = None) -> Tensor:
+    """Return (N, C) values of patches at places on them, differentiable in ``values``; the same on any threads.
+
+    Args:
+        values: (P, 6, C) of control points.
+        ids: (N,) int32 patch of each place.
+        uv: (N, 2) places.
+        along: None: the value; else its derivative along u or v, at the other held constant.
+    """
+    return _looked_up(values, ids, uv, NUM_POINTS, _BASES[along])
+
+
+def lattice_values(values: Tensor, ids: Tensor, uv: Tensor, segments: int) -> Tensor:
+    """Return (N, C): as ``patch_values`` of values (P, K, C) at the points of a lattice, linear between them."""
+    if not 1 <= segments <= MOST_SEGMENTS:
+        raise DyngsError(f"patches: a lattice has 1 to {MOST_SEGMENTS} segments, got {segments}")
+    return _looked_up(values, ids, uv, lattice_size(segments), segments)
+
+
+def _looked_up(values: Tensor, ids: Tensor, uv: Tensor, count: int, basis: int) -> Tensor:
+    patches, _, channels = values.shape
+    check_tensors("patches", {"values": (values, (patches, count, channels)), "uv": (uv, (len(ids), 2))})
+    if ids.dtype != torch.int32:
+        raise DyngsError(f"patches: ids must be int32, got {ids.dtype}")
+    return values_op(values.contiguous(), ids.contiguous(), uv.contiguous().to(values.dtype), basis)
+
+
+@torch.no_grad()
+def visible_patches(points: Tensor, cameras: Cameras, near: float, segments: int = SEGMENTS) -> tuple[Tensor, Tensor]:
+    """Return (V, H, W) int32 patch that each pixel shows, -1 for none, and (V, H, W, 2) where on it.
+
+    A z-buffer of flat faces: perspective-correct, both sides, cut at ``near``; of several as near the first is shown.
+    Patches with a point that is not finite are not. The same on any number of threads.
+
+    Args:
+        points: (P, 6, 3) control points, world.
+        segments: of an edge; a patch is ``segments``^2 faces.
+    """
+    check_number("near", near, 1e-9)
+    check_tensors("patches", {"points": (points, (len(points), NUM_POINTS, 3))})
+    check_size(cameras.width, cameras.height)
+    if not 1 <= segments <= MOST_SEGMENTS:
+        raise DyngsError(f"patches: an edge has 1 to {MOST_SEGMENTS} segments, got {segments}")
+    cameras = cameras.to(dtype=points.dtype)
+    shape = len(cameras), cameras.height, cameras.width
+    ids = torch.empty(shape, dtype=torch.int32, device=points.device)
+    uv = points.new_empty(*shape, 2)
+    pose, intrinsics = cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()
+    launch(points, "visible_patches", points.contiguous(), pose, intrinsics, segments, near, ids, uv, num_threads())
+    return ids, uv
+
+
+def _ends(
+    points: Tensor, cameras: list[Tensor], views: Tensor, ids: Tensor, uv: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    found = torch.empty(ids.shape, dtype=torch.bool, device=ids.device)
+    out = uv.new_empty(ids.shape), torch.empty_like(uv), torch.empty_like(uv)
+    launch(points, "patch_ends", points, *cameras, uv, (views, ids, directions), found, out, num_threads())
+    return found, *out
+
+
+ends_op = register("patch_ends", _ends)
+"""Whether and where patches end between places on them and the next pixels; ``cameras``: poses and intrinsics."""
+
+
+def _blend(means: Tensor, colours: Tensor, crossings: Tensor, rows: Tensor, ids: Tensor) -> tuple[Tensor, Tensor]:
+    out = colours.new_empty(*rows.shape, colours.shape[1]), colours.new_empty(rows.shape)
+    launch(colours, "blend_patches_forward", colours, crossings, rows, ids, out, num_threads())
+    return out
+
+
+def _blend_backward(inputs: list[Tensor], grads: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    colours, crossings, rows, ids = inputs
+    out = colours.new_empty(len(colours), 2), empty_like(colours), empty_like(crossings)
+    launch(colours, "blend_patches_backward", colours, crossings, rows, ids, tuple(grads), out, num_threads())
+    return out
+
+
+blend_backward_op = register("blend_patches_backward", _blend_backward)
+"""Gradients by means, colours and crossings; ``inputs`` are the last four of ``blend_patches``."""
+
+
+def _save_blend(ctx: Any, inputs: tuple[Any, ...], _: tuple[Tensor, ...]) -> None:
+    ctx.save_for_backward(*inputs[1:])
+
+
+def _blend_gradient(ctx: Any, image: Tensor, transmittance: Tensor) -> tuple[Tensor | None, ...]:
+    grads = [image.contiguous(), transmittance.contiguous()]
+    return *blend_backward_op(list(ctx.saved_tensors), grads), None, None
+
+
+blend_op = register("blend_patches", _blend, gradient=Gradient(_save_blend, _blend_gradient))
+
+
+@dataclass(frozen=True)
+class Places:
+    """The N places on patches that the pixels of V views show."""
+
+    rows: Tensor  # (V, H, W) int32, which of them a pixel shows; -1: nothing
+    ids: Tensor  # (N,) int32 patches
+    uv: Tensor  # (N, 2)
+
+    @staticmethod
+    def of(ids: Tensor, uv: Tensor) -> Places:
+        """Return the places of what ``visible_patches`` returned, view by view, row by row."""
+        shown = ids >= 0
+        rows = torch.where(shown, shown.flatten().cumsum(0).view(ids.shape) - 1, -1).to(torch.int32)
+        return Places(rows, ids[shown], uv[shown])
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Points of patches in an image, differentiable."""
+
+    means: Tensor  # (N, 2) px
+    depths: Tensor  # (N,)
+
+
+def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> Projected:
+    """Return where ``points`` (N, 3) of the world are in the images of ``views`` (N,)."""
+    which = slice(0, 1) if len(cameras) == 1 else views
+    pose, inner = cameras.cam_from_world[which], cameras.intrinsics[which]
+    local = points @ pose[0, :3, :3].T if len(cameras) == 1 else (pose[:, :3, :3] * points[:, None]).sum(2)
+    x, y, z = (local + pose[:, :3, 3]).unbind(1)
+    across, down = inner[:, 0, 0] * x / z + inner[:, 0, 2], inner[:, 1, 1] * y / z + inner[:, 1, 2]
+    return Projected(torch.stack([across, down], 1), z)
+
+
+def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tensor:
+    """Return (V, 2, H, W): how far from a pixel's centre to the next in its row, in its column, their outline is.
+
+    ``NO_CROSSING`` where both show the same patch, where the outline runs rather along the row or column than across
+    it, or where neither ends in between: then what shows is a fold. Where both end there it is the middle of the two
+    ends. Differentiable in ``points`` (P, 6, 3).
+    """
+    views, height, width = places.rows.shape
+    out = points.new_full((views, 2, height, width), NO_CROSSING)
+    if not len(places.ids):
+        return out
+    pairs = [_differing(places, axis) for axis in (0, 1)]
+    first, second, to = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+    axis = (to // (height * width)) % 2
+    steps, found = _ends_between(
+        points, cameras, places, torch.cat([first, second]), torch.cat([2 * axis, 2 * axis + 1])
+    )
+    (a, b), (of_a, of_b) = steps.view(2, -1), found.view(2, -1)
+    middle = torch.where(of_b, 0.5 * (a + 1 - b), a)
+    crossing = torch.where(of_a, middle, torch.where(of_b, 1 - b, NO_CROSSING))
+    return out.view(-1).index_put((to,), crossing).view_as(out)
+
+
+def _differing(places: Places, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return indices of pixels that show another patch than the next along x (axis 0) or y, of those, of crossings."""
+    rows = places.rows
+    _, height, width = rows.shape
+    labels = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1)
+    differs = torch.zeros(labels.shape, dtype=torch.bool, device=labels.device)
+    if axis == 0:
+        differs[:, :, :-1] = labels[:, :, 1:] != labels[:, :, :-1]
+    else:
+        differs[:, :-1] = labels[:, 1:] != labels[:, :-1]
+    first = differs.view(-1).nonzero()[:, 0]
+    return first, first + (1, width)[axis], first + (first // (height * width) + axis) * (height * width)
+
+
+def _ends_between(
+    points: Tensor, cameras: Cameras, places: Places, pixels: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return (N,) steps in ``directions`` from ``pixels`` to where what they show ends, and (N,) whether it does."""
+    rows = places.rows.view(-1)[pixels].long()
+    ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0)], -1)
+    views = (pixels // places.rows[0].numel()).to(torch.int32)
+    found, steps, uv, slopes = ends_op(
+        points.detach().contiguous(),
+        [cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()],
+        views,
+        ids,
+        places.uv[rows.clamp_min(0)].contiguous(),
+        directions.to(torch.int32),
+    )
+    which = found.nonzero()[:, 0]
+    edges = patch_values(points, ids[which], uv[which])
+    means = project_points(edges, cameras, views[which].long()).means
+    moved = steps[which] + ((means - means.detach()) * slopes[which]).sum(1)
+    return steps.index_put((which,), moved), found
+
+
+def blend_patches(means: Tensor, colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
+    """Return (V, H, W, C) images before black and (V, H, W) transmittance, differentiable once.
+
+    A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel and the next one,
+    with an outline t steps from the first (``crossings``), max(0, 1/2 - t) of the first are the second's, and
+    max(0, t - 1/2) of the second the first's. Where neighbours would cover more than all of a pixel their shares are
+    scaled to it. The same bits on any number of threads.
+
+    Args:
+        means: (N, 2) px, of the places, which are at the centres of their pixels: not read. Their gradient is that of
+            moving what a patch shows along the image, by differences of neighbours on the same patch.
+        colours: (N, C).
+        crossings: (V, 2, H, W), see ``outline_crossings``.
+    """
+    count, (views, height, width) = len(places.ids), places.rows.shape
+    checked = {"means": (means, (count, 2)), "colours": (colours, (count, colours.shape[-1]))}
+    check_tensors("patches", checked | {"crossings": (crossings, (views, 2, height, width))})
+    if not means.dtype == colours.dtype == crossings.dtype:
+        raise DyngsError("patches: means, colours and crossings of one dtype")
+    return blend_op(means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids)

@@ -1,0 +1,168 @@
+"""Curved triangles in training: where they are and their colours first, textures after that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dyngs.adam import AdamState
+from dyngs.data.loader import Image
+from dyngs.errors import DyngsError
+from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import RunStart
+from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.schedule import scaled
+from dyngs.models.views import evaluation_background
+from dyngs.state import State, prefixed
+from dyngs.triangles.densify import change
+from dyngs.triangles.keys import BgTriangleModel
+from dyngs.triangles.patches import Patches
+from dyngs.triangles.scene import TriangleScene, rendering_of, scene_options, stored_triangles
+from dyngs.triangles.tallies import Tallies, slopes_of
+
+EVERY, LEAST_EVERY, UNTIL = 300, 50, 14_000
+"""Steps between changes of a 30,000-step run, the fewest in any run, and after how many of 30,000 none is changed."""
+HARMONICS_SLOWER = 20.0  # than colours
+LAST_COLOUR = 0.1  # Of their learning rate, at the end of each stage
+
+
+First = Callable[[RunStart, BgTriangleModel], tuple[Patches, float]]
+"""What the first step begins with, in place of what was there before: triangles, and half the side of their scene."""
+
+
+class TriangleTraining(Model[TriangleScene]):
+    """See the module."""
+
+    def __init__(
+        self, run: RunStart, patches: Patches, unit: float, model: BgTriangleModel, first: First | None = None
+    ) -> None:
+        self._run, self._model, self._unit, self._first = run, model, unit, first
+        options = scene_options(model, unit)
+        behind = evaluation_background(run.config.data.background, run.capture.has_alpha)[1]
+        self._like = TriangleScene(patches, unit, options, behind)
+        self._begin(patches)
+
+    def _begin(self, patches: Patches) -> None:
+        """Learn ``patches`` from now on, with empty moments and tallies."""
+        self._take(patches)
+        self._adam = AdamState.zero(self._patches.tensors)
+
+    def _take(self, patches: Patches) -> None:
+        self._patches = patches.of({name: x.detach().requires_grad_() for name, x in patches.tensors.items()})
+        self._tallies, self._now = Tallies(len(patches)), Tallies(len(patches))
+
+    @property
+    def scene(self) -> TriangleScene:
+        return replace(self._like, patches=self._patches)
+
+    @property
+    def leaves(self) -> Sequence[Tensor]:
+        return list(self._patches.tensors.values())
+
+    @property
+    def is_textured(self) -> bool:
+        """Whether textures are learned, and places no more."""
+        return self._patches.texture > 0
+
+    def _begin_on_surface(self) -> None:
+        """Go on with what the first step begins with."""
+        if self._first is None:
+            return
+        patches, unit = self._first(self._run, self._model)
+        self._first = None
+        self._set_unit(unit)
+        self._begin(patches)
+
+    def _set_unit(self, unit: float) -> None:
+        self._unit = unit
+        self._like = replace(self._like, unit=unit, options=scene_options(self._model, unit))
+
+    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+        self._begin_on_surface()
+        options = replace(self._like.options, depth="expected" if depth else "none")
+        view = self.scene.view(image.cameras, options)
+        if not self.is_textured:
+            self._now.count(view.places, slopes_of(image.composite(background)))
+        return Drawn(rendering_of([view], background, options))
+
+    def tallies(self, step: int) -> Sequence[Tensor]:
+        return [] if self.is_textured else list(self._now.tensors().values())
+
+    def update(self, step: int) -> Updated:
+        steps, patches = self._run.config.train.steps, self._patches
+        grad = patches.points.grad
+        if not self.is_textured and grad is not None:
+            self._now.gradients += grad.norm(dim=-1).sum(1) * self._now.views
+            self._tallies.add(self._now)
+            self._now = Tallies(len(patches))
+        rates = self._rates(step)
+        updates = [self._adam.update(name, x, rates[name]) for name, x in patches.tensors.items() if rates[name] > 0]
+        bad = self._adam.steps_(updates, step=step)
+        for x in self.leaves:
+            x.grad = None
+        if not self.is_textured and self._last_step_of_places <= step < steps:
+            self._texture()
+            return Updated(bad, f"textures are learned from now on, on {len(patches):,} triangles", True)
+        return self._changed(step, bad) if self._is_due(step) else Updated(bad)
+
+    def _rates(self, step: int) -> dict[str, float]:
+        """Return the learning rate of each tensor in ``step``."""
+        steps, model = self._run.config.train.steps, self._model
+        until = steps if model.moves_on else self._last_step_of_places
+        moved = min(1.0, step / max(1, until))
+        position = self._unit * model.lr_position ** (1 - moved) * model.lr_position_final**moved
+        begun = self._last_step_of_places if self.is_textured else 0
+        end = steps if self.is_textured else self._last_step_of_places
+        colour = model.lr_colour * LAST_COLOUR ** min(1.0, (step - begun) / max(1, end - begun))
+        stops = self.is_textured and not model.moves_on
+        return {"points": 0.0 if stops else position, "colours": colour, "harmonics": colour / HARMONICS_SLOWER}
+
+    def _texture(self) -> None:
+        """Learn textures from now on, with the moments of what stays as it is."""
+        before = self._adam
+        self._begin(self._patches.textured(self._model.texture))
+        for name in ("points", "harmonics"):
+            self._adam.exp_avg[name], self._adam.exp_avg_sq[name] = before.exp_avg[name], before.exp_avg_sq[name]
+
+    @property
+    def _interval(self) -> int:
+        return max(LEAST_EVERY, scaled(EVERY, self._run.config.train.steps))
+
+    def _is_due(self, step: int) -> bool:
+        until = min(scaled(UNTIL, self._run.config.train.steps), self._last_step_of_places)
+        return not self.is_textured and step % self._interval == 0 and step <= until
+
+    @property
+    def _last_step_of_places(self) -> int:
+        return round(self._model.texture_from * self._run.config.train.steps)
+
+    def _changed(self, step: int, bad: Tensor | int) -> Updated:
+        until = min(scaled(UNTIL, self._run.config.train.steps), self._last_step_of_places)
+        rounds = 1 + (until - step) // self._interval
+        found = change(self._patches, self._tallies, self._unit, self._model.max_triangles, rounds)
+        adam = AdamState(
+            {name: found.of_moments(name, x) for name, x in self._adam.exp_avg.items()},
+            {name: found.of_moments(name, x) for name, x in self._adam.exp_avg_sq.items()},
+        )
+        self._take(self._patches.of({name: found.of(name, x) for name, x in self._patches.tensors.items()}))
+        self._adam = adam
+        return Updated(bad, is_rearranged=True)
+
+    def state(self) -> State:
+        kept = prefixed("adam", self._adam.state()) | prefixed("tallies", self._tallies.state())
+        return self.scene.state() | kept
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        patches, unit = stored_triangles(checkpoint)
+        self._first = None
+        self._set_unit(unit)
+        self._take(patches)
+        self._adam = AdamState.restored(checkpoint.part("adam"), self._patches.tensors)
+        self._tallies = Tallies.restored(checkpoint.part("tallies"), len(patches))
+
+    def place(self, device: torch.device) -> None:
+        if device.type != "cpu":
+            raise DyngsError("model.kind=bg_triangle is trained on the CPU: give run.device=cpu")

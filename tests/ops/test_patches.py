@@ -1,0 +1,331 @@
+"""Bezier patches: values, what images show, and blending, against plain torch in float64 and known answers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from patch_reference import bernstein, reference_blend, reference_values, reference_visible
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
+from dyngs.ops.native import kernel_threads
+from dyngs.ops.patches import (
+    Places,
+    blend_backward_op,
+    blend_op,
+    blend_patches,
+    ends_op,
+    lattice,
+    lattice_size,
+    lattice_values,
+    outline_crossings,
+    patch_values,
+    project_points,
+    values_backward_op,
+    values_op,
+    visible_patches,
+)
+
+
+def camera(width: int = 24, height: int = 18, distance: float = 3.0, views: int = 1) -> Cameras:
+    """Looking along z from ``distance`` in front of the origin."""
+    pose = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
+    pose[:, 2, 3] = distance
+    pose[:, 0, 3] = torch.linspace(0, 0.4, views, dtype=torch.float64) if views > 1 else 0.0
+    inner = torch.tensor([[20.0, 0, width / 2], [0, 21.0, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return Cameras(pose, inner.repeat(views, 1, 1), width, height)
+
+
+def random_patches(count: int, seed: int = 0, size: float = 0.6) -> Tensor:
+    """(P, 6, 3) around the origin, bent at random."""
+    generator = torch.Generator().manual_seed(seed)
+    middle = torch.rand(count, 1, 3, generator=generator, dtype=torch.float64) * 1.6 - 0.8
+    return middle + size * torch.randn(count, 6, 3, generator=generator, dtype=torch.float64)
+
+
+def flat(*corners: tuple[float, float, float]) -> Tensor:
+    """(1, 6, 3) a flat triangle."""
+    a, b, c = torch.tensor(corners, dtype=torch.float64)
+    return torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c])[None]
+
+
+def random_places(count: int, patches: int, seed: int = 1) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    uv = torch.rand(count, 2, generator=generator, dtype=torch.float64)
+    uv = torch.where(uv.sum(1, keepdim=True) > 1, 1 - uv, uv)
+    return torch.randint(patches, (count,), generator=generator, dtype=torch.int32), uv
+
+
+def test_values_are_those_of_bernstein_polynomials() -> None:
+    values = random_patches(5).requires_grad_()
+    ids, uv = random_places(40, 5)
+    found, expected = patch_values(values, ids, uv), reference_values(values, ids, uv)
+    torch.testing.assert_close(found, expected)
+    grad = torch.randn_like(found)
+    torch.testing.assert_close(*(torch.autograd.grad(x, values, grad)[0] for x in (found, expected)))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_derivatives_are_those_of_the_values(axis: int) -> None:
+    values, (ids, uv) = random_patches(3), random_places(20, 3)
+    step = torch.zeros(2, dtype=torch.float64)
+    step[axis] = 1e-5
+    slope = (patch_values(values, ids, uv + step) - patch_values(values, ids, uv - step)) / 2e-5
+    torch.testing.assert_close(patch_values(values, ids, uv, "uv"[axis]), slope)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("segments", [1, 2, 5])
+def test_a_lattice_is_linear_between_its_points(segments: int) -> None:
+    places, faces = lattice(segments)
+    assert places.shape == (lattice_size(segments), 2)
+    assert faces.shape == (segments**2, 3)
+    values = torch.randn(2, len(places), 3, dtype=torch.float64).requires_grad_()
+    ids = torch.ones(len(places), dtype=torch.int32)
+    torch.testing.assert_close(lattice_values(values, ids, places, segments), values[1])
+    middles = places[faces].mean(1)
+    found = lattice_values(values, torch.zeros(len(faces), dtype=torch.int32), middles, segments)
+    torch.testing.assert_close(found, values[0][faces].mean(1))
+    some, uv = random_places(30, 2)
+    assert torch.autograd.gradcheck(lambda x: lattice_values(x, some, uv, segments), values)
+
+
+def test_a_lattice_of_linear_values_is_them() -> None:
+    """A function that is linear on the whole patch is so on the lattice's, wherever it is looked up."""
+    places, _ = lattice(4)
+    ids, uv = random_places(50, 1)
+    torch.testing.assert_close(lattice_values(places[None], ids, uv, 4), uv)
+
+
+def test_faces_of_a_lattice_face_alike_and_fill_it() -> None:
+    places, faces = lattice(6)
+    a, b, c = places[faces].unbind(1)
+    areas = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+    torch.testing.assert_close(areas, torch.full((36,), 1 / 72, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pixels_show_the_nearest_patch(seed: int) -> None:
+    points, cameras = random_patches(4, seed), camera(12, 9, 2.0, views=2)
+    ids, uv = visible_patches(points, cameras, 0.7, 2)
+    expected, places, _ = reference_visible(points, cameras, 0.7, 2)
+    torch.testing.assert_close(ids, expected)
+    assert (ids >= 0).any()
+    torch.testing.assert_close(uv, places)
+
+
+def test_what_is_shown_projects_to_its_pixel() -> None:
+    """A slanted flat patch: perspective-correct places, on the rays of the pixels' centres."""
+    cameras = camera()
+    points = flat((-1, -0.8, -1), (1, -0.5, 2), (0, 0.9, 0))
+    ids, uv = visible_patches(points, cameras, 0.2)
+    places = Places.of(ids, uv)
+    assert len(places.ids) > 30
+    x, y, z = patch_values(points, places.ids, places.uv).unbind(1)
+    rows = (ids[0] >= 0).nonzero()
+    torch.testing.assert_close(20 * x / (z + 3) + 12, rows[:, 1].double() + 0.5)
+    torch.testing.assert_close(21 * y / (z + 3) + 9, rows[:, 0].double() + 0.5)
+
+
+def test_both_sides_are_shown_and_the_first_of_equals() -> None:
+    patch = flat((-1, -1, 0), (1, -1, 0), (0, 1, 0))
+    turned = patch[:, [0, 2, 1, 5, 4, 3]]
+    ids, _ = visible_patches(torch.cat([patch, patch]), camera(), 0.2)
+    assert (ids == 0).sum() > 50
+    assert not (ids == 1).any()
+    torch.testing.assert_close(visible_patches(turned, camera(), 0.2)[0], visible_patches(patch, camera(), 0.2)[0])
+
+
+def test_neighbours_leave_no_gap() -> None:
+    corners = [(-1.0, -1.0, 0.3), (1.0, -1.0, -0.2), (1.0, 1.0, 0.1), (-1.0, 1.0, 0.0)]
+    both = torch.cat([flat(corners[0], corners[1], corners[2]), flat(corners[0], corners[2], corners[3])])
+    for width in (17, 24, 33):
+        ids, _ = visible_patches(both.float(), camera(width, width, 3.2).to(dtype=torch.float32), 0.2)
+        inside = ids[0, width // 3 : -(width // 3), width // 3 : -(width // 3)]
+        assert (inside >= 0).all()
+
+
+def test_what_cannot_be_drawn_is_not() -> None:
+    """All points equal, collinear, behind the camera, nearer than near, not a number, infinite."""
+    point = flat((0, 0, 0), (0, 0, 0), (0, 0, 0))
+    line = flat((-1, 0, 0), (0, 0, 0), (1, 0, 0))
+    behind = flat((-1, -1, -4), (1, -1, -4), (0, 1, -5))
+    near = flat((-1, -1, -2.9), (1, -1, -2.9), (0, 1, -2.9))
+    patch = flat((-1, -1, 0), (1, -1, 0), (0, 1, 0))
+    nan, infinite = patch.clone(), patch.clone()
+    nan[0, 4, 1], infinite[0, 2, 0] = math.nan, math.inf
+    ids, uv = visible_patches(torch.cat([point, line, behind, near, nan, infinite]), camera(), 0.2)
+    assert (ids == -1).all()
+    assert uv.isfinite().all()
+
+
+def test_a_patch_through_the_near_plane_is_cut_there() -> None:
+    """Larger than all that is seen, from behind the camera to far away: a floor below it."""
+    floor = flat((-1e4, 1, -1e4), (1e4, 1, -1e4), (0, 1, 2e4))
+    cameras = camera()
+    ids, uv = visible_patches(floor, cameras, 2.5)
+    rows = (ids[0] >= 0).any(1).nonzero().flatten()
+    assert rows.tolist() == list(range(9, 17))  # z = 21 / (y + 0.5 - 9), at least 2.5
+    assert ((uv >= 0) & (uv <= 1)).all()
+
+
+def some_image(seed: int, views: int = 1, width: int = 14, height: int = 11) -> tuple[Tensor, Tensor, Tensor, Places]:
+    """Means, colours of two channels, crossings anywhere, and the places of pixels that show one of three patches."""
+    ids, uv = visible_patches(random_patches(3, seed, 0.5), camera(width, height, views=views), 0.2)
+    places = Places.of(ids, uv)
+    generator = torch.Generator().manual_seed(seed)
+    means = (ids >= 0).nonzero()[:, [2, 1]] + 0.5
+    colours = torch.rand(len(means), 2, generator=generator, dtype=torch.float64)
+    crossings = torch.rand(views, 2, height, width, generator=generator, dtype=torch.float64)
+    return means.double().requires_grad_(), colours.requires_grad_(), crossings.requires_grad_(), places
+
+
+@pytest.mark.parametrize(("seed", "views"), [(0, 1), (1, 2), (2, 1)])
+def test_blending_is_what_it_is_defined_as(seed: int, views: int) -> None:
+    means, colours, crossings, places = some_image(seed, views)
+    found = blend_patches(means, colours, crossings, places)
+    expected = reference_blend(colours, crossings, places)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other)
+    grads = [torch.randn_like(x) for x in found]
+    for one, other in zip(
+        torch.autograd.grad(found, (colours, crossings), grads),
+        torch.autograd.grad(expected, (colours, crossings), grads),
+        strict=True,
+    ):
+        assert other.abs().max() > 0
+        torch.testing.assert_close(one, other)
+
+
+def drawn(points: Tensor, cameras: Cameras, colours: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Images of patches, whose control points have ``colours`` (P, 6, C), and transmittance."""
+    places = Places.of(*visible_patches(points.detach(), cameras, 0.2))
+    views = (places.rows >= 0).nonzero()[:, 0]
+    means = project_points(patch_values(points, places.ids, places.uv), cameras, views).means
+    shown = torch.ones(len(places.ids), 1, dtype=points.dtype)
+    if colours is not None:
+        shown = patch_values(colours, places.ids, places.uv)
+    return blend_patches(means, shown, outline_crossings(points, cameras, places), places)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, 1.1, 2.0])
+def test_an_outline_covers_the_area_that_it_encloses(turn: float) -> None:
+    """To a hundredth of a pixel for each that it crosses, and at each corner a part of one."""
+    angles = turn + torch.arange(3, dtype=torch.float64) * 2.0943951
+    points = flat(*[(float(a.cos()), float(a.sin()), 0.0) for a in angles])
+    image, through = drawn(points, camera().scaled(3))
+    torch.testing.assert_close(image[..., 0] + through, torch.ones_like(through))
+    crossed = int(((image > 0) & (image < 1)).sum())
+    assert abs(float(image.sum()) - 0.75 * 3**0.5 * 20 * 21) < 0.01 * crossed + 1
+
+
+@pytest.mark.parametrize("edge", [0.0, 0.21, 0.5, 0.73])
+def test_a_pixel_is_covered_as_far_as_the_outline_goes(edge: float) -> None:
+    """An upright edge at column 15 + ``edge``."""
+    right = (15 + edge - 12) * 3 / 20
+    points = flat((right, -9, 0), (right, 9, 0), (-20, 0, 0))
+    _, through = drawn(points, camera())
+    torch.testing.assert_close(through[0, 9, 13:18], torch.tensor([0, 0, 1 - edge, 1, 1], dtype=torch.float64))
+
+
+def test_the_nearer_one_covers_the_other_along_its_own_outline() -> None:
+    """A strip before a wall: only the strip's edges are outlines, and only they get a gradient."""
+    wall = flat((-9, -9, 1), (9, -9, 1), (0, 18, 1))
+    strip = flat((-0.4, -9, 0), (0.41, 0, 0), (-0.4, 9, 0))
+    points = torch.cat([wall, strip]).requires_grad_()
+    colours = torch.stack([torch.zeros(6, 1), torch.ones(6, 1)]).double()
+    image, through = drawn(points, camera(), colours)
+    assert (through == 0).all()
+    (by_points,) = torch.autograd.grad(image.sum(), points)
+    assert (by_points[0] == 0).all()
+    assert by_points[1, 3, 0] > 1
+
+
+def test_two_that_meet_share_their_outline() -> None:
+    """Neighbours of one wall: no light comes through, and both ends of the outline move it."""
+    one, other = flat((0.03, -9, 0), (0.03, 9, 0), (-20, 0, 0)), flat((0.03, -9, 0), (0.03, 9, 0), (20, 0, 0))
+    points = torch.cat([one, other]).requires_grad_()
+    image, through = drawn(points, camera(), torch.stack([torch.zeros(6, 1), torch.ones(6, 1)]).double())
+    assert (through == 0).all()
+    (by_points,) = torch.autograd.grad(image.sum(), points)
+    torch.testing.assert_close(by_points[0, :4].sum(0), by_points[1, :4].sum(0))
+    assert by_points[0, 0, 0] < 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_gradient_is_that_of_what_is_drawn(seed: int) -> None:
+    """Of whole images by control points, against differences: outlines move, and colours move along."""
+    points = random_patches(1, seed + 7, 0.1) * 0.2
+    points = points + flat((-0.8, -0.7, 0.2), (0.9, -0.3, 0), (-0.2, 0.8, -0.1))
+    colours = torch.linspace(0, 1, 6, dtype=torch.float64).view(1, 6, 1) * 0.4 + 0.5
+    cameras = camera(48, 36).scaled(6)
+    ramp = torch.linspace(0.5, 1.5, cameras.width, dtype=torch.float64)[:, None]
+
+    def total(x: Tensor) -> Tensor:
+        return (drawn(x, cameras, colours)[0] * ramp).sum() / 36
+
+    leaf = points.clone().requires_grad_()
+    (found,) = torch.autograd.grad(total(leaf), leaf)
+    step = 2e-2
+    slopes = torch.zeros_like(points)
+    for i in range(6):
+        for axis in range(3):
+            moved = torch.zeros_like(points)
+            moved[0, i, axis] = step
+            slopes[0, i, axis] = (total(points + moved) - total(points - moved)) / (2 * step)
+    error = (found - slopes).norm() / slopes.norm()
+    assert error < 0.1, (error, found, slopes)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_same_bytes_on_any_number_of_threads(dtype: torch.dtype) -> None:
+    points, cameras = random_patches(30, 3, 0.3).to(dtype), camera(70, 75, 2.5, views=2).to(dtype=dtype)
+    results = []
+    for threads in (1, 2, 4):
+        with kernel_threads(threads):
+            values = points.clone().requires_grad_()
+            ids, uv = visible_patches(values, cameras, 0.2)
+            places = Places.of(ids, uv)
+            at, crossings = patch_values(values, places.ids, places.uv), outline_crossings(values, cameras, places)
+            image, through = blend_patches(at[:, :2] * 20 + 30, at, crossings, places)
+            (image.square().sum() + through.sum()).backward()
+            results.append([ids, uv, crossings.detach(), image.detach(), through.detach(), values.grad])
+    for other in results[1:]:
+        for one, two in zip(results[0], other, strict=True):
+            assert one is not None
+            assert two is not None
+            assert torch.equal(one, two)
+
+
+def test_the_ops_are_those_of_torch() -> None:
+    values, (ids, uv) = random_patches(2), random_places(5, 2)
+    torch.library.opcheck(values_op, (values.requires_grad_(), ids, uv, 0))
+    means, colours, crossings, places = some_image(0)
+    torch.library.opcheck(values_backward_op, (values.detach(), ids, uv, torch.ones(5, 3, dtype=torch.float64), 0))
+    torch.library.opcheck(blend_op, (means, colours, crossings, places.rows, places.ids))
+    inputs = [colours.detach(), crossings.detach(), places.rows, places.ids]
+    grads = [x.detach() for x in blend_patches(means, colours, crossings, places)]
+    torch.library.opcheck(blend_backward_op, (inputs, grads))
+    at = [x.detach() for x in (camera().cam_from_world, camera().intrinsics)]
+    torch.library.opcheck(ends_op, (values.detach(), at, torch.zeros_like(ids), ids, uv, torch.zeros_like(ids)))
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    values, (ids, uv) = random_patches(2), random_places(5, 2)
+    with pytest.raises(DyngsError, match="values must be"):
+        patch_values(values[:, :5], ids, uv)
+    with pytest.raises(DyngsError, match="ids must be int32"):
+        patch_values(values, ids.long(), uv)
+    with pytest.raises(ValueError, match="no patch has"):
+        patch_values(values, ids + 2, uv)
+    with pytest.raises(DyngsError, match="segments"):
+        lattice_values(values, ids, uv, 0)
+    with pytest.raises(DyngsError, match="near"):
+        visible_patches(values, camera(), 0.0)
+
+
+def test_weights_of_a_patch_sum_to_one() -> None:
+    uv = random_places(20, 1)[1]
+    torch.testing.assert_close(bernstein(uv[:, 0], uv[:, 1]).sum(1), torch.ones(20, dtype=torch.float64))

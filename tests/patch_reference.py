@@ -1,0 +1,84 @@
+"""Bezier patches in plain torch, pixel by pixel: what the kernels are tested against."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.ops.patches import Places, lattice
+
+ORDER = (2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2)
+
+
+def bernstein(u: Tensor, v: Tensor) -> Tensor:
+    """(..., 6) weights of the control points."""
+    w = 1 - u - v
+    weights = []
+    for i, j, k in ORDER:
+        count = 2 / (math.factorial(i) * math.factorial(j) * math.factorial(k))
+        weights.append(count * u**i * v**j * w**k)
+    return torch.stack(weights, -1)
+
+
+def reference_values(values: Tensor, ids: Tensor, uv: Tensor) -> Tensor:
+    return (bernstein(uv[:, 0], uv[:, 1])[..., None] * values[ids.long()]).sum(1)
+
+
+def reference_visible(points: Tensor, cameras: Cameras, near: float, segments: int) -> tuple[Tensor, Tensor, Tensor]:
+    """(V, H, W) ids, (V, H, W, 2) places and (V, H, W) depth: each ray with each face, by Cramer's rule."""
+    places, faces = lattice(segments)
+    corners = torch.einsum("kb,pbc->pkc", bernstein(places[:, 0], places[:, 1]), points.double())
+    shape = len(cameras), cameras.height, cameras.width
+    ids, uv = torch.full(shape, -1, dtype=torch.int32), torch.zeros(*shape, 2, dtype=torch.float64)
+    depth = torch.full(shape, math.inf, dtype=torch.float64)
+    for view in range(len(cameras)):
+        pose, inner = cameras.cam_from_world[view].double(), cameras.intrinsics[view].double()
+        seen = corners @ pose[:3, :3].T + pose[:3, 3]
+        for y in range(cameras.height):
+            for x in range(cameras.width):
+                ray = torch.linalg.solve(inner, torch.tensor([x + 0.5, y + 0.5, 1.0], dtype=torch.float64))
+                for patch in range(len(points)):
+                    for face in faces:
+                        a = seen[patch][face].T
+                        if abs(float(torch.linalg.det(a))) < 1e-12:
+                            continue
+                        part = torch.linalg.solve(a, ray)
+                        if (part < 0).any() or part.sum() <= 0:
+                            continue
+                        z = float(1 / part.sum())
+                        if z >= near and z < depth[view, y, x]:
+                            depth[view, y, x], ids[view, y, x] = z, patch
+                            uv[view, y, x] = (part / part.sum()) @ places[face]
+    return ids, uv, depth
+
+
+def reference_blend(colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
+    """As ``blend_patches``, by its definition; what a pixel shows is a row of colours and of how much is nothing."""
+    views, height, width = places.rows.shape
+    shown = torch.cat([colours, torch.zeros_like(colours[:, :1])], 1)
+    nothing = torch.nn.functional.pad(colours.new_zeros(colours.shape[1]), (0, 1), value=1.0)
+    pixels: list[Tensor] = []
+    for view in range(views):
+
+        def at(x: int, y: int, view: int = view) -> Tensor:
+            row = int(places.rows[view, y, x])
+            return nothing if row < 0 else shown[row]
+
+        for y in range(height):
+            for x in range(width):
+                shares: list[tuple[Tensor, Tensor]] = []
+                for axis, (dx, dy) in enumerate(((1, 0), (0, 1))):
+                    if x + dx < width and y + dy < height:
+                        covered = (0.5 - crossings[view, axis, y, x]).clamp_min(0)
+                        shares.append((covered, at(x + dx, y + dy)))
+                    if x >= dx and y >= dy:
+                        covered = (crossings[view, axis, y - dy, x - dx] - 0.5).clamp_min(0)
+                        shares.append((covered, at(x - dx, y - dy)))
+                total = sum((share for share, _ in shares), colours.new_zeros(()))
+                mixed = (1 - total).clamp_min(0) * at(x, y) + sum((share * c for share, c in shares), nothing * 0)
+                pixels.append(mixed / total.clamp_min(1))
+    image = torch.stack(pixels).view(views, height, width, -1)
+    return image[..., :-1], image[..., -1]

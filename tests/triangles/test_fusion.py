@@ -1,0 +1,100 @@
+"""Depths of a ball, seen from all around, as one surface, and that as few triangles."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from small_triangles import camera
+
+from dyngs.camera import Cameras
+from dyngs.triangles.fusion import Mesh, Seen, colours_of, fused, simplified
+
+RADIUS, SIZE = 0.8, 48
+LOW, HIGH = torch.full((3,), -1.0), torch.full((3,), 1.0)
+
+
+def seen_from(turn: torch.Tensor) -> Seen:
+    """A ball around the origin, red where x > 0; ``turn`` (3, 3) of the camera."""
+    looking = camera(SIZE)
+    pose = looking.cam_from_world.clone()
+    pose[0, :3, :3] = turn
+    inner = looking.intrinsics[0]
+    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    ray = torch.stack([(x - inner[0, 2]) / inner[0, 0], (y - inner[1, 2]) / inner[1, 1], torch.ones_like(x)], -1)
+    a, b = ray.square().sum(-1), 4.0 * ray[..., 2]
+    inside = b**2 - a * (16 - RADIUS**2)
+    depth = (b - inside.clamp_min(0).sqrt()) / a
+    world = (depth[..., None] * ray - torch.tensor([0.0, 0, 4])) @ turn
+    colour = torch.zeros(SIZE, SIZE, 3)
+    colour[..., 0] = (world[..., 0] > 0).float()
+    return Seen(Cameras(pose, looking.intrinsics, SIZE, SIZE), depth, (inside > 0).float(), colour)
+
+
+@cache
+def views() -> list[Seen]:
+    turns = [torch.eye(3)]
+    for axis, other in ((0, 2), (1, 2)):
+        for cosine, sine in ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)):
+            turn = torch.eye(3)
+            turn[axis, axis] = turn[other, other] = cosine
+            turn[axis, other], turn[other, axis] = sine, -sine
+            turns.append(turn)
+    return [seen_from(turn) for turn in turns]
+
+
+@cache
+def ball() -> Mesh:
+    found = fused(views(), LOW, HIGH, 40)
+    assert found is not None
+    return found
+
+
+def radii(mesh: Mesh) -> np.ndarray:
+    return np.linalg.norm(mesh.vertices[np.unique(mesh.faces)], axis=1)
+
+
+def test_the_surface_is_where_all_views_see_it() -> None:
+    assert len(ball().faces) > 2000
+    assert abs(radii(ball()).mean() - RADIUS) < 0.02
+    assert radii(ball()).std() < 0.03
+
+
+@pytest.mark.parametrize("most", [40, 300, 10**6])
+def test_it_has_as_few_triangles_as_asked_for(most: int) -> None:
+    mesh = simplified(ball(), most)
+    assert min(most, len(ball().faces)) / 3 < len(mesh.faces) <= most
+    assert np.abs(radii(mesh) - RADIUS).max() < 0.3
+    assert (np.diff(np.sort(mesh.faces, axis=1), axis=1) > 0).all()
+
+
+def test_joined_vertices_lie_where_planes_meet() -> None:
+    """A finely cut cube keeps its corners."""
+    axis = np.linspace(-1, 1, 21)
+    u, v = (x.reshape(-1) for x in np.meshgrid(axis, axis, indexing="ij"))
+    corner = np.arange(20)[:, None] * 21 + np.arange(20)
+    flat = np.stack([corner, corner + 21, corner + 1, corner + 22, corner + 1, corner + 21], -1).reshape(-1, 3)
+    sides = [
+        np.stack([u, v, np.full_like(u, s)], 1)[:, roll] for roll in ([0, 1, 2], [2, 0, 1], [1, 2, 0]) for s in (-1, 1)
+    ]
+    faces = np.concatenate([flat + k * 441 for k in range(6)])
+    mesh = simplified(Mesh(np.concatenate(sides) + 1e-3, faces), 100)
+    for x in (-1, 1):
+        for y in (-1, 1):
+            distance = np.linalg.norm(mesh.vertices - np.array([x, y, 1]), axis=1).min()
+            assert distance < 0.1
+
+
+def test_colours_are_those_of_the_views_that_show_a_point() -> None:
+    points = torch.tensor([[RADIUS, 0.0, 0.0], [-RADIUS, 0.0, 0.0], [0.0, 0.0, 9.0]])
+    colours = colours_of(views(), points, 0.1)
+    torch.testing.assert_close(colours[0], torch.tensor([1.0, 0, 0]), atol=0.02, rtol=0)
+    torch.testing.assert_close(colours[1], torch.zeros(3), atol=0.02, rtol=0)
+    torch.testing.assert_close(colours[2], torch.full((3,), 0.5))
+
+
+def test_nothing_has_no_surface() -> None:
+    empty = [Seen(one.camera, one.depth, torch.zeros(SIZE, SIZE), one.colour) for one in views()]
+    assert fused(empty, LOW, HIGH, 20) is None

@@ -1,0 +1,94 @@
+"""Curved triangles through the commands: trained, resumed, evaluated, drawn, exported; what is refused, in a line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from small_triangles import config_of
+
+import dyngs
+from dyngs.cli import main
+from dyngs.evaluate.report import evaluate_run
+from dyngs.kinds import build
+from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.runs.opened import open_run
+from dyngs.triangles.scene import TriangleScene
+
+STEPS = ["train.steps=120", "train.save_every=60"]
+
+
+@pytest.fixture(scope="module")
+def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "triangles"
+    return dyngs.train(config_of(capture, *STEPS, "model.gaussian_steps=300", f"run.dir={folder}"))
+
+
+def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
+    assert evaluate_run(run).psnr > 18
+    scene = open_run(run).renderable
+    assert isinstance(scene, TriangleScene)
+    assert 100 < len(scene.patches) <= 300
+    assert scene.patches.texture == 3
+
+
+@pytest.mark.parametrize("last", ["texture_from=0.5", "moves_on=false"])
+def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path, last: str) -> None:
+    steps = ["train.steps=112", "train.save_every=56"]  # cut right after a change and the first texture
+    run = dyngs.train(config_of(capture, *steps, f"model.{last}", f"run.dir={tmp_path / 'run'}"))
+    path = checkpoint_paths(run)[-1]
+    whole = path.read_bytes()
+    path.unlink()
+    assert main(["train", "--resume", str(run)]) == 0
+    assert path.read_bytes() == whole
+
+
+def test_it_is_drawn(run: Path, tmp_path: Path) -> None:
+    assert main(["render", str(run), "--out", str(tmp_path / "images"), "--depth"]) == 0
+    assert len(list((tmp_path / "images").rglob("*.png"))) > 1
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
+def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"mesh{suffix}"
+    assert main(["export", str(run), "--format", "mesh", "--segments", "2", "--out", str(out)]) == 0
+    mesh = trimesh.load(out, force="mesh", process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    scene = open_run(run).renderable
+    assert isinstance(scene, TriangleScene)
+    assert len(mesh.faces) == 4 * len(scene.patches)
+    visual: Any = mesh.visual
+    assert np.ptp(np.asarray(visual.vertex_colors)[:, :3]) > 0
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["export", "RUN", "--out", "OUT/scene.ply"], "Gaussians"),
+        (["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"], "1 to 64"),
+        (["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"], "radiance field"),
+        (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
+    ],
+)
+def test_what_does_not_go_is_refused(
+    run: Path, tmp_path: Path, command: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [word.replace("RUN", str(run)).replace("OUT", str(tmp_path)) for word in command]
+    assert main(words) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]
+
+
+def test_the_first_triangles_lie_at_the_first_points(capture: Path) -> None:
+    trainer: Any = build(config_of(capture, "model.num_first=40", "model.gaussian_steps=0"))
+    scene: TriangleScene = trainer.model.scene
+    assert len(scene.patches) == 40
+    assert 0.5 < scene.unit < 1.4
+    assert bool((scene.patches.areas > 0).all())
+    assert scene.options.near == pytest.approx(0.05 * scene.unit)
+    torch.testing.assert_close(scene.patches.colours[:, 0], scene.patches.colours[:, 5])
