@@ -35,7 +35,7 @@ _UNFIT: dict[str, dict[str, str]] = {
         "sh_degree": "the page has the colours of the run",
     },
     "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up") | _FOR_DYNGS,
-    "surface": dict.fromkeys(("times", "motion", *_PARTS, *_AXES), "the file has the surface at one time") | _FOR_DYNGS,
+    "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface") | _FOR_DYNGS,
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
     "tracks": _FOR_SPLATS,
@@ -57,6 +57,7 @@ examples:
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
   dyngs export runs/ann --format mesh --motion walk.npz --out ann.glb   skinned and textured, for Blender, three.js ...
+  dyngs export runs/bench --format mesh --out bench.glb           the surface, with colours of vertices
   dyngs export runs/ann --joints --out ann.ply                    Gaussians of a person with joints and weights
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
@@ -92,6 +93,8 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--max-change", type=float, metavar="X", help=about)
     about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
     parser.add_argument("--level", type=float, metavar="X", help=about)
+    about = "--format mesh of Gaussians or a field: cells along the longest side of the scene (default 192)"
+    parser.add_argument("--cells", type=int, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
     parser.add_argument("--segments", type=int, metavar="N", help=about)
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
@@ -118,10 +121,10 @@ def run(arguments: argparse.Namespace) -> int:
     writers["surface"] = _export_surface
     if arguments.bodies:
         return _export_bodies(arguments)
-    if arguments.level is not None and kind != "surface":
-        raise DyngsError("--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)")
-    if arguments.segments is not None and (kind != "surface" or not 1 <= arguments.segments <= 64):
-        raise DyngsError("--segments, 1 to 64, goes with --format mesh of curved triangles (model.kind=bg_triangle)")
+    if kind != "surface":
+        for option in ("level", "segments", "cells"):
+            if getattr(arguments, option) is not None:
+                raise DyngsError(f"--{option} goes with --format mesh, not of a person")
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
@@ -387,26 +390,32 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
 
 
 def _has_surface(arguments: argparse.Namespace) -> bool:
-    """Return whether the run is a radiance field or of curved triangles, whose surface is a mesh."""
+    """Return whether the run is of something whose surface is looked for: all but people, who have a body."""
     from dyngs.config.io import load_resolved
-    from dyngs.fields.keys import FieldModel
-    from dyngs.triangles.keys import BgTriangleModel
 
-    kinds = FieldModel, BgTriangleModel
-    return arguments.run_dir.is_dir() and isinstance(load_resolved(arguments.run_dir).model, kinds)
+    return arguments.run_dir.is_dir() and not load_resolved(arguments.run_dir).model.is_posed
 
 
 def _export_surface(arguments: argparse.Namespace) -> int:
-    """Write the surface of a radiance field, or curved triangles."""
-    from dyngs.export.surface_file import write_surface
+    """Write the surface of a scene, at several times one file each."""
+    from dyngs.export.surface_file import Cut, write_surface
+    from dyngs.gaussians.surface import num_holes
     from dyngs.runs.opened import open_scene
 
-    out: Path = arguments.out or arguments.run_dir / "mesh.ply"
+    times = _times(arguments) or (0.0,)
+    out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
+    if arguments.times and out.suffix:
+        raise DyngsError(f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one")
     opened = open_scene(arguments.run_dir, data_root=args.data_root(arguments))
-    time = 0.0 if arguments.time is None else arguments.time
-    surface = write_surface(opened, out, time=time, level=arguments.level, segments=arguments.segments)
-    args.print_notes((f"{counted(len(surface.faces), 'triangle')} with colours of {len(surface.vertices):,} vertices",))
-    args.print_written(out)
+    cut = Cut(arguments.level, arguments.cells, arguments.segments)
+    for i, time in enumerate(times):
+        path = out / f"mesh_{i:04d}.ply" if arguments.times else out
+        surface = write_surface(opened, path, time=time, cut=cut)
+        holes = num_holes(surface)
+        closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
+        faces, vertices = counted(len(surface.faces), "triangle"), f"{len(surface.vertices):,}"
+        args.print_notes((f"{faces} with colours of {vertices} vertices, {closed}",))
+        args.print_written(path)
     return 0
 
 

@@ -1,57 +1,114 @@
-"""A radiance field or curved triangles as a mesh that other programs read: .ply, .glb, .obj, colours of vertices."""
+"""A scene's surface as a mesh that other programs read: .ply, .glb or .obj with colours of vertices."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
 from dyngs.fields import mesh as fields
+from dyngs.fields.keys import NgpModel
 from dyngs.fields.scene import FieldScene
+from dyngs.fields.space import space_of
 from dyngs.files.write import atomic_file
+from dyngs.gaussians import surface as gaussians
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.surface import Surface
+from dyngs.models.views import training_cameras
+from dyngs.ops.patches import MOST_SEGMENTS
+from dyngs.ops.rays import Space
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.triangles import mesh as triangles
 from dyngs.triangles.scene import TriangleScene
 
 SUFFIXES = ".ply", ".glb", ".obj"
+VIEWS = 150  # Of the training views, whose depths are averaged for a surface of Gaussians
+MOST_CELLS = 1024
 
 
-def write_surface(
-    opened: Opened, out: Path, *, time: float = 0.0, level: float | None = None, segments: int | None = None
-) -> Surface:
-    """Write the surface of a field at ``time``, or curved triangles, in the capture's own coordinates, and return it.
+@dataclass(frozen=True)
+class Cut:
+    """How a surface is cut out of a scene; None: as usual.
 
-    Args:
-        level: density at the surface of a field; None: as usual.
-        segments: of an edge of a curved triangle; None: as usual.
-
-    Raises:
-        DyngsError: it is neither, a suffix of no mesh, an option of the other, or no surface is there.
+    Attributes:
+        level: density at the surface of a field, per unit of a world whose innermost cube has half side 1.5.
+        cells: along the longest side of the space that a field or Gaussians are looked at in.
+        segments: of an edge of a curved triangle.
     """
-    scene = opened.renderable
-    if not isinstance(scene, (FieldScene, TriangleScene)):
-        raise DyngsError(f"{out}: a surface is that of a radiance field or curved triangles (ngp, nerf, bg_triangle)")
-    if level is not None and not isinstance(scene, FieldScene):
-        raise DyngsError("--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)")
-    if segments is not None and not isinstance(scene, TriangleScene):
-        raise DyngsError("--segments goes with --format mesh of curved triangles (model.kind=bg_triangle)")
+
+    level: float | None = None
+    cells: int | None = None
+    segments: int | None = None
+
+    def require_fitting(self, scene: object) -> None:
+        """Check that all that is given goes with the kind of scene. Raises DyngsError."""
+        if self.level is not None and not isinstance(scene, FieldScene):
+            raise DyngsError("--level goes with --format mesh of a radiance field (model.kind=ngp or nerf)")
+        if self.segments is not None and not isinstance(scene, TriangleScene):
+            raise DyngsError("--segments goes with --format mesh of curved triangles (model.kind=bg_triangle)")
+        if self.segments is not None and not 1 <= self.segments <= MOST_SEGMENTS:
+            raise DyngsError(f"--segments {self.segments}: give 1 to {MOST_SEGMENTS}")
+        if self.cells is not None and isinstance(scene, TriangleScene):
+            raise DyngsError("--cells goes with --format mesh of radiance fields and Gaussians, not of triangles")
+        if self.cells is not None and not 8 <= self.cells <= MOST_CELLS:
+            raise DyngsError(f"--cells {self.cells}: give 8 to {MOST_CELLS}")
+
+
+def write_surface(opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | None = None) -> Surface:
+    """Write the surface of a scene at ``time`` in the capture's own coordinates, and return it.
+
+    Raises DyngsError: a person, a suffix of no mesh, an option of another kind, no capture where that is needed, or no
+    surface is there.
+    """
+    cut = cut or Cut()
+    cut.require_fitting(opened.renderable)
     if out.suffix.lower() not in SUFFIXES:
         raise DyngsError(f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}")
     inputs_of(opened).require_output(out)
     import trimesh
 
-    if isinstance(scene, FieldScene):
-        surface = fields.surface_of(scene, time, level)
-    else:
-        surface = triangles.surface_of(scene, segments)
-    vertices = surface.vertices + np.asarray(opened.world_offset, dtype=np.float64)
+    surface = _surface(opened, time, cut)
+    vertices = surface.vertices + opened.world_offset
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, surface.faces, vertex_colors=colours, process=False)
     with atomic_file(out) as temporary:
         data: Any = mesh.export(file_type=out.suffix.lower()[1:])
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
     return surface
+
+
+def _surface(opened: Opened, time: float, cut: Cut) -> Surface:
+    match opened.renderable:
+        case FieldScene() as scene:
+            return fields.surface_of(scene, time, cut.level, cut.cells)
+        case TriangleScene() as scene:
+            return triangles.surface_of(scene, cut.segments)
+        case GaussianScene() as scene if opened.person is None:
+            return _surface_of_gaussians(opened, scene, time, cut)
+        case _:
+            raise DyngsError("a surface is that of a still or moving scene; a person's mesh is its body")
+
+
+def _surface_of_gaussians(opened: Opened, scene: GaussianScene, time: float, cut: Cut) -> Surface:
+    """Return what training cameras see of Gaussians: an object closed, of other scenes only what is seen."""
+    views, has_alpha = opened.capture.splits["train"], opened.capture.has_alpha
+    cameras = training_cameras([views[i] for i in evenly_spaced(len(views), VIEWS)], opened.config.data)
+    box = gaussians.opaque_box(scene.at(time))
+    if not has_alpha:
+        box = _common(box, space_of(NgpModel(), None, opened.capture))
+    return gaussians.surface_of(scene, cameras, box, time, cells=cut.cells, unseen_is_solid=has_alpha)
+
+
+def _common(box: tuple[Tensor, Tensor], space: Space) -> tuple[Tensor, Tensor]:
+    """Return the corners of what ``box`` and the innermost cube share; of the cube where that is little."""
+    middle = torch.tensor(space.centre, device="cpu")
+    low, high = torch.maximum(box[0], middle - space.half), torch.minimum(box[1], middle + space.half)
+    shares_much = bool((high - low > 0.1 * space.half).all())
+    return (low, high) if shares_much else (middle - space.half, middle + space.half)

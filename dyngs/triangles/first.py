@@ -14,23 +14,22 @@ from torch import Tensor
 from dyngs.config import DefaultStrategy, ShColour, StaticModel
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
-from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.colour.training import ColourTraining
+from dyngs.gaussians.fusion import Mesh, Seen, colours_of, fused, simplified
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.gaussians.start import densifier_of, first_gaussians
+from dyngs.gaussians.surface import opaque_box
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.state import State
-from dyngs.triangles.fusion import Mesh, Seen, colours_of, fused, simplified
 
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000
 VIEWS = 64  # Whose depths are fused
 CELLS = 128  # Along the scene, at most; no more than pixels along an image
-INNER = 0.005  # Fraction of the Gaussians on either side that does not count for where the scene is
-MARGIN = 0.02  # Of the scene's size, around it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +72,7 @@ def first_surface(run: RunStart, steps: int, most: int) -> FirstSurface:
     Raises DyngsError: what they show is no surface.
     """
     trained = _trained(run, steps)
-    seen, (low, high) = _views(run, trained), _box(trained.scene.gaussians)
+    seen, (low, high) = _views(run, trained), opaque_box(trained.scene.gaussians)
     cells = min(CELLS, max(max(one.depth.shape) for one in seen))
     mesh = fused(seen, low, high, cells)
     mesh = None if mesh is None else simplified(mesh, most)
@@ -128,13 +127,3 @@ def _views(run: RunStart, model: GaussianModel) -> list[Seen]:
         black = torch.zeros(3, device="cpu")
         found.append(Seen(image.cameras, drawn.depth[0], 1 - drawn.transmittance[0], image.composite(black)))
     return found
-
-
-def _box(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Return the corners of the box around opaque Gaussians."""
-    means = gaussians.means.detach()
-    opaque = gaussians.logit_opacities.detach() > 0
-    means = means[opaque] if bool(opaque.any()) else means
-    low, high = means.quantile(torch.tensor([INNER, 1 - INNER], device="cpu"), dim=0)
-    margin = MARGIN * (high - low).max()
-    return low - margin, high + margin

@@ -17,6 +17,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 
 BEHIND = 3.0  # Cells behind a surface that still count as seen
+AT_ONCE = 1 << 21  # Points of the grid that are looked at together
 OPAQUE = 0.5  # Of a pixel that shows a surface
 TRIALS = 10  # Sizes of cells that are tried for a number of triangles
 FINEST = 1024.0  # Cells along the surface, at most
@@ -41,28 +42,46 @@ class Mesh:
     faces: np.ndarray  # (F, 3)
 
 
-def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int) -> Mesh | None:
+def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen_is_solid: bool = True) -> Mesh | None:
     """Return the surface in the box from ``low`` to ``high`` (3,); None where there is none.
 
     Args:
         cells: along the longest side of the box.
+        unseen_is_solid: what no view sees into counts as inside, which closes the back of things; else the surface
+            ends where what is seen does.
     """
     from skimage.measure import marching_cubes
 
     size = float((high - low).max()) / cells
     counts = ((high - low) / size).ceil().long() + 1
-    axes = [low[i] + size * torch.arange(int(counts[i]), device="cpu") for i in range(3)]
-    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
+    x, y, z = (low[i] + size * torch.arange(int(counts[i]), device="cpu") for i in range(3))
+    slabs = x.split(max(AT_ONCE // (len(y) * len(z)), 1))
+    means, known = zip(*(_averages(seen, torch.cartesian_prod(slab, y, z), size) for slab in slabs), strict=True)
+    shape = tuple(counts.tolist())
+    grid = torch.cat(means).view(shape).numpy()
+    mask = None if unseen_is_solid else _surrounded(torch.cat(known).view(shape).numpy())
+    looked_at = grid if mask is None else grid[mask]
+    if not looked_at.size or not looked_at.min() < 0 < looked_at.max():
+        return None
+    vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=mask)
+    return Mesh(vertices * size + low.numpy(), faces)
+
+
+def _averages(seen: Sequence[Seen], points: Tensor, size: float) -> tuple[Tensor, Tensor]:
+    """Return (N,) mean distances of the views that see ``points`` (N, 3), -1 without any, and (N,) bool: there are."""
     total, weight = torch.zeros(len(points), device="cpu"), torch.zeros(len(points), device="cpu")
     for one in seen:
         distance, counted = _distances(one, points, size)
         total += torch.where(counted, distance, 0.0)
         weight += counted
-    grid = torch.where(weight > 0, total / weight.clamp_min(1), -1.0).view(tuple(counts.tolist())).numpy()
-    if not grid.min() < 0 < grid.max():
-        return None
-    vertices, faces, _, _ = marching_cubes(grid, 0.0)
-    return Mesh(vertices * size + low.numpy(), faces)
+    return torch.where(weight > 0, total / weight.clamp_min(1), -1.0), weight > 0
+
+
+def _surrounded(known: np.ndarray) -> np.ndarray:
+    """Return which places are known, and all beside them, so that no cell has an unknown corner."""
+    from scipy.ndimage import minimum_filter
+
+    return minimum_filter(known, 3, mode="nearest")
 
 
 def _distances(one: Seen, points: Tensor, size: float) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,66 @@
+"""Surfaces of Gaussians as files, through the command: still and moving ones, in the capture's own coordinates."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from moving_scene import write_moving_run
+
+from dyngs.cli import main
+from dyngs.export.surface_file import SUFFIXES
+
+
+def mesh_of(path: Path) -> trimesh.Trimesh:
+    found = trimesh.load(path, force="mesh", process=False)
+    assert isinstance(found, trimesh.Trimesh)
+    return found
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_balls_side_by_side(tmp_path: Path, suffix: str) -> None:
+    """Five of a radius of about 0.3, from x = -1 to 1, somewhere far away."""
+    run, out = write_moving_run(tmp_path, moves=False, offset=(100.0, 0.0, 0.0)), tmp_path / f"balls{suffix}"
+    assert main(["export", str(run), "--format", "mesh", "--cells", "32", "--out", str(out)]) == 0
+    mesh = mesh_of(out)
+    assert len(mesh.faces) > 200
+    np.testing.assert_allclose(mesh.vertices.mean(0), [100, 0, 0], atol=0.15)
+    assert 1.8 < np.ptp(mesh.vertices[:, 0]) < 3.2
+
+
+def test_a_moving_scene_has_a_mesh_for_each_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, out = write_moving_run(tmp_path), tmp_path / "meshes"
+    assert main(["export", str(run), "--format", "mesh", "--cells", "24", "--times", "0:1:2", "--out", str(out)]) == 0
+    assert len(re.findall(r"triangles with colours of .* vertices", capsys.readouterr().out)) == 2
+    first, last = (mesh_of(path) for path in sorted(out.iterdir()))
+    assert not np.array_equal(first.vertices[:50], last.vertices[:50])
+    assert main(["export", str(run), "--format", "mesh", "--cells", "24", "--times", "0:1:2", "--out", str(out)]) == 0
+    np.testing.assert_array_equal(mesh_of(out / "mesh_0000.ply").vertices, first.vertices)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--cells 7", "--cells 7: give 8 to 1024"),
+        ("--level 2", "--level goes with --format mesh of a radiance field"),
+        ("--segments 3", "--segments goes with --format mesh of curved triangles"),
+        ("--out x.stl", r"x\.stl: a mesh of a surface is one file that ends in \.ply, \.glb, \.obj"),
+        ("--times 0:1:2 --out x.ply", r"x\.ply: a sequence is a folder of files; give --out x"),
+        ("--static", "--static does not go with --format mesh"),
+    ],
+)
+def test_what_does_not_go_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: str, words: str
+) -> None:
+    run = write_moving_run(tmp_path)
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    assert main(["export", str(run), "--format", "mesh", *options.split()]) == 2
+    said = capsys.readouterr().err
+    assert re.search(words, said)
+    assert said.count("\n") == 1
+    assert not list((tmp_path / "empty").iterdir())
+    assert not list(run.glob("mesh*"))

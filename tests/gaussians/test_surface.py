@@ -1,0 +1,107 @@
+"""The surface of a ball of Gaussians, seen from all around."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from seen_ball import HIGH, LOW, RADIUS, views
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.conventions import SH_C0
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians.fusion import Mesh, fused
+from dyngs.gaussians.surface import largest_pieces, num_holes, opaque_box, surface_of
+from dyngs.models.surface import Surface
+from dyngs.static.scene import StaticScene
+
+COUNT = 3000
+BOX = LOW, HIGH
+
+
+def ball(opacity: float = 6.0) -> StaticScene:
+    """Small discs of the surface, red where x > 0, else blue."""
+    k = torch.arange(COUNT) + 0.5
+    height, angle = 1 - 2 * k / COUNT, k * math.pi * (1 + 5**0.5)
+    across = (1 - height.square()).sqrt()
+    ways = torch.stack([across * angle.cos(), across * angle.sin(), height], 1)
+    colours = torch.where(ways[:, :1] > 0, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
+    quats = torch.cat([1 + ways[:, 2:], -ways[:, 1:2], ways[:, :1], torch.zeros(COUNT, 1)], 1)  # z to the normal
+    scales = torch.tensor([0.03, 0.03, 0.002]).log().repeat(COUNT, 1)
+    sh = ((colours - 0.5) / SH_C0)[:, None]
+    return StaticScene(gaussians=Gaussians(RADIUS * ways, quats, scales, torch.full((COUNT,), opacity), sh))
+
+
+def cameras() -> list[Cameras]:
+    """Those of the ball with four times as many pixels along a side."""
+    larger = torch.tensor([4.0, 4.0, 1.0])[:, None]
+    seen = [one.camera for one in views()]
+    return [Cameras(one.cam_from_world, one.intrinsics * larger, 4 * one.width, 4 * one.height) for one in seen]
+
+
+@cache
+def surface() -> Surface:
+    return surface_of(ball(), cameras(), BOX, cells=40)
+
+
+def volume(found: Surface | Mesh) -> float:
+    """Positive where faces are anticlockwise from outside."""
+    a, b, c = found.vertices[found.faces].transpose(1, 0, 2)
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def test_a_ball_of_gaussians_has_the_surface_of_a_ball() -> None:
+    radii = np.linalg.norm(surface().vertices, axis=1)
+    assert abs(np.median(radii) - RADIUS) < 0.01
+    assert np.quantile(np.abs(radii - RADIUS), 0.95) < 0.05
+    assert volume(surface()) == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.05)
+    assert num_holes(surface()) == 0
+    sides = surface().vertices[:, 0]
+    assert surface().colours[sides > 0.1, 0].min() > 0.7
+    assert surface().colours[sides < -0.1, 2].min() > 0.7
+
+
+def test_what_hardly_shows_has_no_surface() -> None:
+    with pytest.raises(DyngsError, match="no surface"):
+        surface_of(ball(-6.0), cameras(), BOX, cells=20)
+
+
+def test_without_what_no_view_sees_the_surface_ends() -> None:
+    """From one side half a ball is seen, and nothing closes it."""
+    half = fused(views()[:1], *BOX, 40, unseen_is_solid=False)
+    assert half is not None
+    assert num_holes(Surface(half.vertices, half.faces, half.vertices)) > 0
+    assert half.vertices[:, 2].max() < 0.3
+    np.testing.assert_allclose(np.linalg.norm(half.vertices, axis=1).mean(), RADIUS, atol=0.03)
+
+
+def test_the_box_holds_opaque_gaussians() -> None:
+    lost = ball()
+    lost.gaussians.means[:2] += 50
+    low, high = opaque_box(lost.gaussians)
+    assert bool((high < 1).all())
+    assert bool((low > -1).all())
+    assert bool((high > 0.7).all())
+
+
+def piece(center: tuple[float, float, float], count: int) -> tuple[Tensor, Tensor]:
+    """A fan of ``count`` triangles."""
+    angles = torch.arange(count + 1) / count * 5
+    rim = torch.stack([angles.cos(), angles.sin(), torch.zeros(count + 1)], 1)
+    corners = torch.cat([torch.zeros(1, 3), rim]) + torch.tensor(center)
+    k = torch.arange(count)
+    return corners, torch.stack([torch.zeros(count, dtype=torch.long), k + 1, k + 2], 1)
+
+
+def test_small_pieces_go_and_faces_keep_their_corners() -> None:
+    (large, first), (small, second) = piece((0, 0, 0), 200), piece((9, 0, 0), 2)
+    mesh = Mesh(torch.cat([small, large]).numpy(), torch.cat([second, first + len(small)]).numpy())
+    kept = largest_pieces(mesh)
+    assert kept.faces.shape == (200, 3)
+    np.testing.assert_array_equal(kept.vertices[kept.faces], large.numpy()[first.numpy()])
+    assert num_holes(Surface(kept.vertices, kept.faces, kept.vertices)) == 1
