@@ -97,13 +97,13 @@ def _surface(opened: Opened, time: float, cut: Cut) -> Surface:
 
 
 def _surface_of_gaussians(opened: Opened, scene: GaussianScene, time: float, cut: Cut) -> Surface:
-    """Return what training cameras see of Gaussians: an object closed, of other scenes only what is seen."""
-    views, has_alpha = opened.capture.splits["train"], opened.capture.has_alpha
+    """Return what training cameras see of Gaussians; what they frame, where there is a background."""
+    views = opened.capture.splits["train"]
     cameras = training_cameras([views[i] for i in evenly_spaced(len(views), VIEWS)], opened.config.data)
     box = gaussians.opaque_box(scene.at(time))
-    if not has_alpha:
+    if not opened.capture.has_alpha:
         box = _common(box, space_of(NgpModel(), None, opened.capture))
-    return gaussians.surface_of(scene, cameras, box, time, cells=cut.cells, unseen_is_solid=has_alpha)
+    return gaussians.surface_of(scene, cameras, box, time, cells=cut.cells)
 
 
 def _common(box: tuple[Tensor, Tensor], space: Space) -> tuple[Tensor, Tensor]:

@@ -59,7 +59,7 @@ def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen
     means, known = zip(*(_averages(seen, torch.cartesian_prod(slab, y, z), size) for slab in slabs), strict=True)
     shape = tuple(counts.tolist())
     grid = torch.cat(means).view(shape).numpy()
-    mask = None if unseen_is_solid else _surrounded(torch.cat(known).view(shape).numpy())
+    mask = None if unseen_is_solid else _known_cells(torch.cat(known).view(shape).numpy())
     looked_at = grid if mask is None else grid[mask]
     if not looked_at.size or not looked_at.min() < 0 < looked_at.max():
         return None
@@ -77,11 +77,11 @@ def _averages(seen: Sequence[Seen], points: Tensor, size: float) -> tuple[Tensor
     return torch.where(weight > 0, total / weight.clamp_min(1), -1.0), weight > 0
 
 
-def _surrounded(known: np.ndarray) -> np.ndarray:
-    """Return which places are known, and all beside them, so that no cell has an unknown corner."""
+def _known_cells(known: np.ndarray) -> np.ndarray:
+    """Return whether all eight corners of a cell are known, at its last corner, where marching cubes asks."""
     from scipy.ndimage import minimum_filter
 
-    return minimum_filter(known, 3, mode="nearest")
+    return minimum_filter(known, 2, mode="nearest")
 
 
 def _distances(one: Seen, points: Tensor, size: float) -> tuple[Tensor, Tensor]:

@@ -30,22 +30,21 @@ def surface_of(
     time: float | None = None,
     *,
     cells: int | None = None,
-    unseen_is_solid: bool = True,
 ) -> Surface:
     """Return the surface at ``time`` that ``cameras``, one view each, see in ``box``, two corners (3,) in the world.
 
-    Pieces with less than a fiftieth of the faces of the largest are left out.
+    Where nothing is seen the surface ends, and pieces with less than a fiftieth of the faces of the largest are left
+    out.
 
     Args:
         cells: along the longest side of the box; None: ``CELLS``.
-        unseen_is_solid: see ``fused``.
 
     Raises:
         DyngsError: no view shows anything solid there.
     """
     cells = CELLS if cells is None else cells
     seen = [_seen(scene, camera, time) for camera in cameras]
-    mesh = fused(seen, *box, cells, unseen_is_solid=unseen_is_solid)
+    mesh = fused(seen, *box, cells, unseen_is_solid=False)
     if mesh is None:
         raise DyngsError("no surface: none of the views shows anything solid where the Gaussians are")
     mesh = largest_pieces(mesh)

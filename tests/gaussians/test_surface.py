@@ -46,7 +46,7 @@ def cameras() -> list[Cameras]:
 
 @cache
 def surface() -> Surface:
-    return surface_of(ball(), cameras(), BOX, cells=40)
+    return surface_of(ball(), cameras(), BOX, cells=30)
 
 
 def volume(found: Surface | Mesh) -> float:
