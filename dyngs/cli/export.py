@@ -35,7 +35,7 @@ _UNFIT: dict[str, dict[str, str]] = {
         "sh_degree": "the page has the colours of the run",
     },
     "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up") | _FOR_DYNGS,
-    "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface") | _FOR_DYNGS,
+    "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface at its time") | _FOR_DYNGS,
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
     "tracks": _FOR_SPLATS,

@@ -38,6 +38,7 @@ RESOLVED_NAME = "config.yaml"
 
 MAX_WHOLE = 2**63 - 1
 """The largest whole number of a configuration."""
+MOST_KEYS = 40  # Of a section that are listed in one line
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
 
@@ -309,7 +310,9 @@ def _explain(layers: _Layers, problem: ErrorDetails) -> str:
         return f"{prefix}{dotted} is missing ({info.description}); give {example}"
     if what in ("model_type", "model_attributes_type", "dict_type"):
         inside = dict.fromkeys(key for variant in section_classes(info) for key in variant.model_fields)
-        return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(inside)}"
+        shown = [*inside][:MOST_KEYS]
+        rest = ", ... (docs/cli.md has all)" if len(inside) > len(shown) else ""
+        return f"{prefix}{dotted} is a section, not a value; its keys: {', '.join(shown)}{rest}"
     if what == "union_tag_invalid":
         dotted, value, choices = f"{dotted}.kind", layers.value_at((*keys, "kind")), kinds_of(info)
         allowed = f"one of {', '.join(choices)}"

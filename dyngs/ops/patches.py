@@ -63,7 +63,7 @@ def _values_backward(like: Tensor, ids: Tensor, uv: Tensor, grad: Tensor, basis:
     return g_values
 
 
-values_backward_op = register("patch_values_backward", _values_backward)
+patch_values_backward_op = register("patch_values_backward", _values_backward)
 
 
 def _save_values(ctx: Any, inputs: tuple[Any, ...], _: Tensor) -> None:
@@ -73,10 +73,10 @@ def _save_values(ctx: Any, inputs: tuple[Any, ...], _: Tensor) -> None:
 
 def _values_gradient(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     values, ids, uv = ctx.saved_tensors
-    return values_backward_op(values, ids, uv, grad.contiguous(), ctx.basis), None, None, None
+    return patch_values_backward_op(values, ids, uv, grad.contiguous(), ctx.basis), None, None, None
 
 
-values_op = register("patch_values", _values, gradient=Gradient(_save_values, _values_gradient))
+patch_values_op = register("patch_values", _values, gradient=Gradient(_save_values, _values_gradient))
 
 
 def patch_values(values: Tensor, ids: Tensor, uv: Tensor, along: Along | None = None) -> Tensor:
@@ -103,7 +103,7 @@ def _looked_up(values: Tensor, ids: Tensor, uv: Tensor, count: int, basis: int) 
     check_tensors("patches", {"values": (values, (patches, count, channels)), "uv": (uv, (len(ids), 2))})
     if ids.dtype != torch.int32:
         raise DyngsError(f"patches: ids must be int32, got {ids.dtype}")
-    return values_op(values.contiguous(), ids.contiguous(), uv.contiguous().to(values.dtype), basis)
+    return patch_values_op(values.contiguous(), ids.contiguous(), uv.contiguous().to(values.dtype), basis)
 
 
 @torch.no_grad()
@@ -140,7 +140,7 @@ def _ends(
     return found, *out
 
 
-ends_op = register("patch_ends", _ends)
+patch_ends_op = register("patch_ends", _ends)
 """Whether and where patches end between places on them and the next pixels; ``cameras``: poses and intrinsics."""
 
 
@@ -157,7 +157,7 @@ def _blend_backward(inputs: list[Tensor], grads: list[Tensor]) -> tuple[Tensor, 
     return out
 
 
-blend_backward_op = register("blend_patches_backward", _blend_backward)
+blend_patches_backward_op = register("blend_patches_backward", _blend_backward)
 """Gradients by means, colours and crossings; ``inputs`` are the last four of ``blend_patches``."""
 
 
@@ -167,10 +167,10 @@ def _save_blend(ctx: Any, inputs: tuple[Any, ...], _: tuple[Tensor, ...]) -> Non
 
 def _blend_gradient(ctx: Any, image: Tensor, transmittance: Tensor) -> tuple[Tensor | None, ...]:
     grads = [image.contiguous(), transmittance.contiguous()]
-    return *blend_backward_op(list(ctx.saved_tensors), grads), None, None
+    return *blend_patches_backward_op(list(ctx.saved_tensors), grads), None, None
 
 
-blend_op = register("blend_patches", _blend, gradient=Gradient(_save_blend, _blend_gradient))
+blend_patches_op = register("blend_patches", _blend, gradient=Gradient(_save_blend, _blend_gradient))
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ def _ends_between(
     rows = places.rows.view(-1)[pixels].long()
     ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0)], -1)
     views = (pixels // places.rows[0].numel()).to(torch.int32)
-    found, steps, uv, slopes = ends_op(
+    found, steps, uv, slopes = patch_ends_op(
         points.detach().contiguous(),
         [cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()],
         views,
@@ -285,4 +285,4 @@ def blend_patches(means: Tensor, colours: Tensor, crossings: Tensor, places: Pla
     check_tensors("patches", checked | {"crossings": (crossings, (views, 2, height, width))})
     if not means.dtype == colours.dtype == crossings.dtype:
         raise DyngsError("patches: means, colours and crossings of one dtype")
-    return blend_op(means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids)
+    return blend_patches_op(means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids)

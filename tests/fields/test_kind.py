@@ -75,7 +75,7 @@ def test_its_surface_is_a_mesh_with_colours(
     [
         (["export", "RUN", "--out", "OUT/scene.ply"], "Gaussians"),
         (["export", "RUN", "--format", "mesh", "--level", "1e9", "--out", "OUT/mesh.ply"], "another --level"),
-        (["export", "RUN", "--format", "mesh", "--motion", "OUT/a.bvh", "--out", "OUT/mesh.ply"], "one time"),
+        (["export", "RUN", "--format", "mesh", "--motion", "OUT/a.bvh", "--out", "OUT/mesh.ply"], "at its time"),
         (["export", "RUN", "--format", "mesh", "--out", "OUT/mesh.stl"], ".ply"),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
     ],

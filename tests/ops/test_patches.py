@@ -14,18 +14,18 @@ from dyngs.errors import DyngsError
 from dyngs.ops.native import kernel_threads
 from dyngs.ops.patches import (
     Places,
-    blend_backward_op,
-    blend_op,
     blend_patches,
-    ends_op,
+    blend_patches_backward_op,
+    blend_patches_op,
     lattice,
     lattice_size,
     lattice_values,
     outline_crossings,
+    patch_ends_op,
     patch_values,
+    patch_values_backward_op,
+    patch_values_op,
     project_points,
-    values_backward_op,
-    values_op,
     visible_patches,
 )
 
@@ -301,15 +301,17 @@ def test_the_same_bytes_on_any_number_of_threads(dtype: torch.dtype) -> None:
 
 def test_the_ops_are_those_of_torch() -> None:
     values, (ids, uv) = random_patches(2), random_places(5, 2)
-    torch.library.opcheck(values_op, (values.requires_grad_(), ids, uv, 0))
+    torch.library.opcheck(patch_values_op, (values.requires_grad_(), ids, uv, 0))
     means, colours, crossings, places = some_image(0)
-    torch.library.opcheck(values_backward_op, (values.detach(), ids, uv, torch.ones(5, 3, dtype=torch.float64), 0))
-    torch.library.opcheck(blend_op, (means, colours, crossings, places.rows, places.ids))
+    torch.library.opcheck(
+        patch_values_backward_op, (values.detach(), ids, uv, torch.ones(5, 3, dtype=torch.float64), 0)
+    )
+    torch.library.opcheck(blend_patches_op, (means, colours, crossings, places.rows, places.ids))
     inputs = [colours.detach(), crossings.detach(), places.rows, places.ids]
-    grads = [x.detach() for x in blend_patches(means, colours, crossings, places)]
-    torch.library.opcheck(blend_backward_op, (inputs, grads))
+    by_image = [x.detach() for x in blend_patches(means, colours, crossings, places)]
+    torch.library.opcheck(blend_patches_backward_op, (inputs, by_image))
     at = [x.detach() for x in (camera().cam_from_world, camera().intrinsics)]
-    torch.library.opcheck(ends_op, (values.detach(), at, torch.zeros_like(ids), ids, uv, torch.zeros_like(ids)))
+    torch.library.opcheck(patch_ends_op, (values.detach(), at, torch.zeros_like(ids), ids, uv, torch.zeros_like(ids)))
 
 
 def test_what_does_not_fit_is_refused() -> None:
