@@ -71,7 +71,7 @@ struct ValueBuffers {
         sort(w, places.count) {}
 };
 
-__global__ void __launch_bounds__(kThreads) patch_ends_kernel(PatchSteps<float> in, PatchEnds<float> out) {
+__global__ void __launch_bounds__(kThreads, 4) patch_ends_kernel(PatchSteps<float> in, PatchEnds<float> out) {
   const int64_t n = this_thread();
   if (n >= in.count) return;
   const int32_t id = global(in.ids)[n];

@@ -84,7 +84,7 @@ struct RayTriangle {
   Vec3<double> edges[3];  // of the corner of the same number: its coordinate grows with <edge, ray>
   double volume;          // six times that of the tetrahedron with the camera
 
-  bool is_drawn() const { return volume > 0; }  // not edge-on, not NaN
+  DYNGS_INLINE bool is_drawn() const { return volume > 0; }  // not edge-on, not NaN
 };
 
 DYNGS_HD inline Vec3<double> cross(const Vec3<double>& a, const Vec3<double>& b) {

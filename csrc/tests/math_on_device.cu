@@ -154,8 +154,8 @@ struct FieldArrays {
 template <class S>
 __global__ void fields(Numbers<S> n, FieldArrays<S> in, const bool* occupied, bool* reached) {
   S coords[3][1] = {{n.next()}, {n.next()}, {n.next()}};
-  HashCorners<3, 1, S> corners;
-  locate_hashed<3, 1, S>({63, 64, 0, 1 << 14, false}, coords, corners);
+  HashCorners<1, S> corners;
+  locate_hashed<1, S>({63, 64, 0, 1 << 14, false}, coords, corners);
   n.put(corners.weights[7][0] + static_cast<S>(corners.rows[5][0]));
   const S o[3] = {n.next(), n.next(), n.next()}, d[3] = {n.next(), n.next(), n.next()};
   RaySteps<S> steps(in, o, d, n.next());
