@@ -43,7 +43,7 @@ def surface_of(
         DyngsError: no view shows anything solid there.
     """
     cells = CELLS if cells is None else cells
-    seen = [_seen(scene, camera, time) for camera in cameras]
+    seen = [seen_by(scene, camera, time) for camera in cameras]
     mesh = fused(seen, *box, cells, unseen_is_solid=False)
     if mesh is None:
         raise DyngsError("no surface: none of the views shows anything solid where the Gaussians are")
@@ -53,7 +53,8 @@ def surface_of(
     return Surface(mesh.vertices, mesh.faces, colours.numpy())
 
 
-def _seen(scene: GaussianScene, camera: Cameras, time: float | None) -> Seen:
+def seen_by(scene: GaussianScene, camera: Cameras, time: float | None = None) -> Seen:
+    """Return what one camera sees of a scene; colours are those of what is there, without the background."""
     options = replace(scene.options, depth="expected")
     drawn = scene.render(camera, time, options=options, background=torch.zeros(3, device="cpu"))
     assert drawn.depth is not None

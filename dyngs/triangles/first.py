@@ -14,48 +14,20 @@ from torch import Tensor
 from dyngs.config import DefaultStrategy, ShColour, StaticModel
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError
-from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.colour.training import ColourTraining
 from dyngs.gaussians.fusion import Mesh, Seen, colours_of, fused, simplified
 from dyngs.gaussians.model import GaussianModel, SceneTraining
-from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.gaussians.start import densifier_of, first_gaussians
-from dyngs.gaussians.surface import opaque_box
+from dyngs.gaussians.surface import opaque_box, seen_by
 from dyngs.models.kind import RunStart
 from dyngs.models.views import background_colour
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.state import State
+from dyngs.static.scene import StaticScene
 
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
 MOST_GAUSSIANS = 20_000
 VIEWS = 64  # Whose depths are fused
 CELLS = 128  # Along the scene, at most; no more than pixels along an image
-
-
-@dataclass(frozen=True, kw_only=True)
-class _StillScene(GaussianScene):
-    """The same Gaussians at all times."""
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        return ()
-
-    @property
-    def rows(self) -> Tensor:
-        return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
-
-    @property
-    def num_moving(self) -> int:
-        return 0
-
-    def time_step(self, time: float | None) -> GaussianTimeStep:
-        return GaussianTimeStep(self.gaussians)
-
-    def edited(self, edit: TopologyEdit) -> _StillScene:
-        return replace(self, gaussians=self.gaussians.edited(edit))
-
-    def _model_state(self) -> State:
-        return {}
 
 
 @dataclass(frozen=True)
@@ -97,7 +69,7 @@ def _trained(run: RunStart, steps: int) -> GaussianModel:
     changed = {"model": StaticModel(sh_degree=0), "strategy": strategy, "train": train, "colour": ShColour()}
     own = config.model_copy(update=changed)
     start = replace(run, config=own, asked=own)
-    scene = _StillScene(gaussians=first_gaussians(start))
+    scene = StaticScene(gaussians=first_gaussians(start))
     model = GaussianModel(start, scene, SceneTraining(), densifier_of(start), ColourTraining(ShColour()))
     order = torch.randint(len(run.images), (steps,), generator=run.generator, device="cpu")
     for step, index in enumerate(order.tolist(), 1):
@@ -118,12 +90,10 @@ def _divisor(width: int, height: int) -> int:
 
 @torch.no_grad()
 def _views(run: RunStart, model: GaussianModel) -> list[Seen]:
-    options, found = replace(model.options, depth="expected"), []
+    scene, found = replace(model.scene, options=model.options), []
     for index in evenly_spaced(len(run.images), VIEWS):
         image = run.images[index]
         image = image.shrunk(_divisor(image.cameras.width, image.cameras.height))
-        drawn = model.scene.render(image.cameras, model.scene.time_step(None), options=options)
-        assert drawn.depth is not None
-        black = torch.zeros(3, device="cpu")
-        found.append(Seen(image.cameras, drawn.depth[0], 1 - drawn.transmittance[0], image.composite(black)))
+        own = image.composite(torch.zeros(3, device="cpu"))
+        found.append(replace(seen_by(scene, image.cameras), colour=own))
     return found
