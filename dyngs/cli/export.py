@@ -393,7 +393,10 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
     """Return whether the run is of something whose surface is looked for: all but people, who have a body."""
     from dyngs.config.io import load_resolved
 
-    return arguments.run_dir.is_dir() and not load_resolved(arguments.run_dir).model.is_posed
+    source: Path = arguments.run_dir
+    if source.is_file() and not args.is_avatar_file(source):
+        raise DyngsError(f"{source}: a file has no training views, whose depths make a surface; give the run")
+    return source.is_dir() and not load_resolved(source).model.is_posed
 
 
 def _export_surface(arguments: argparse.Namespace) -> int:

@@ -64,3 +64,12 @@ def test_what_does_not_go_is_one_line(
     assert said.count("\n") == 1
     assert not list((tmp_path / "empty").iterdir())
     assert not list(run.glob("mesh*"))
+
+
+def test_a_file_of_gaussians_has_no_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, file = write_moving_run(tmp_path, moves=False), tmp_path / "balls.ply"
+    assert main(["export", str(run), "--out", str(file)]) == 0
+    capsys.readouterr()
+    assert main(["export", str(file), "--format", "mesh", "--out", str(tmp_path / "mesh.glb")]) == 2
+    assert re.fullmatch(r"dyngs: error: .*balls\.ply: a file has no training views, .*\n", capsys.readouterr().err)
+    assert not (tmp_path / "mesh.glb").exists()
