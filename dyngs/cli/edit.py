@@ -19,7 +19,7 @@ examples:
   dyngs edit runs/room --up auto --scale "0,0,0 1,0,0 1.25m" --out room.ply   upright, in metres
   dyngs edit room.ply --crop -1,-1,-1 1,1,1 --out table.spz                   a box, by two corners
   dyngs edit room.ply --crop 0,0,0 1.5 --outside --out rest.ply               all but a sphere
-  dyngs edit runs/room --clean --out clean.ply                                without what spoils it; costs 0.1 dB at most
+  dyngs edit runs/room --clean --out clean.ply                                without what spoils it, for 0.1 dB at most
   dyngs edit runs/site --geo points.csv --out site.ply                        in the coordinates of control points
   dyngs edit room.ply --merge chair.ply lamp.spz --out all.ply
   dyngs edit table.ply --undo --out before.ply                                the frame of before
@@ -34,8 +34,8 @@ def add_parser(commands: args.Commands) -> None:
         "edit",
         run,
         "another frame, a part, cleaned, several in one: a scene as an edited file",
-        "Edit a run or a file of Gaussians, and write the result as another file. Points are given in the coordinates of "
-        "a file, or of the capture of a run. How the frame was changed is stored, so that it can be undone.",
+        "Edit a run or a file of Gaussians, and write the result as another file. Points are given in the coordinates "
+        "of a file, or of the capture of a run. How the frame was changed is stored, so that it can be undone.",
         _EPILOG,
     )
     parser._negative_number_matcher = _NEGATIVE  # else "-1,0,2" would be taken for an option

@@ -92,8 +92,8 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
     """Return (N,) bool which Gaussians of a run stay; what goes, and what it costs, is told.
 
     One kind after another goes, of each as much as the mean PSNR of views held out may lose: by no more than
-    ``max_loss`` in all, dB. Views held out are those of the split val, else every eighth training view, which then is not
-    asked what contributes to it. Deterministic. Raises DyngsError: no such run, or its capture cannot be read.
+    ``max_loss`` in all, dB. Views held out are those of the split val, else every eighth training view, which then
+    counts for no contribution. Deterministic. Raises DyngsError: no such run, or its capture cannot be read.
     """
     config = load_resolved(run_dir, data_root=data_root)
     if not config.model.made_of_gaussians:
@@ -115,7 +115,7 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
 
 
 def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]:
-    """Return what may go, the most harmless kind first, by its contribution to all training views but those ``held``."""
+    """Return what may go, the most harmless kind first, by its contribution to all training views not ``held``."""
     scene: GaussianScene = trainer.model.scene.unmasked()
     views = scoring_views(trainer, scene)
     if scene.is_static:

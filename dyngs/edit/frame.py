@@ -110,9 +110,7 @@ def scale_of(text: str) -> float | Distance:
         start, end = (point(word, "--scale") for word in words[:2])
         return Distance(start, end, number(words[2], "--scale"))
     if len(words) != 1 or "," in text:
-        raise DyngsError(
-            f"--scale: {printable(repr(text), 60)}: give a factor, or two points and a length in one string"
-        )
+        raise DyngsError(f"--scale: {printable(repr(text), 60)}: give a factor, or 'x,y,z x,y,z LENGTH'")
     return number(text, "--scale")
 
 
@@ -166,7 +164,7 @@ def geo_frame(path: Path) -> GeoFrame:
 
 
 def _control_points(path: Path) -> np.ndarray:
-    """Return rows (P, 6) float64 of a text file: x y z in the scene, X Y Z in the world; one line of names, # remarks."""
+    """Return rows (P, 6) float64 of a text file: x y z in the scene, X Y Z in the world; first names, # remarks."""
     if not path.exists():
         raise DyngsError(f"{path}: no such file; give rows of x,y,z,X,Y,Z")
     require_regular(path)

@@ -99,7 +99,7 @@ def edit_scene(
 ) -> EditedFile:
     """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the format.
 
-    ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done; nothing is written then.
+    ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done, and nothing is written.
     """
     moves = out.name.lower().endswith(SUFFIX)
     if known_format(out) is None and not moves:
