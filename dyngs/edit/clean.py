@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dyngs.api.prune import unseen_images
 from dyngs.api.train import num_cores
+from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError, counted
@@ -23,14 +24,13 @@ from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FEWEST_VIEWS, floaters
 from dyngs.prune.search import evenly_held_out
 from dyngs.prune.stage import importance, quality_of, scoring_views
-from dyngs.runs.checkpoint import latest_checkpoint
+from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
 
 NEEDLE = 20.0  # longest axis over the second longest
 VEIL, LARGE = 0.1, 4.0  # opacity below which large Gaussians veil what is behind; size over the median size
 FAINT = 2 / 255  # opacity below which a Gaussian hardly shows
 LONE, NEIGHBOURS = 20.0, 4
 """Distance to the fourth neighbour over its median, from which a Gaussian is alone."""
-HARDLY = 0.25  # contribution over the median one, below which Gaussians that are alone may go
 _TRIALS = 6  # of a bisection
 Tell = Callable[[str], None]
 
@@ -99,8 +99,7 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
     if not config.model.made_of_gaussians:
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to clean")
     with kernel_threads(threads or num_cores()), deterministic(device_for(config.run.device), True), torch.no_grad():
-        trainer = assemble(config, restored=True)
-        trainer.restore(latest_checkpoint(run_dir))
+        trainer = _at_end(config, run_dir)
         unseen = unseen_images(config, trainer.device)
         held = () if unseen else evenly_held_out(len(trainer.images))
         if not unseen and not held:
@@ -112,6 +111,18 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
         told = f"clean: {int((~kept).sum()):,} of {counted(len(kept), 'Gaussian')} go; {before:.2f} -> {after:.2f} dB"
         tell(f"{told} ({after - before:+.3f}) on {views} held out; {max_loss:g} dB may be lost")
         return kept.cpu()
+
+
+def _at_end(config: Config, run_dir: Path) -> GaussianTrainer:
+    """Return the trainer of a run where it ended; without checkpoints with nothing but its scene."""
+    trainer: GaussianTrainer = assemble(config, restored=True)
+    if has_only_scene_file(run_dir):
+        scene = load_run(run_dir, config.data.root).scene.to(trainer.device)
+        trainer.model.begin_with(scene, trainer.model.training)
+        trainer.model.exchange(scene)
+    else:
+        trainer.restore(latest_checkpoint(run_dir))
+    return trainer
 
 
 def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]:
@@ -127,8 +138,7 @@ def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]
     kinds = {"never seen": contribution <= 0}
     if scene.is_static and len(trainer.images) >= FEWEST_VIEWS:
         kinds["floaters"] = floaters(trainer)
-    kinds["lone"] = shapes["lone"] & (contribution < HARDLY * contribution.median())
-    kinds |= {kind: shapes[kind] for kind in ("faint", "veils", "needles")}
+    kinds |= {kind: shapes[kind] for kind in ("lone", "faint", "veils", "needles")}
     return [Suspects.of(kind, rows, contribution) for kind, rows in kinds.items()]
 
 

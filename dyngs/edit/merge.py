@@ -12,7 +12,7 @@ from dyngs.runs.opened import open_scene
 from dyngs.splats.formats import known_format, read_splats
 from dyngs.splats.rotation import axis_of, joined, turn_between
 from dyngs.splats.similarity import Similarity
-from dyngs.splats.splat_file import SplatFile, with_degree
+from dyngs.splats.splat_file import SplatFile, splat_options, with_degree
 
 
 def merged(
@@ -28,7 +28,7 @@ def merged(
         gaussians = other.gaussians
         if up is not None and direction is not None:
             gaussians = Similarity(turn_between(tuple(direction), tuple(up))).gaussians(gaussians)
-        if (other.mode, other.eps2d) != (splat.mode, splat.eps2d):
+        if splat_options(other) != splat_options(splat):
             tell(f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is")
         tell(f"{file}: {counted(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())

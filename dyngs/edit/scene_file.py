@@ -132,7 +132,9 @@ def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
     rows = held_by(edits.region, scene, found.offset) ^ edits.outside
     count = int(rows.sum())
     if not count:
-        low, high = (", ".join(f"{x:.4g}" for x in end.tolist()) for end in scene.bounds.cpu() + found.offset)
+        low, high = (
+            ", ".join(f"{x:.4g}" for x in end.tolist()) for end in scene.bounds.double().cpu().numpy() + found.offset
+        )
         raise DyngsError(
             f"{source}: --crop leaves none of {counted(len(scene), 'Gaussian')}; they lie between {low} and {high}"
         )
