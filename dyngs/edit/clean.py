@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -68,14 +69,14 @@ def lone(means: Tensor) -> Tensor:
     if len(means) <= NEIGHBOURS:
         return torch.zeros(len(means), dtype=torch.bool, device=means.device)
     points = means.double().cpu().numpy()
-    distance = torch.from_numpy(KDTree(points).query(points, k=[NEIGHBOURS + 1])[0][:, 0])
+    distance = torch.from_numpy(np.asarray(KDTree(points).query(points, k=NEIGHBOURS + 1)[0])[:, -1])
     return (distance > LONE * distance.median()).to(means.device)
 
 
 def cleaned_file(gaussians: Gaussians, tell: Tell) -> Tensor:
     """Return (N,) bool which Gaussians stay of a scene without cameras: all but what is faint, a needle or alone."""
     found = by_shape(gaussians, gaussians.opacities)
-    gone = torch.zeros(len(gaussians), dtype=torch.bool)
+    gone = torch.zeros_like(found["faint"])
     for kind in ("faint", "needles", "lone"):
         tell(f"clean: {kind}: {counted(int((found[kind] & ~gone).sum()), 'Gaussian')}")
         gone |= found[kind]

@@ -40,7 +40,7 @@ class Box:
     high: np.ndarray
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        return ((points >= self.low) & (points <= self.high)).all(1)
+        return np.all((points >= self.low) & (points <= self.high), axis=1)
 
 
 @dataclass(frozen=True)
