@@ -73,10 +73,11 @@ class EditedFile:
 
 @dataclass(frozen=True)
 class _Source:
-    """What is edited: a scene, and the contents of its file where it was one."""
+    """What is edited: a scene; of a file also its contents, and what is up in files of its format by default."""
 
     opened: Opened
-    splat: SplatFile | None
+    splat: SplatFile | None = None
+    usual: str | None = None
 
     @property
     def offset(self) -> np.ndarray:
@@ -121,8 +122,8 @@ def _opened(source: Path, data_root: Path | None) -> _Source:
     if source.is_file() and known_format(source) is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
         opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), source)
-        return _Source(replace(opened, stated_up=splat.up, notes=splat.notes), splat)
-    return _Source(open_scene(source, data_root=data_root), None)
+        return _Source(replace(opened, stated_up=splat.up, notes=splat.notes), splat, format_of(source).up)
+    return _Source(open_scene(source, data_root=data_root))
 
 
 def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
@@ -208,6 +209,8 @@ def _frame(
         return edits.geo.similarity.after(Similarity(shift=(x, y, z))), "z"
     x, y, z = (np.array(edits.frame.origin or (0.0, 0.0, 0.0)) - found.offset).tolist()
     frame = edits.frame if edits.frame.origin is None else replace(edits.frame, origin=(x, y, z))
+    if found.splat is not None and found.splat.up != found.usual and frame.up is None:  # as control points leave it
+        return frame.similarity(None, ()), found.splat.up
     return frame.similarity(direction, axis_of(wanted)), None if direction is None else wanted
 
 

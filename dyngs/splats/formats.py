@@ -16,7 +16,15 @@ from dyngs.gaussians import Gaussians
 from dyngs.splats.edit_note import note_path, read_note, write_note
 from dyngs.splats.rotation import AXES, axis_of, product, turn_between
 from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, require_writable, unit_rotations, with_degree
+from dyngs.splats.splat_file import (
+    GEO_OFFSET,
+    Nonfinite,
+    SplatFile,
+    drawable,
+    require_writable,
+    unit_rotations,
+    with_degree,
+)
 
 
 @dataclass(frozen=True)
@@ -174,7 +182,8 @@ def turned_file(splat: SplatFile, turn: tuple[float, float, float, float], up: s
 
 def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
     """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what then points up."""
-    return replace(splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited))
+    edited = replace(splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited))
+    return edited if how == UNMOVED else _without_offset(edited)
 
 
 def undone_file(splat: SplatFile) -> SplatFile:
@@ -182,7 +191,11 @@ def undone_file(splat: SplatFile) -> SplatFile:
     back = splat.edited.inverse()
     before = None if splat.up is None else back.rotation @ axis_of(splat.up)
     up = next((name for name, axis in AXES.items() if before is not None and before @ axis > 1 - 1e-6), None)
-    return replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
+    return _without_offset(replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED))
+
+
+def _without_offset(splat: SplatFile) -> SplatFile:
+    return replace(splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET)))
 
 
 def _unit(gaussians: Gaussians) -> Gaussians:

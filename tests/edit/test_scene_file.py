@@ -79,6 +79,12 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
     wanted = 2 * read_splats(plain).gaussians.means.numpy()[:, [1, 2, 0]] + [691000.0, 5334000.0, 500.0]
     np.testing.assert_allclose(found.gaussians.means.double().numpy() + offset, wanted, atol=1e-4)
     assert "viewers of the format take -y for up" in told[-1]
+    edit_scene(tmp_path / "a.ply", tmp_path / "b.ply", Edits(region=Sphere((0.0, 0.0, 0.0), 1e3)), tell=silent)
+    part = read_splats(tmp_path / "b.ply")
+    assert (part.up, comment in part.comments) == ("z", True)
+    torch.testing.assert_close(part.gaussians.means, found.gaussians.means, rtol=0, atol=0)
+    edit_scene(tmp_path / "a.ply", tmp_path / "b.ply", Edits(undo=True), tell=silent)
+    assert comment not in read_splats(tmp_path / "b.ply").comments
 
 
 def test_a_run_with_an_offset_is_meant_in_the_coordinates_of_its_capture(tmp_path: Path) -> None:
