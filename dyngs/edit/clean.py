@@ -93,8 +93,9 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
     """Return (N,) bool which Gaussians of a run stay; what goes, and what it costs, is told.
 
     One kind after another goes, of each as much as the mean PSNR of views held out may lose: by no more than
-    ``max_loss`` in all, dB. Views held out are those of the split val, else every eighth training view, which then
-    counts for no contribution. Deterministic. Raises DyngsError: no such run, or its capture cannot be read.
+    ``max_loss`` in all, dB, and that of 16 training views by no more. Views held out are those of the split val, else
+    every eighth training view, which then counts for no contribution. Deterministic. Raises DyngsError: no such run, or
+    its capture cannot be read.
     """
     config = load_resolved(run_dir, data_root=data_root)
     if not config.model.made_of_gaussians:
@@ -109,8 +110,10 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
         kept = judge.kept(suspects_of(trainer, held), max_loss, tell)
         views = counted(len(judge.images), "validation view" if unseen else "training view")
         before, after = judge.psnr_before, judge.psnr_of(kept)
-        told = f"clean: {int((~kept).sum()):,} of {counted(len(kept), 'Gaussian')} go; {before:.2f} -> {after:.2f} dB"
-        tell(f"{told} ({after - before:+.3f}) on {views} held out; {max_loss:g} dB may be lost")
+        gone = f"clean: {int((~kept).sum()):,} of {counted(len(kept), 'Gaussian')} go"
+        cost = f"{before:.2f} -> {after:.2f} dB ({after - before:+.3f}) on {views} held out"
+        lost = f"{max(judge.loss_of(kept), 0):.3f} of {max_loss:g} dB lost, with training views"
+        tell(f"{gone}; {cost}; {lost}")
         return kept.cpu()
 
 
@@ -144,21 +147,27 @@ def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]
 
 
 class Judge:
-    """What views held out say of Gaussians that go.
+    """What views held out say of Gaussians that go; as few of them may be kind by chance, some training views as well.
 
     Args:
         trainer: of the run, at its end.
-        images: the views.
+        images: the views held out.
     """
 
     def __init__(self, trainer: GaussianTrainer, images: Sequence[Image]) -> None:
         self.images, self._trainer = images, trainer
         self._scene: GaussianScene = trainer.model.scene.unmasked()
         self.psnr_before = quality_of(trainer, self._scene, images)
+        self._trained_before = quality_of(trainer, self._scene)
 
     def psnr_of(self, kept: Tensor) -> float:
         """Return the mean PSNR of the views, drawn of the Gaussians where ``kept`` (N,) is true, dB."""
         return quality_of(self._trainer, self._scene.select(kept), self.images)
+
+    def loss_of(self, kept: Tensor) -> float:
+        """Return the larger loss of mean PSNR, of the views held out or of 16 training views, dB."""
+        trained = self._trained_before - quality_of(self._trainer, self._scene.select(kept))
+        return max(self.psnr_before - self.psnr_of(kept), trained)
 
     def kept(self, suspects: Sequence[Suspects], max_loss: float, tell: Tell) -> Tensor:
         """Return (N,) bool which Gaussians stay when as many suspects go as may; by kind, the first ones of each."""
@@ -178,7 +187,7 @@ class Judge:
         def may_go(count: int) -> bool:
             left = kept.clone()
             left[rows[:count]] = False
-            return bool(left.any()) and self.psnr_before - self.psnr_of(left) <= max_loss
+            return bool(left.any()) and self.loss_of(left) <= max_loss
 
         if may_go(len(rows)):
             return len(rows)

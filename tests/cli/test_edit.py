@@ -63,7 +63,7 @@ def test_a_run_by_its_cameras(tmp_path: Path, capsys: Capture) -> None:
         )
         == 0
     )
-    assert "dB may be lost" in capsys.readouterr().out
+    assert "dB lost, with training views" in capsys.readouterr().out
     assert edit(str(trained), "--out", str(out)) == 0
     os.rename(tmp_path / "capture", tmp_path / "moved")
     said = error_line(capsys, "edit", str(run), "--clean", "--out", str(out))
