@@ -35,6 +35,7 @@ VERBS = (
     "render",
     "export",
     "convert",
+    "edit",
     "data",
     "bench",
     "doctor",

@@ -33,7 +33,7 @@ SHELL, PYTHON, OUTLINE = ("bash", "sh"), ("python",), ("", "text")
 
 RUN_PAGES = (
     "README.md", "storage.md", "photos.md", "video.md", "person.md", "mask.md", "look.md", "longer.md", "smaller.md",
-    "faster.md",
+    "faster.md", "edit.md",
 )  # fmt: skip
 SHORTER = {
     "data synth": ("--size", "16", "--views", "6"),

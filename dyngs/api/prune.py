@@ -93,7 +93,7 @@ def prune_within(
     with kernel_threads(config.run.threads or num_cores()), bytewise:
         trainer = assemble(config, restored=True)
         trainer.restore(start)
-        chosen, file, promise = Search(trainer, start, tell, _unseen(config, trainer.device)).run(max_loss)
+        chosen, file, promise = Search(trainer, start, tell, unseen_images(config, trainer.device)).run(max_loss)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
@@ -113,7 +113,7 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     return config
 
 
-def _unseen(config: Config, device: torch.device) -> list[Image]:
+def unseen_images(config: Config, device: torch.device) -> list[Image]:
     """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people none.
 
     They play other motions there, in which poses are not refined.

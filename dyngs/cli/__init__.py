@@ -32,6 +32,7 @@ from dyngs.cli import (
     demo,
     docs,
     doctor,
+    edit,
     evaluate,
     export,
     predict,
@@ -156,8 +157,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    running = (demo, train, prune, predict, evaluate, render, view, export, convert, tradeoff, compare, data, bench)
-    for module in (*running, config, docs, completion, doctor):
+    running = (demo, train, prune, predict, evaluate, render, view, export, convert, edit, tradeoff, compare, data)
+    for module in (*running, bench, config, docs, completion, doctor):
         module.add_parser(commands)
     return parser
 

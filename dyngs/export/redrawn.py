@@ -17,12 +17,13 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr
 from dyngs.runs.opened import Opened
 from dyngs.splats.formats import Written, read_splats
-from dyngs.splats.rotation import AXES, inverse, product, with_scene
+from dyngs.splats.rotation import AXES
 from dyngs.splats.splat_file import SplatFile, splat_options
 
 VIEWS = 4
 _LONGEST_SIDE = 240
 _LEAST_FRACTION = 0.002  # cameras that see the scene in fewer pixels than this are replaced by an orbit
+_NEAR = 0.05  # near plane of an orbit over its distance, where the default would be too far for a small scene
 FAINT = 30.0  # dB, below which a line about the difference is a warning
 
 
@@ -53,12 +54,12 @@ def compare_run(opened: Opened, scene: GaussianScene, time: float, meant: SplatF
     """
     with torch.no_grad():
         moment = scene.time_step(time)
-        for cameras in (capture_cameras(opened), with_scene(around(meant), inverse(meant.turned))):
+        for cameras in (capture_cameras(opened), meant.frame.inverse().cameras(around(meant))):
             if cameras is None:
                 continue
             drawn = scene.render(cameras, moment, background=_black(moment.gaussians.means))
             if float((drawn.alpha > 0.1).float().mean()) >= _LEAST_FRACTION:
-                return compare(drawn.rgb, with_scene(cameras, meant.turned), read)
+                return compare(drawn.rgb, meant.frame.cameras(cameras), read, scene.options.near * meant.frame.scale)
     raise DyngsError("nothing of the scene is seen by the cameras of the capture, or from an orbit around it")
 
 
@@ -67,19 +68,20 @@ def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
 
     Raises DyngsError: the file cannot be read.
     """
-    cameras = around(splat)
+    cameras, moved = around(splat), written.splat.frame.after(splat.frame.inverse())
+    distance = float((cameras.centers[0] - splat.gaussians.means.mean(0)).norm())
+    options = splat_options(splat)
+    options = replace(options, near=min(options.near, _NEAR * distance))
     with torch.no_grad():
-        background = _black(splat.gaussians.means)
-        wanted = render(splat.gaussians, cameras, splat_options(splat), background=background).rgb
-    return compare(
-        wanted, with_scene(cameras, product(written.splat.turned, inverse(splat.turned))), read_splats(written.path)
-    )
+        wanted = render(splat.gaussians, cameras, options, background=_black(splat.gaussians.means)).rgb
+    return compare(wanted, moved.cameras(cameras), read_splats(written.path), options.near * moved.scale)
 
 
-def compare(wanted: Tensor, cameras: Cameras, splat: SplatFile) -> Redrawn:
+def compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> Redrawn:
     """Return how what a file holds, seen by cameras in its axes, differs from images (V, H, W, 3)."""
+    options = replace(splat_options(splat), near=near)
     with torch.no_grad():
-        drawn = render(splat.gaussians, cameras, splat_options(splat), background=_black(wanted)).rgb
+        drawn = render(splat.gaussians, cameras, options, background=_black(wanted)).rgb
     values = [psnr(a, b) for a, b in zip(drawn, wanted, strict=True)]
     return Redrawn(float(np.mean(values)), len(values))
 

@@ -22,8 +22,9 @@ from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.formats import Written, turned_file, write_splats
+from dyngs.splats.formats import Written, moved_file, turned_file, write_splats
 from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
+from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import SplatFile, drawable, from_linear, unit_rotations
 
 Part = Literal["all", "moving", "still"]
@@ -37,6 +38,7 @@ class Writing:
     turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     up: str | None = None  # axis that then points up, such as "-y"; None: not known
     sh_degree: int | None = None  # degree of the harmonics in the file; None: as they are, up to what the format holds
+    edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
 
 
 AS_THEY_ARE = Writing()
@@ -153,7 +155,8 @@ def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = 
         comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     x, y, z = opened.info.world_offset
     splat = SplatFile(gaussians.detach(), model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
-    return turned_file(splat, how.turn, how.up)
+    splat = turned_file(splat, how.turn, how.up)
+    return splat if how.edit == UNMOVED else moved_file(splat, how.edit, how.up)
 
 
 def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: Writing) -> Written:

@@ -30,6 +30,7 @@ from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
 from dyngs.splats.formats import all_suffixes, known_format, read_splats
 from dyngs.splats.rotation import AXES
+from dyngs.splats.similarity import UNMOVED
 from dyngs.splats.splat_file import Nonfinite, splat_options
 from dyngs.static.scene import StaticScene
 
@@ -256,8 +257,11 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path, nonfinite=nonfinite)
     opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), path)
+    opened = replace(opened, stated_up=splat.up, notes=splat.notes)
+    if splat.edited != UNMOVED:  # then its own frame is the one that people mean
+        return opened
     info = replace(opened.info, world_offset=splat.world_offset)
-    return replace(opened, info=info, turned=splat.turned, stated_up=splat.up, notes=splat.notes)
+    return replace(opened, info=info, turned=splat.turned)
 
 
 def open_run(folder: Path, capture: Capture | None = None, data_root: Path | None = None) -> Opened:

@@ -13,8 +13,18 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, reading, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
-from dyngs.splats.rotation import axis_of, product, turn_between, turned
-from dyngs.splats.splat_file import Nonfinite, SplatFile, drawable, require_writable, unit_rotations, with_degree
+from dyngs.splats.edit_note import note_path, read_note, write_note
+from dyngs.splats.rotation import AXES, axis_of, product, turn_between
+from dyngs.splats.similarity import UNMOVED, Similarity
+from dyngs.splats.splat_file import (
+    GEO_OFFSET,
+    Nonfinite,
+    SplatFile,
+    drawable,
+    require_writable,
+    unit_rotations,
+    with_degree,
+)
 
 
 @dataclass(frozen=True)
@@ -27,6 +37,11 @@ class Format:
     max_degree: int  # largest degree of the harmonics that it holds
     states_mode: bool  # whether it can say that the scene is antialiased
     home: tuple[str, str, str]  # module and the names of its reader and its writer
+
+    @property
+    def holds_comments(self) -> bool:
+        """Return whether its files say how they were turned and edited; beside others lies a note about edits."""
+        return self.home[0] == "ply"
 
     @property
     def reader(self) -> Callable[[Path], SplatFile]:
@@ -108,6 +123,8 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
         splat = own.reader(path)
         if splat.up is None:
             splat = replace(splat, up=own.up)
+        if not own.holds_comments:
+            splat = replace(splat, edited=read_note(path))
         return drawable(splat, path, nonfinite)
 
 
@@ -137,6 +154,9 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
         except DyngsError as error:
             reason = str(error).removeprefix(f"{temporary}: ")
             raise DyngsError(f"{path}: not written: {reason}") from error
+    if not own.holds_comments and splat.edited != UNMOVED:
+        write_note(path, splat.edited)
+        notes.append(f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does")
     return Written(path, whole, tuple(notes))
 
 
@@ -154,8 +174,28 @@ def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
 
 def turned_file(splat: SplatFile, turn: tuple[float, float, float, float], up: str | None) -> SplatFile:
     """Return the contents turned by a quaternion wxyz about the origin, ``up`` being what then points up."""
-    gaussians = turned(splat.gaussians, turn)
-    return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
+    if splat.edited == UNMOVED:
+        gaussians = Similarity(turn).gaussians(splat.gaussians)
+        return replace(splat, gaussians=gaussians, up=up, turned=product(turn, splat.turned))
+    return moved_file(splat, Similarity(turn), up)
+
+
+def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
+    """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what then points up."""
+    edited = replace(splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited))
+    return edited if how == UNMOVED else _without_offset(edited)
+
+
+def undone_file(splat: SplatFile) -> SplatFile:
+    """Return the contents as they lay before all of ``moved_file``; up is known where it was an axis."""
+    back = splat.edited.inverse()
+    before = None if splat.up is None else back.rotation @ axis_of(splat.up)
+    up = next((name for name, axis in AXES.items() if before is not None and before @ axis > 1 - 1e-6), None)
+    return _without_offset(replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED))
+
+
+def _without_offset(splat: SplatFile) -> SplatFile:
+    return replace(splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET)))
 
 
 def _unit(gaussians: Gaussians) -> Gaussians:

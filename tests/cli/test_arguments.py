@@ -31,6 +31,7 @@ WORDS = {
     "prune": {"overrides", "prune", "masks", "steps"},
     "render": {"times", "view", "overrides"},
     "export": {"times", "overrides"},
+    "edit": {"up", "origin", "scale", "crop", "max_loss", "overrides"},
     "tradeoff": {"overrides", "vary", "require", "minimize", "maximize"},
     "compare": {"overrides"},
     "config": {"overrides"},

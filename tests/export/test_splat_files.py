@@ -21,6 +21,7 @@ from moving_scene import (
     still_scene,
     write_moving_run,
 )
+from scene_kinds import KINDS, onlooker, scene_of_kind
 
 from dyngs.cli import main
 from dyngs.errors import DyngsError
@@ -28,9 +29,11 @@ from dyngs.export import splat_files
 from dyngs.export.splat_files import (
     Part,
     Tracks,
+    Writing,
     frame_names,
     read_moment,
     scene_part,
+    splats_at,
     tracks_of,
     up_of,
     write_moving,
@@ -39,10 +42,12 @@ from dyngs.export.splat_files import (
     write_tracks,
     writing_of,
 )
+from dyngs.gaussians.rendering import render
 from dyngs.runs.checkpoint import load_run
-from dyngs.runs.opened import Captured, Opened, open_run
+from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
 from dyngs.splats.formats import read_splats
 from dyngs.splats.rotation import AXES, turn_between
+from dyngs.splats.similarity import Similarity
 from dyngs.static.scene import StaticScene
 
 ALL = (0, 1, 2, 3, 4)
@@ -301,3 +306,18 @@ def test_without_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(splat_files, "import_module", missing)
     with pytest.raises(DyngsError, match=r"pip install 'dyngs\[4dgs\]'"):
         write_moving(run, tmp_path / "a.4dgs", [0.0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
+    """What moves, is posed or has a 3D filter: seen by cameras moved with it, at a time in between."""
+    scene = replace(scene_of_kind(kind), colour=None)
+    edit = Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (3.0, -1.0, 0.5))
+    splat = splats_at(opened_scene(scene), scene, 0.3, Writing(edit=edit, up="y"))
+    seen = onlooker()
+    before = scene.render(seen, 0.3, background=torch.zeros(3)).rgb
+    options = replace(scene.options, near=scene.options.near * edit.scale)
+    after = render(splat.gaussians, edit.cameras(seen), options).rgb
+    assert float(before.max()) > 0.05
+    torch.testing.assert_close(after, before, rtol=0, atol=2e-4)
+    assert (splat.edited, splat.up) == (edit, "y")

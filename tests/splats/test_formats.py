@@ -18,16 +18,20 @@ from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
 from dyngs.files.limits import VARIABLE
 from dyngs.gaussians import Gaussians
+from dyngs.splats.edit_note import note_path
 from dyngs.splats.formats import (
     FORMATS,
     Format,
     format_named,
     format_of,
     known_format,
+    moved_file,
     read_splats,
+    undone_file,
     upright,
     write_splats,
 )
+from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import SplatFile, splat_options
 
 LEAST_PSNR = {"ply": 99, "compressed-ply": 42, "spz": 36, "splat": 40, "sog": 35, "glb": 90, "usd": 90}
@@ -202,6 +206,32 @@ def test_the_original_place_is_known_from_a_ply(tmp_path: Path) -> None:
         assert "mine" in back.comments
         again = read_splats(write_splats(path, replace(back, comments=(*back.comments, "caf\xe9", "two\rlines"))).path)
         assert again.comments == back.comments  # nothing twice, nothing that breaks the header
+
+
+@pytest.mark.parametrize("kind", readable(), ids=str)
+def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
+    """In comments, or in a note beside the file; turned for viewers or not."""
+    path = tmp_path / f"a{kind.suffixes[0]}"
+    before = SplatFile(cloud(30, kind.max_degree), up="-y", turned=(0.0, 0.0, 1.0, 0.0))
+    edited = moved_file(
+        moved_file(before, Similarity((0.6, 0.0, 0.8, 0.0), 0.5), "-y"), Similarity(shift=(1, 2, 3)), "-y"
+    )
+    back = read_splats(write_splats(path, upright(edited, None, path)).path)
+    assert note_path(path).exists() is not kind.holds_comments
+    assert back.edited.numbers == pytest.approx(upright(edited, None, path).edited.numbers)
+    undone = undone_file(back)
+    assert (undone.up, undone.edited) == ("-y", UNMOVED)
+    order = (before.gaussians.means[:, None] - undone.gaussians.means).norm(dim=2)
+    assert float(order.amin(1).max()) < 0.02  # of a cloud of size 1, in the coarsest format
+    path.write_bytes(write_splats(tmp_path / f"b{kind.suffixes[0]}", before).path.read_bytes())
+    assert read_splats(path).edited == UNMOVED  # another file by that name
+
+
+def test_an_edit_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = write_splats(tmp_path / "a.ply", moved_file(SplatFile(cloud(3)), Similarity(scale=2), None)).path
+    path.write_bytes(path.read_bytes().replace(b"edited: 1.0 0.0", b"edited: 3.0 0.0"))
+    with pytest.raises(DyngsError, match="is no similarity; remove it"):
+        read_splats(path)
 
 
 def test_large_scenes_keep_their_place_in_spz(tmp_path: Path) -> None:
