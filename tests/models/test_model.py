@@ -16,13 +16,13 @@ from dyngs.config import Config, ModelSection
 from dyngs.config.io import load_config
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
+from dyngs.human.prediction.learner import PersonPredictor, new_network
 from dyngs.kinds import build, restored_model
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import KINDS, kind_of
-from dyngs.models.model import Predictor
+from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.state import Role
-from dyngs.training.prediction import PersonPredictor, new_network
 from dyngs.training.trainer import Trainer
 
 TRAINED = {
@@ -158,7 +158,7 @@ def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
     root = people(tmp_path, (1,)) / "p1"
     network, mean = new_network(NET, torch.Generator().manual_seed(0)), torch.full((3, 32, 32), 0.5)
     config = Config.model_validate({"data": {"root": root}, "model": NET})
-    predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root))
+    predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root), config.data)
     one, three = predictor.predict([0]), predictor.predict([0, 3, 6])
     for scene in (one, three):
         assert isinstance(scene, Renderable)

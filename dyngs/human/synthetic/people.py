@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dyngs.conventions import ReportProgress, report_nothing
+from dyngs.data.people_set import PEOPLE_FILE
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import require_new_folder
 from dyngs.files.write import write_text
@@ -14,8 +15,6 @@ from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capt
 
 SHARD = 100
 """People in a folder."""
-PEOPLE_FILE = "people.json"
-"""In a folder of folders of people: the options that they were made with."""
 _MOST = 10**6  # People of one seed, so that those of two seeds share nothing
 
 
@@ -59,16 +58,6 @@ def _begin(out: Path, made_with: dict[str, int]) -> None:
         write_text(mark, text)
     elif mark.read_text(encoding="utf-8", errors="replace") != text:
         raise DyngsError(f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same")
-
-
-def folders_of_people(root: Path) -> list[Path]:
-    """Return the folders of captures in ``root`` by name: below its shards where ``write_people`` wrote it."""
-    shards = _folders(root) if (root / PEOPLE_FILE).is_file() else [root]
-    return [person for shard in shards for person in _folders(shard)]
-
-
-def _folders(root: Path) -> list[Path]:
-    return sorted(f for f in root.iterdir() if f.is_dir() and not f.name.startswith(".")) if root.is_dir() else []
 
 
 def person_options(options: PeopleOptions, number: int) -> HumanOptions:
