@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from dyngs.deform.keys import DynamicModel
 from dyngs.errors import DyngsError
 from dyngs.fields.keys import NerfModel, NgpModel
+from dyngs.gps.keys import GpsModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import ModelSection
 from dyngs.static.keys import StaticModel
@@ -79,6 +80,7 @@ KINDS: tuple[Kind, ...] = (
     Kind(DynamicModel, "dyngs.deform.kind"),
     Kind(HumanModel, "dyngs.human.avatar.kind"),
     Kind(HumanPredictorModel, "dyngs.human.prediction.learner"),
+    Kind(GpsModel, "dyngs.gps.learner"),
     Kind(NgpModel, "dyngs.fields.kind"),
     Kind(NerfModel, "dyngs.fields.kind"),
 )
