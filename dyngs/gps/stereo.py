@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool1d, silu, unfold
+from torch.nn.functional import avg_pool1d, max_pool2d, normalize, silu, unfold
 
 from dyngs.models.convolution import ResidualBlock, upsampled
 
@@ -21,6 +21,7 @@ _LEVELS, _RADIUS = (
     4,
 )  # Of the correlation: resolutions, each half as fine, and entries on either side in each
 _HIDDEN = 32  # Channels of the state that is refined
+_NEVER = -1e4  # Logit of what cannot be
 _SIDES = (1.0, -1.0)  # A larger offset lies further left in the right view, further right in the left one
 
 
@@ -63,14 +64,18 @@ class StereoNetwork(nn.Module):
             nn.Conv2d(_HIDDEN, _HIDDEN, 3, padding=1), nn.SiLU(), nn.Conv2d(_HIDDEN, 9 * QUARTER**2, 1)
         )
 
-    def forward(self, levels: Sequence[Tensor], iterations: int) -> tuple[list[Tensor], Tensor]:
-        """Return the offsets (2, 1, H, W) after each iteration, px, and the fused features (2, C, h, w)."""
+    def forward(self, levels: Sequence[Tensor], inside: Tensor, iterations: int) -> tuple[list[Tensor], Tensor]:
+        """Return offsets (2, 1, H, W), px, and the fused features (2, C, h, w).
+
+        The offsets are those by correlation alone, then those after each iteration. ``inside`` (2, 1, H, W) is 1 where
+        the person is.
+        """
         fused = self.fuse(torch.cat([levels[1], upsampled(levels[2])], dim=1))
         pyramid = correlation_pyramid(self.match(fused))
+        offsets = best_matches(pyramid[0], max_pool2d(inside, QUARTER))
+        found = [upsampled(upsampled(QUARTER * offsets))]
         hidden, given = self.context(fused).split(_HIDDEN, dim=1)
         hidden, given = hidden.tanh(), silu(given)
-        offsets = torch.zeros_like(fused[:, :1])
-        found: list[Tensor] = []
         for _ in range(iterations):
             offsets = offsets.detach()  # each iteration learns from its own error (Teed and Deng 2020)
             motion = self.motion(torch.cat([looked_up(pyramid, offsets), offsets], dim=1))
@@ -89,15 +94,28 @@ class StereoNetwork(nn.Module):
 def correlation_pyramid(features: Tensor) -> list[Tensor]:
     """Return the scalar products of ``features`` (2, C, h, w) along rows: (2, h, w, w') each.
 
-    Entry (v, y, x, x') is of pixel x of view v and pixel x' of the other one, over the root of C; x' is pooled by two
-    from one to the next.
+    Entry (v, y, x, x') is the root of C times the cosine between the features of pixel x of view v and pixel x' of the
+    other one; x' is pooled by two from one to the next.
     """
-    volume = torch.einsum("chx,chy->hxy", features[0], features[1]) / features.shape[1] ** 0.5
+    features = normalize(features, dim=1) * features.shape[1] ** 0.25
+    volume = torch.einsum("chx,chy->hxy", features[0], features[1])
     levels = [torch.stack([volume, volume.transpose(1, 2)])]
     for _ in range(_LEVELS - 1):
         pooled = avg_pool1d(levels[-1].flatten(0, 1), 2, ceil_mode=True, count_include_pad=False)
         levels.append(pooled.unflatten(0, levels[-1].shape[:2]))
     return levels
+
+
+def best_matches(volume: Tensor, inside: Tensor) -> Tensor:
+    """Return the offsets (2, 1, h, w) to the mean place in the other view, weighted by the softmax of ``volume``.
+
+    Places outside of the person, where ``inside`` (2, 1, h, w) is 0, do not count (Xu et al. 2022, GMFlow).
+    """
+    outside = inside.flip(0)[:, 0, :, None] == 0
+    shares = volume.masked_fill(outside, _NEVER).softmax(dim=3)
+    column = torch.arange(volume.shape[3], dtype=volume.dtype, device=volume.device)
+    place = (shares * column).sum(3)
+    return (volume.new_tensor(_SIDES)[:, None, None] * (column - place))[:, None]
 
 
 def looked_up(pyramid: Sequence[Tensor], offsets: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ _LEAST = 0.2  # Smallest disparity, relative to that of the middle of the person
 class Surface:
     """What the network says of two views."""
 
-    offsets: list[Tensor]  # (2, 1, H, W) after each iteration, px
+    offsets: list[Tensor]  # (2, 1, H, W) by correlation alone, then after each iteration, px
     raw: Tensor | None  # (2, 8, H, W) in the order of ``HEADS``; None: only depth was asked for
 
 
@@ -66,7 +66,7 @@ class GpsNetwork(nn.Module):
         inside = pair.solid.float()
         images = torch.cat([(2 * pair.rgb - 1) * inside, inside], dim=1)
         levels = self.encoder(images)
-        offsets, fused = self.stereo(levels, self.iterations)
+        offsets, fused = self.stereo(levels, inside, self.iterations)
         if not with_gaussians:
             return Surface(offsets, None)
         depth = torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1)

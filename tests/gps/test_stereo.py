@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.gps.stereo import QUARTER, Encoder, StereoNetwork, correlation_pyramid, looked_up, refined
+from dyngs.gps.stereo import QUARTER, Encoder, StereoNetwork, best_matches, correlation_pyramid, looked_up, refined
 from dyngs.models.convolution import begin_weights
 
 WIDTHS = (8, 16, 16)
@@ -25,6 +25,19 @@ def test_the_correlation_is_highest_at_the_true_offset_in_both_views() -> None:
             found = looked_up(pyramid, torch.full((2, 1, 6, 16), around))[:, :9].argmax(1)
             inner = found[:, :, 5:11]
             assert (inner == 4 + offset - around).all(), "of the left and the right view"
+
+
+def test_the_best_match_is_the_true_offset_within_the_person() -> None:
+    """Where one pixel is alike, and no other inside; what lies outside of the person is never matched."""
+    for offset in (-3, 0, 2):
+        volume = 10 * correlation_pyramid(shifted(offset))[0]
+        found = best_matches(volume, torch.ones(2, 1, 6, 16))
+        torch.testing.assert_close(found[..., 5:11], torch.full((2, 1, 6, 6), float(offset)), atol=0.01, rtol=0)
+    only = torch.zeros(2, 1, 6, 16)
+    only[..., 7] = 1
+    found = best_matches(volume, only)
+    column = torch.arange(16.0).expand(6, 16)
+    torch.testing.assert_close(found[:, 0], torch.stack([column - 7, 7 - column]))
 
 
 def test_look_ups_are_linear_and_0_outside() -> None:
@@ -51,8 +64,8 @@ def test_every_weight_gets_a_gradient() -> None:
     torch.manual_seed(0)
     encoder, stereo = Encoder(4, WIDTHS), StereoNetwork(WIDTHS)
     begin_weights(stereo, torch.Generator().manual_seed(0))
-    found, fused = stereo(encoder(torch.randn(2, 4, 32, 24)), 3)
-    assert [x.shape for x in found] == [(2, 1, 32, 24)] * 3
+    found, fused = stereo(encoder(torch.randn(2, 4, 32, 24)), torch.ones(2, 1, 32, 24), 3)
+    assert [x.shape for x in found] == [(2, 1, 32, 24)] * 4
     assert fused.shape == (2, 16, 8, 6)
     sum(x.square().mean() for x in found).backward()
     for name, x in [*encoder.named_parameters(), *stereo.named_parameters()]:
