@@ -22,7 +22,7 @@ class GpsModel(SceneModel):
         "(docs/people_network.md)",
     )
     person_px: int = Field(
-        default=192, ge=32, le=2048, description="height of the person in the rectified views, px; a Gaussian per pixel"
+        default=160, ge=32, le=2048, description="height of the person in the rectified views, px; a Gaussian per pixel"
     )
     widths: tuple[Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)], Annotated[int, Field(ge=8)]] = Field(
         default=(24, 40, 64), description="channels of the features of images at 1/2, 1/4 and 1/8 of the resolution"
