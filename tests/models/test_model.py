@@ -10,6 +10,7 @@ import pytest
 import torch
 from moving_scene import camera
 from tiny_people import NET, people, person
+from tiny_stereo import stereo_config, stereo_people
 from toy_kind import registered
 
 from dyngs.config import Config, ModelSection
@@ -25,6 +26,16 @@ from dyngs.models.renderable import Renderable
 from dyngs.state import Role
 from dyngs.training.trainer import Trainer
 
+
+def people_config(folder: Path) -> Config:
+    values = {"data": {"root": people(folder, (1,))}, "model": NET.model_dump(), "train": {"steps": 3}}
+    return Config.model_validate(json.loads(json.dumps(values, default=str)))
+
+
+def stereo_config_of(folder: Path) -> Config:
+    return stereo_config(stereo_people(folder / "set"), folder / "run")
+
+
 TRAINED = {
     "static": ("still", ["init.num_random=40"]),
     "dynamic": ("moving", ["init.num_random=40", "model.motion_from=0.3", "model.motion_threshold=0", "train.steps=6"]),
@@ -34,7 +45,7 @@ TRAINED = {
     "toy": ("still", []),
 }
 """Fixture with a capture for each kind that is trained on one, and other keys of a small run."""
-NETWORKS = {"human_predictor"}
+NETWORKS = {"human_predictor": people_config, "gps": stereo_config_of}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -66,7 +77,7 @@ def same(one: Checkpoint, other: Checkpoint) -> bool:
 
 
 def test_every_kind_is_here() -> None:
-    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == TRAINED.keys() | NETWORKS
+    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == TRAINED.keys() | NETWORKS.keys()
     for kind in KINDS:
         assert kind_of(kind.section()) is kind
         assert issubclass(kind.section, ModelSection)
@@ -141,8 +152,7 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config) -> None:
 @pytest.mark.parametrize("name", sorted(NETWORKS))
 def test_a_network_is_trained_stored_and_restored(tmp_path: Path, name: str) -> None:
     """It is no scene, but predicts one."""
-    values = {"data": {"root": people(tmp_path, (1,))}, "model": NET.model_dump(), "train": {"steps": 3}}
-    config = Config.model_validate(json.loads(json.dumps(values, default=str)))
+    config = NETWORKS[name](tmp_path)
     assert config.model.kind == name
     trainer, again = build(config), build(config, restored=True)
     trainer.step()
