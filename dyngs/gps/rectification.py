@@ -91,7 +91,7 @@ def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
     focal = person_px / height
     size = [_rounded(focal * height), _rounded(focal * float((boxes[:, 0, 1] - boxes[:, 0, 0]).max()))]
     middle = torch.stack([boxes[:, 0].mean(1), boxes[:, 1].mean().expand(2)], dim=1)
-    principal = torch.tensor([size[1] / 2, size[0] / 2], dtype=torch.float64) - focal * middle
+    principal = torch.tensor([size[1] / 2, size[0] / 2], dtype=torch.float64, device="cpu") - focal * middle
     rays = _rays(principal, focal, (size[0], size[1]))
     baseline = float((centers[1] - centers[0]).norm())
     windows = [_window(image, turn, ray) for image, ray in zip(images, rays, strict=True)]
