@@ -36,6 +36,7 @@ DECAY = 0.9
 """Weight of the error of an iteration relative to the next."""
 DEPTH_WEIGHT = 0.05  # Of the error of offsets, px, next to that of images
 _AROUND = 8  # px of background around the person in the images that are compared
+_FAINT = 0.02  # Opacity below which a predicted Gaussian is left out
 _OPEN = 64  # People whose captures are kept open
 
 
@@ -81,8 +82,10 @@ class GpsPredictor:
         for pair in pairs:
             both = rectified(images[pair.left], images[pair.right], self.model.person_px)
             found.append(gaussians_of(both, self.network(both)))
+        gaussians = joined(found)
+        gaussians = gaussians.select(gaussians.opacities >= _FAINT)
         background = evaluation_background(self.config.data.background, True)[1]
-        return StaticScene(gaussians=joined(found), options=render_options(self.model), background=background)
+        return StaticScene(gaussians=gaussians, options=render_options(self.model), background=background)
 
     def run_config(self, views: Sequence[int]) -> Config:
         preset = load_config(packaged_preset("static"), ["data.root=."])

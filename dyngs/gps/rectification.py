@@ -70,6 +70,15 @@ class RectifiedPair:
         """Return the depth of ``offsets`` of any shape, px, in the axes of the windows, world units."""
         return self.focal * self.baseline / (self.shift + offsets)
 
+    def seen_by_other(self, offsets: Tensor) -> Tensor:
+        """Return the alpha (2, 1, H, W) of the other window where it shows what is at ``offsets``; differentiable."""
+        height, width = offsets.shape[2:]
+        sides = offsets.new_tensor([1.0, -1.0])[:, None, None]
+        column = torch.arange(width, device=offsets.device) + 0.5 - sides * offsets[:, 0]
+        row = (torch.arange(height, device=offsets.device) + 0.5)[:, None].expand_as(column)
+        grid = torch.stack([2 * column / width - 1, 2 * row / height - 1], dim=-1)
+        return grid_sample(self.alpha.flip(0), grid, align_corners=False)
+
     def points(self, depth: Tensor) -> Tensor:
         """Return the points (2, H, W, 3) in the world of all pixels at ``depth`` (2, 1, H, W)."""
         rays = _rays(self.principal, self.focal, (depth.shape[2], depth.shape[3]))

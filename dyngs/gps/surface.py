@@ -81,16 +81,19 @@ def gaussians_of(pair: RectifiedPair, surface: Surface) -> Gaussians:
     """Return the Gaussians of the pixels of the person in both views, differentiable in ``surface``.
 
     Means lie on the rays through the pixels, rotations are relative to the axes of the windows, colours are those of
-    the images.
+    the images. What the other view would show beside the person is transparent (visual hull).
     """
     assert surface.raw is not None
     least = (_LEAST - 1) * pair.shift
-    depth = pair.depth(torch.maximum(surface.offsets[-1], least))
+    offsets = torch.maximum(surface.offsets[-1], least)
+    depth = pair.depth(offsets)
     solid = pair.solid[:, 0]
     parts = surface.raw.permute(0, 2, 3, 1)[solid].split(tuple(HEADS.values()), dim=1)
     part = dict(zip(HEADS, parts, strict=True))
     pixel = (depth[:, 0][solid] / pair.focal)[:, None]
     scales = LARGEST * pixel * (part["scale"] + _SCALE_LOGIT).sigmoid()
+    opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * pair.seen_by_other(offsets)[solid[:, None]]
+    opacities = opacities.clamp(1e-4, 1 - 1e-4)
     one = part["rotation"].new_tensor([1.0, 0.0, 0.0, 0.0])
     world_from_rect = quats_of(pair.rect_from_world.T[None])
     rgb = pair.rgb.permute(0, 2, 3, 1)[solid]
@@ -98,7 +101,7 @@ def gaussians_of(pair: RectifiedPair, surface: Surface) -> Gaussians:
         means=pair.points(depth)[solid],
         quats=quat_product(world_from_rect.expand(len(rgb), 4), unit_quats(one + part["rotation"])),
         log_scales=scales.clamp_min(1e-12).log(),
-        logit_opacities=part["opacity"][:, 0] + _OPACITY_LOGIT,
+        logit_opacities=(opacities / (1 - opacities)).log(),
         sh=((rgb - 0.5) / SH_C0)[:, None],
     )
 

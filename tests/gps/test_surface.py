@@ -24,13 +24,26 @@ def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
     raw = torch.zeros(*offsets.shape[:1], 8, *offsets.shape[2:])
     found = gaussians_of(pair, Surface([offsets], raw))
     assert len(found) == int(pair.solid.sum())
-    inner = pair.alpha[pair.solid] > 0.999
+    inner = (pair.alpha[pair.solid] > 0.999) & (pair.seen_by_other(offsets)[pair.solid] > 0.999)
+    assert found.opacities[inner].min() > 0.85
     assert ((found.means - CENTER).norm(dim=1) - RADIUS)[inner].abs().max() < 1e-4
     assert found.scales.min() > 0
     size = found.scales[:, 0] * pair.focal / depth[pair.solid]
     torch.testing.assert_close(size, torch.full_like(size, 0.5), atol=0.02, rtol=0)
     colour = pair.rgb.permute(0, 2, 3, 1)[pair.solid[:, 0]]
     torch.testing.assert_close(found.base_rgb, colour, atol=1e-6, rtol=1e-5)
+
+
+def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -> None:
+    """A surface beside that of the ball; where the true one is hidden from the other view nothing is wrong with it."""
+    offsets = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
+    raw = torch.zeros(2, 8, *offsets.shape[2:])
+    right, wrong = (gaussians_of(pair, Surface([offsets + d], raw)).opacities for d in (0.0, 15.0))
+    known = pair.alpha[pair.solid] > 0.999
+    assert right[known].mean() > 0.8
+    beside = pair.seen_by_other(offsets + 15.0)[pair.solid] == 0
+    assert 0.1 < beside.float().mean() < 0.9
+    assert wrong[beside].max() < 1e-3
 
 
 def test_scales_and_depth_are_limited(pair: RectifiedPair) -> None:
