@@ -44,6 +44,7 @@ class ModelSection(Section):
         kind: Any = None
         """Name of the kind."""
         source_views: Any = 0
+        lr: Any = 0.0
 
     @property
     def added_for_motion(self) -> int:

@@ -21,7 +21,7 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gps.pairs import MAX_ANGLE, Pair, lessons, neighbours, well_spread
-from dyngs.gps.rectification import RectifiedPair, cropped, rectified
+from dyngs.gps.rectification import RectifiedPair, cropped, is_inside, rectified
 from dyngs.gps.surface import GpsNetwork, gaussians_of, joined, offset_loss
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights
@@ -77,13 +77,16 @@ class GpsPredictor:
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> StaticScene:
         pairs = neighbours(self.name, self.views, views)
-        images = ImageLoader(self.views, self.data)
-        found = []
+        loader = ImageLoader(self.views, self.data)
+        images, found = {i: loader[i] for i in views}, []
         for pair in pairs:
             both = rectified(images[pair.left], images[pair.right], self.model.person_px)
             found.append(gaussians_of(both, self.network(both)))
         gaussians = joined(found)
-        gaussians = gaussians.select(gaussians.opacities >= _FAINT)
+        kept = gaussians.opacities >= _FAINT
+        for image in images.values():
+            kept &= is_inside(image, gaussians.means)
+        gaussians = gaussians.select(kept)
         background = evaluation_background(self.config.data.background, True)[1]
         return StaticScene(gaussians=gaussians, options=render_options(self.model), background=background)
 
@@ -99,10 +102,10 @@ class GpsPredictor:
         return preset.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        model.begin_with(scene, StaticTraining(FilterUpdate([], [])))
+        model.begin_with(scene, StaticTraining(FilterUpdate()))
 
 
-class GpsLearner(Learner):
+class GpsLearner(Learner[GpsNetwork]):
     """See ``Learner``: at first only depth is learned, from depth maps, then also the images of views in between."""
 
     def __init__(

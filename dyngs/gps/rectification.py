@@ -212,6 +212,18 @@ def _rounded(pixels: float) -> int:
     return int(-(-(pixels + 2 * _MARGIN) // FACTOR) * FACTOR)
 
 
+def is_inside(image: Image, points: Tensor) -> Tensor:
+    """Return (N,) bool: whether an image shows the person, or reaches not, where ``points`` (N, 3) in the world are."""
+    assert image.alpha is not None
+    camera = image.cameras
+    pose = camera.cam_from_world[0]
+    flat = (points @ pose[:3, :3].T + pose[:3, 3]) @ camera.intrinsics[0].T
+    place = flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / flat.new_tensor([camera.width, camera.height])
+    beyond = (flat[:, 2] <= 0) | ((place < 0) | (place > 1)).any(1)
+    alpha = grid_sample(image.alpha[None, None], (2 * place - 1)[None, None], align_corners=False)[0, 0, 0]
+    return beyond | (alpha > SOLID)
+
+
 def cropped(image: Image, margin: int) -> Image:
     """Return the part of an image, with its camera, that shows what is not transparent, and ``margin`` px around it."""
     assert image.alpha is not None

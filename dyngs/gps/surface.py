@@ -59,6 +59,7 @@ class GpsNetwork(nn.Module):
             self.heads = nn.Conv2d(_FULL, sum(HEADS.values()), 1)
         begin_weights(self, generator)
         for layer in (self.heads, self.stereo.change[-1]):
+            assert isinstance(layer, nn.Conv2d)
             nn.init.zeros_(layer.weight)
 
     def forward(self, pair: RectifiedPair, *, with_gaussians: bool = True) -> Surface:

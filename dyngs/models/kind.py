@@ -66,7 +66,7 @@ class Kind:
         refusal = getattr(import_module(self.home), "refusal", None)
         return None if refusal is None else refusal(capture)
 
-    def learner(self, config: Config, generator: torch.Generator) -> Learner:
+    def learner(self, config: Config, generator: torch.Generator) -> Learner[Any]:
         """Return a network in training, before the first step."""
         return import_module(self.home).learner(config, generator)
 

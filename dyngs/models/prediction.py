@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -27,6 +27,8 @@ from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.tensor_checks import require_tensor
+
+N = TypeVar("N", bound=nn.Module)
 
 MAX_GRADIENT = 1.0  # Norm to which gradients are clipped
 
@@ -77,7 +79,7 @@ class Example:
     num_gaussians: int = 0
 
 
-class Learner(ABC):
+class Learner(ABC, Generic[N]):
     """A network in training and the people that it is trained on.
 
     Attributes:
@@ -86,7 +88,7 @@ class Learner(ABC):
         background: "white", "black" or "random".
     """
 
-    network: nn.Module
+    network: N
     names: Sequence[str]
     background: str
 

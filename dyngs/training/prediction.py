@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,7 +28,7 @@ class NetworkTrainer:
     """A run in memory, as ``Trainer``."""
 
     config: Config
-    learner: Learner
+    learner: Learner[Any]
     optimizer: torch.optim.AdamW
     sampler: ViewSampler  # of people
     generator: torch.Generator

@@ -11,7 +11,7 @@ from ray_traced_ball import CENTER, RADIUS, SIZE, ball, exact_depth, pose_at
 
 from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
-from dyngs.gps.rectification import FACTOR, RectifiedPair, cropped, rectified
+from dyngs.gps.rectification import FACTOR, RectifiedPair, cropped, is_inside, rectified
 
 
 @pytest.fixture(params=[(0, 30, 0.0, 0.0), (-10, 35, 0.15, 4.0), (170, 192, -0.1, -3.0)])
@@ -90,6 +90,15 @@ def test_views_that_cannot_show_the_same_are_refused() -> None:
     for alpha in (None, torch.zeros(SIZE, SIZE)):
         with pytest.raises(DyngsError, match="b: shows no silhouette"):
             rectified(left, replace(right, alpha=alpha), 64)
+
+
+def test_points_beside_the_person_are_outside() -> None:
+    image = ball(pose_at(40))
+    points = torch.stack([CENTER, CENTER + torch.tensor([0.0, 0.9 * RADIUS, 0.0]), CENTER + torch.tensor([0, 0.75, 0])])
+    assert is_inside(image, points).tolist() == [True, True, False]
+    assert is_inside(image, torch.tensor([[0.0, 50.0, 0.0], [20.0, 1.0, 20.0]])).all(), (
+        "not in the image: nothing is known"
+    )
 
 
 def aside(camera: Cameras, degrees: float) -> Cameras:

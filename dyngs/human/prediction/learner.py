@@ -119,6 +119,8 @@ class PersonPredictor:
         return person_config(self.data, self.model)
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
+        if not isinstance(config.model, HumanModel):
+            raise TypeError(f"not the section of one person: {config.model!r}")
         frames = self.person.sitter.subject.motion.frames
         model.begin_with(scene, HumanTraining(config.model, frames, Rates(config.train.steps)))
 
@@ -128,7 +130,7 @@ class PersonPredictor:
         return scene_of(human_options(self.model), avatar, Rates(1))[0]
 
 
-class AtlasLearner(Learner):
+class AtlasLearner(Learner[AtlasNetwork]):
     """See ``Learner``: predicted from one choice of images, compared with others of one time step."""
 
     def __init__(
