@@ -25,6 +25,7 @@ from dyngs.errors import DyngsError
 FACTOR = 8
 """Windows are multiples of so many pixels."""
 SOLID = 0.5  # Alpha from which a pixel belongs to the person
+_REACHED = 0.1  # Alpha from which a point may be part of the person: outlines are not cut off
 _MARGIN = 6  # px around the person
 _FEWEST = 16  # Pixels of a person that can be rectified
 _SAME_HEIGHT = 0.08  # Largest difference of the rows where the person begins or ends, relative to the person's height
@@ -221,7 +222,7 @@ def is_inside(image: Image, points: Tensor) -> Tensor:
     place = flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / flat.new_tensor([camera.width, camera.height])
     beyond = (flat[:, 2] <= 0) | ((place < 0) | (place > 1)).any(1)
     alpha = grid_sample(image.alpha[None, None], (2 * place - 1)[None, None], align_corners=False)[0, 0, 0]
-    return beyond | (alpha > SOLID)
+    return beyond | (alpha > _REACHED)
 
 
 def cropped(image: Image, margin: int) -> Image:
