@@ -24,18 +24,26 @@ from statistics import fmean
 
 import torch
 
-from dyngs.api.predict import network_config, predict_person, write_run
+from dyngs.api.predict import network_config, predict, write_run
 from dyngs.api.train import train
 from dyngs.config import Config, HumanPredictorModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.evaluate.report import evaluate_run
+from dyngs.gaussians.schedule import Rates
+from dyngs.human.prediction.learner import (
+    PersonPredictor,
+    filmed,
+    human_options,
+    load_network,
+    new_network,
+    scene_of,
+)
 from dyngs.human.prediction.network import predict_gaussians
 from dyngs.human.prediction.person import spread_views
 from dyngs.human.prediction.texel_maps import from_atlas
 from dyngs.human.synthetic.capture import HumanOptions, varied, write_human_capture
 from dyngs.human.template.body_reader import load_template
 from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at
-from dyngs.training.prediction import filmed, human_options, load_network, new_network
 
 FIRST_HELD_OUT = 101
 """Seed of the first held-out person."""
@@ -81,18 +89,20 @@ def predicted(network: Path, capture: Path, out: Path, views: int, steps: int) -
     name = f"network, {views} views" + ("" if steps else ", as trained")
     run = out / f"network_{views}_{steps}"
     if not checkpoint_paths(run):
-        predict_person(network, capture, run, views, steps=steps)
+        predict(network, capture, run, views, steps=steps)
     return scored(name, run, seconds_at(run, 0))
 
 
 def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
     """The bare template, coloured without the network."""
-    config, model = network_config(network)
-    mean = load_network(new_network(model, torch.Generator("cpu")), latest_checkpoint(network), model.resolution)
+    config = network_config(network)
+    model = config.model
+    untrained = new_network(model, torch.Generator("cpu"))
+    mean = load_network(untrained, latest_checkpoint(network), model.resolution)
     bare: HumanPredictorModel = model.model_copy(update={"scaffold_heights": (min(model.scaffold_heights),)})
     data = config.data.model_copy(update={"root": capture.absolute()})
     person = filmed(data, bare, load_template(human_options(bare)))
-    rows = []
+    predictor, rows = PersonPredictor(config, bare, untrained, mean, person, data), []
     for name in ("seen, else nearby", "mean texture"):
         start = time.perf_counter()
         maps = person.look(spread_views(person.sitter, count))
@@ -102,7 +112,8 @@ def baselines(network: Path, capture: Path, out: Path, count: int) -> list[Row]:
         seconds = time.perf_counter() - start
         run = out / name.replace(", ", "_").replace(" ", "_")
         if not checkpoint_paths(run):
-            write_run(run, avatar, data, bare, seconds)
+            scene = scene_of(human_options(bare), avatar, Rates(1))[0]
+            write_run(run, predictor, [], scene, seconds)
         rows.append(scored(name, run, seconds))
     return rows
 

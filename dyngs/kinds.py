@@ -38,6 +38,7 @@ from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.limits import within_cap
 from dyngs.training.loop import Trainable
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
+from dyngs.training.prediction import network_trainer
 from dyngs.training.priors.find import used_priors
 from dyngs.training.priors.used import UsedPriors
 from dyngs.training.trainer import Trainer, ViewSampler
@@ -48,7 +49,7 @@ GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 def build(config: Config, capture: Capture | None = None, *, restored: bool = False) -> Trainable:
     """Return what the loop steps; see ``assemble`` for arguments and errors."""
     if config.model.is_network:
-        return kind_of(config.model).trainer(config)
+        return network_trainer(config)
     return assemble(config, capture, restored=restored)
 
 

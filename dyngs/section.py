@@ -28,6 +28,7 @@ class ModelSection(Section):
         begins_with_points: they begin where the points of the capture are.
         is_network: it predicts scenes, and is trained on several captures.
         is_posed: a body moves it: priors on motion say nothing, and poses are refined instead of cameras.
+        source_views: images that a network predicts from, unless it is told otherwise.
         may_move: a field moves it over the times of the capture.
         draws_whole_images: in training; what needs these (priors, masks of what disagrees, refined cameras, exposures)
             does not go with a model that draws some pixels of an image.
@@ -42,6 +43,8 @@ class ModelSection(Section):
     if TYPE_CHECKING:
         kind: Any = None
         """Name of the kind."""
+        source_views: Any = 0
+        lr: Any = 0.0
 
     @property
     def added_for_motion(self) -> int:

@@ -6,11 +6,11 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from dyngs.config import DataConfig, HumanPredictorModel
+from dyngs.config import Config, DataConfig, HumanPredictorModel
+from dyngs.human.prediction.learner import Filmed, filmed
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template
-from dyngs.training.prediction import Filmed, filmed
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
 NET = HumanPredictorModel(
@@ -39,3 +39,15 @@ def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -
 def person(capture: Path, model: HumanPredictorModel = NET) -> Filmed:
     """The person of one capture."""
     return filmed(DataConfig.model_validate({"root": capture}), model, body())
+
+
+def config(folder: Path, run: Path, **changes: object) -> Config:
+    """Of four steps with a checkpoint after every two, with some changes of the model section."""
+    return Config.model_validate(
+        {
+            "data": {"root": folder},
+            "model": NET.model_dump() | changes,
+            "train": {"steps": 4, "save_every": 2, "alpha_weight": 0.1},
+            "run": {"dir": run, "threads": 1},
+        }
+    )

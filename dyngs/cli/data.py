@@ -15,7 +15,20 @@ if TYPE_CHECKING:
     from dyngs.human.fit.known_person import KnownAvatar
     from dyngs.human.motion.motion import Motion
 
-SYNTHETIC_SCENES = ("still", "polyhedra", "spin", "wave", "merge", "room", "roll", "collide", "chain", "enter", "human")
+SYNTHETIC_SCENES = (
+    "still",
+    "polyhedra",
+    "spin",
+    "wave",
+    "merge",
+    "room",
+    "roll",
+    "collide",
+    "chain",
+    "enter",
+    "human",
+    "people",
+)
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
 _STILL = "still", "polyhedra"
 _OF_A_FIT = {
@@ -130,18 +143,21 @@ def _add_synth(verbs: args.Commands) -> None:
         "and vanish. room: videos of a static room with one hopping ball, from fixed cameras. roll: a striped ball "
         "rolls alone. collide: two balls bounce off each other. chain: a finger of five links bends. enter: a die "
         "slides into a room and out again. human: a walking person from all around, with exact body parameters; with "
-        "--style teleport one image per time, as in D-NeRF, without them.",
+        "--style teleport one image per time, as in D-NeRF, without them. people: many people, a capture each, with "
+        "depth maps and key points, for networks that predict people.",
     )
     parser.add_argument("scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES))
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    parser.add_argument("--size", type=int, default=128, metavar="PX", help="width and height (default 128)")
-    views = "training views; for fixed cameras and human: times (default 48, for human 12)"
+    size = "width and height (default 128, for people 256)"
+    parser.add_argument("--size", type=int, metavar="PX", help=size)
+    views = "training views; for fixed cameras, human and people: times (default 48, for human 12, for people 1)"
     parser.add_argument("--views", type=int, metavar="N", help=views)
     style = "of scenes that move: another camera at each time (default), one on a smooth arc, or fixed ones (room)"
     parser.add_argument("--style", choices=("teleport", "moving", "fixed"), help=style)
-    cameras = "training cameras for human, or fixed ones of any scene that moves (default 8)"
+    cameras = "training cameras for human and people, or fixed ones of any scene that moves (default 8; for people 24)"
     parser.add_argument("--cameras", type=int, metavar="N", help=cameras)
-    seed = "random seed of cameras, for human of the clothes (default 0)"
+    parser.add_argument("--people", type=int, metavar="N", help="for people: how many (default 100)")
+    seed = "random seed of cameras, for human of the clothes, for people of everything (default 0)"
     parser.add_argument("--seed", type=int, default=0, metavar="N", help=seed)
     varied = "for human: the seed is also that of body shape, light and clip"
     parser.add_argument("--varied", action="store_true", help=varied)
@@ -299,11 +315,15 @@ def run_synth(arguments: argparse.Namespace) -> int:
     from dyngs.data.synthetic import captures as synthetic
     from dyngs.files.outputs import require_new_folder
 
-    out, scene, size, seed = arguments.out, arguments.scene, arguments.size, arguments.seed
+    if arguments.scene == "people":
+        return _synth_people(arguments)
+    if arguments.people is not None:
+        raise DyngsError("--people is for the scene people only; leave it out")
+    out, scene, size, seed = arguments.out, arguments.scene, arguments.size or 128, arguments.seed
     by_poses = scene == "human" and arguments.style is None
     views = (12 if by_poses else 48) if arguments.views is None else arguments.views
     cameras = 8 if arguments.cameras is None else arguments.cameras
-    if size < 1 or views < 1 or seed < 0:
+    if (arguments.size is not None and arguments.size < 1) or views < 1 or seed < 0:
         raise DyngsError("--size and --views must be at least 1, --seed at least 0")
     style = arguments.style or ("fixed" if arguments.cameras is not None else None)
     if arguments.cameras is not None and (cameras < 1 or scene in _STILL or style != "fixed"):
@@ -330,4 +350,20 @@ def run_synth(arguments: argparse.Namespace) -> int:
         synthetic.write_dynamic_capture(scene, out, moving)
     preset = "human" if by_poses else {"still": "static", "polyhedra": "bg_triangle"}.get(scene, "dynamic")
     print(f"written: {out}\nnext:    dyngs train configs/{preset}.yaml data.root={as_word(out)}")
+    return 0
+
+
+def _synth_people(arguments: argparse.Namespace) -> int:
+    """Write many people and print the commands that train on them."""
+    from dyngs.human.synthetic.people import PeopleOptions, write_people
+
+    if arguments.style is not None or arguments.varied or arguments.usual_clothes:
+        raise DyngsError("--style, --varied and --usual-clothes are not for people, who all differ; leave them out")
+    given = {name: getattr(arguments, name) for name in ("people", "size", "cameras", "seed")}
+    given["frames"] = arguments.views
+    options = replace(PeopleOptions(), **{name: value for name, value in given.items() if value is not None})
+    with ProgressBar() as report:
+        write_people(arguments.out, options, report)
+    word = as_word(arguments.out)
+    print(f"written: {arguments.out}, {counted(options.people, 'capture')}\nnext:    dyngs train gps data.root={word}")
     return 0

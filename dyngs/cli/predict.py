@@ -10,11 +10,13 @@ from dyngs.errors import as_word, counted
 
 _EPILOG = """\
 examples:
-  dyngs train configs/human_predictor.yaml data.root=PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
+  dyngs train human_predictor data.root=PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
   dyngs predict runs/net captures/ann --out runs/ann
   dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
+  dyngs train gps data.root=PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
+  dyngs predict runs/stereo captures/ann --out runs/two --views f000_c00.png,f000_c01.png
   dyngs eval runs/ann
-  dyngs train --resume runs/ann                                            continues from the prediction
+  dyngs train --resume runs/ann                                     continues from the prediction
 """
 
 
@@ -24,17 +26,19 @@ def add_parser(commands: Commands) -> None:
         "predict",
         run,
         "predict a person from a few images, without training",
-        "Predict an avatar from one or a few training views of a capture with silhouettes. Without body parameters a "
-        "body is fitted first, as by `dyngs data fit`. Writes a run folder (model.kind=human) for all other commands.",
+        "Predict a person from one or a few training views of a capture with silhouettes. A network of "
+        "model.kind=human_predictor makes an avatar; where there is no body one is fitted first, as by `dyngs data "
+        "fit`; one of gps the surface that pairs of neighbouring views show. Writes a run folder for all other "
+        "commands.",
         _EPILOG,
     )
-    parser.add_argument("network", type=input_path, metavar="NET_RUN", help="run folder of model.kind=human_predictor")
+    parser.add_argument("network", type=input_path, metavar="NET_RUN", help="run folder of a network")
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument("--out", type=output_path, required=True, metavar="RUN", help="new run folder")
-    views = "number or names of the views to predict from (default 3)"
-    parser.add_argument("--views", type=parse_views, default=3, metavar="N|NAME,..", help=views)
-    steps = "first train the network on these images for so many steps (default 10)"
-    parser.add_argument("--steps", type=int, default=10, metavar="N", help=steps)
+    views = "number or names of the views to predict from (default: model.source_views of the network; gps: 2)"
+    parser.add_argument("--views", type=parse_views, metavar="N|NAME,..", help=views)
+    steps = "human_predictor: first train the network on these images for so many steps (default 10)"
+    parser.add_argument("--steps", type=int, metavar="N", help=steps)
 
 
 def parse_views(text: str) -> int | tuple[str, ...]:
@@ -46,17 +50,16 @@ def parse_views(text: str) -> int | tuple[str, ...]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Predict, and print timings and the next commands."""
-    from dyngs.api.predict import predict_person
+    from dyngs.api.predict import predict
 
     out = arguments.out
     with ProgressBar() as report:
-        made = predict_person(
-            arguments.network, arguments.capture, out, arguments.views, steps=arguments.steps, report=report
-        )
-    trained = f", after {made.seconds_steps:.2f} s of training on these images" if arguments.steps else ""
+        made = predict(arguments.network, arguments.capture, out, arguments.views, steps=arguments.steps, report=report)
+    trained = f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
+    what = counted(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
     word = as_word(out)
     print(
-        f"predicted: {counted(made.num_gaussians, 'Gaussian')} from {', '.join(made.views)}\n"
+        f"predicted: {what} from {', '.join(made.views)}\n"
         f"time:      {made.seconds:.2f} s{trained}\n"
         f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it"
     )

@@ -15,6 +15,7 @@ from dyngs.deform.keys import (
     HexplaneField,
     MlpField,
 )
+from dyngs.gps.keys import GpsModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import CutOff, Fraction, ModelSection, Positive, SceneModel, Section
 from dyngs.static.keys import StaticModel
@@ -35,6 +36,7 @@ __all__ = [
     "FixedStrategy",
     "Fraction",
     "FreeField",
+    "GpsModel",
     "HexplaneField",
     "HumanModel",
     "HumanPredictorModel",

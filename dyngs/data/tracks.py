@@ -86,17 +86,17 @@ class TrueTracks:
     visible: np.ndarray
 
 
-def write_true_tracks(root: Path, tracks: TrueTracks) -> Path:
-    """Write the tracks of a capture, atomically; returns the path. Raises DyngsError where it cannot be written."""
-    path = root / TRACKS_FILE
+def write_true_tracks(root: Path, tracks: TrueTracks, name: str = TRACKS_FILE) -> Path:
+    """Write the tracks of a capture to the file ``name``, atomically; returns the path. Raises DyngsError."""
+    path = root / name
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **asdict(tracks))
     return path
 
 
-def read_true_tracks(root: Path, world_offset: np.ndarray) -> TrueTracks | None:
+def read_true_tracks(root: Path, world_offset: np.ndarray, name: str = TRACKS_FILE) -> TrueTracks | None:
     """Return the tracks of the capture in ``root``, in its recentred world (see ``Capture``); None without any."""
-    path = root / TRACKS_FILE
+    path = root / name
     if not inside(path).is_file():
         return None
     found = read_npz(path, ("points", "times", "views", "moments", "visible"))

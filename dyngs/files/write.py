@@ -59,8 +59,8 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
 
     Args:
         path: ``.png`` or ``.jpg`` (8 bit), ``.exr`` (float32), or what else OpenImageIO writes.
-        pixels: (H, W) or (H, W, C); uint8 as it is, or floats, which are clamped to [0, 1] for 8-bit formats. A fourth
-            channel is alpha: straight for PNG, premultiplied for EXR, as these formats want it.
+        pixels: (H, W) or (H, W, C); uint8 and uint16 as they are, or floats, which are clamped to [0, 1] for 8-bit
+            formats. A fourth channel is alpha: straight for PNG, premultiplied for EXR, as these formats want it.
     """
     import OpenImageIO as oiio
 
@@ -69,6 +69,8 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         raise ValueError(f"pixels must be (H, W) or (H, W, C), got {pixels.shape}")
     if path.suffix.lower() == ".exr":
         pixels, kind = pixels.astype(np.float32), oiio.FLOAT
+    elif pixels.dtype == np.uint16:
+        kind = oiio.UINT16
     else:
         pixels, kind = to_uint8(pixels), oiio.UINT8
     height, width, channels = pixels.shape

@@ -7,7 +7,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from dyngs.deform.keys import DynamicModel
+from dyngs.errors import DyngsError
 from dyngs.fields.keys import NerfModel, NgpModel
+from dyngs.gps.keys import GpsModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.section import ModelSection
 from dyngs.static.keys import StaticModel
@@ -16,11 +18,12 @@ from dyngs.triangles.keys import BgTriangleModel
 if TYPE_CHECKING:
     import torch
 
-    from dyngs.config import Config
+    from dyngs.config import Config, DataConfig
     from dyngs.data.capture import Capture
     from dyngs.data.loader import ImageLoader
     from dyngs.models.checkpoint import Checkpoint
     from dyngs.models.model import Model
+    from dyngs.models.prediction import Learner, Predictor
     from dyngs.models.renderable import Renderable
 
 
@@ -42,8 +45,9 @@ class Kind:
     """A kind of model."""
 
     section: type[ModelSection]  # class of its configuration
-    # module with its ``start`` and ``restore``, ``trainer`` of a network, and ``refusal`` where it cannot take every
-    # capture; imported when first needed, so that reading a configuration imports no model
+    # module with its ``start`` and ``restore``, and ``refusal`` where it cannot take every capture; that of a network
+    # has ``learner`` and ``predictor`` instead, see ``dyngs.models.prediction``. It is imported when first needed, so
+    # that reading a configuration imports no model
     home: str
 
     def start(self, start: RunStart) -> Model[Any]:
@@ -52,6 +56,10 @@ class Kind:
 
     def restore(self, model: ModelSection, checkpoint: Checkpoint) -> Renderable:
         """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not fit."""
+        if model.is_network:
+            raise DyngsError(
+                f"{checkpoint.name}: a network, not a scene; `dyngs predict RUN CAPTURE --out RUN` makes one"
+            )
         return import_module(self.home).restore(model, checkpoint)
 
     def refusal(self, capture: Capture) -> str | None:
@@ -59,16 +67,21 @@ class Kind:
         refusal = getattr(import_module(self.home), "refusal", None)
         return None if refusal is None else refusal(capture)
 
-    def trainer(self, config: Config) -> Any:
-        """Return what the loop steps, of a network, which is not trained on one capture."""
-        return import_module(self.home).trainer(config)
+    def learner(self, config: Config, generator: torch.Generator) -> Learner[Any]:
+        """Return a network in training, before the first step."""
+        return import_module(self.home).learner(config, generator)
+
+    def predictor(self, config: Config, checkpoint: Checkpoint, data: DataConfig, **told: Any) -> Predictor:
+        """Return a trained network with the capture of ``data``; ``told``: ``say``, ``report`` of what takes long."""
+        return import_module(self.home).predictor(config, checkpoint, data, **told)
 
 
 KINDS: tuple[Kind, ...] = (
     Kind(StaticModel, "dyngs.static.training"),
     Kind(DynamicModel, "dyngs.deform.kind"),
     Kind(HumanModel, "dyngs.human.avatar.kind"),
-    Kind(HumanPredictorModel, "dyngs.training.prediction"),
+    Kind(HumanPredictorModel, "dyngs.human.prediction.learner"),
+    Kind(GpsModel, "dyngs.gps.learner"),
     Kind(NgpModel, "dyngs.fields.kind"),
     Kind(NerfModel, "dyngs.fields.kind"),
     Kind(BgTriangleModel, "dyngs.triangles.kind"),

@@ -1,11 +1,11 @@
-"""What a trainer steps: a model that draws training images and is updated; terms of its loss; predictors."""
+"""What a trainer steps: a model that draws training images and is updated; terms of its loss."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -154,11 +154,3 @@ class Loss:
     def __call__(self, look: Look) -> Mapping[str, Tensor]:
         """Return differentiable scalars, weighted, by name."""
         raise NotImplementedError
-
-
-class Predictor(Protocol):
-    """What makes a scene of a few images, without training."""
-
-    def predict(self, views: Sequence[int]) -> Renderable:
-        """Return the scene that the images ``views`` of a capture show."""
-        ...

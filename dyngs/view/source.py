@@ -9,16 +9,16 @@ from pathlib import Path
 
 import torch
 
-from dyngs.api.predict import network_config, predict_person
+from dyngs.api.predict import network_config, predict
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
+from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.files.wrong_place import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import Opened, open_scene
-from dyngs.training.prediction import captures_in
 
 _DEEPEST = 3
 """Folders below that which was given in which runs are looked for."""
@@ -55,7 +55,7 @@ class PeopleNetwork:
         """
         with tempfile.TemporaryDirectory(prefix="dyngs_view_") as folder:
             out = Path(folder) / "run"
-            made = predict_person(self.run, self.people[person].root, out, images or self.num_images)
+            made = predict(self.run, self.people[person].root, out, images or self.num_images)
             opened = open_to_view(out, person, up)
         said = f"predicted from {', '.join(made.views)} in {made.seconds:.1f} s"
         return opened.noted(said)
@@ -66,11 +66,11 @@ def open_network(run: Path, capture: Path | None = None) -> PeopleNetwork:
 
     Raises DyngsError: not the run of a network, or no captures there.
     """
-    config, model = network_config(run)
+    config = network_config(run)
     data = config.data if capture is None else config.data.model_copy(update={"root": capture.absolute()})
     if capture is not None and _is_capture(data):
-        return PeopleNetwork(run, {capture.absolute().name: data}, model.source_views)
-    return PeopleNetwork(run, {one.root.name: one for one in captures_in(data)}, model.source_views)
+        return PeopleNetwork(run, {capture.absolute().name: data}, config.model.source_views)
+    return PeopleNetwork(run, {one.root.name: one for one in captures_in(data)}, config.model.source_views)
 
 
 def _is_capture(data: DataConfig) -> bool:

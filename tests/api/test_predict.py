@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_people import NET, TINY, people
 
-from dyngs.api.predict import Prediction, network_config, predict_person
+from dyngs.api.predict import Prediction, network_config, predict
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_resolved, save_config
@@ -35,7 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     values = {"data": {"root": folder / "people"}, "model": NET, "train": {"steps": 2}, "run": {"dir": folder / "net"}}
     network = train(Config.model_validate(values))
     capture = people(folder / "others", (5,)) / "p5"
-    return Made(network, capture, predict_person(network, capture, folder / "run", 3, steps=1))
+    return Made(network, capture, predict(network, capture, folder / "run", 3, steps=1))
 
 
 def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
@@ -53,14 +53,14 @@ def test_a_prediction_is_a_run_of_a_person(made: Made) -> None:
 
 
 def test_the_same_images_give_the_same_bytes(made: Made, tmp_path: Path) -> None:
-    again = predict_person(made.network, made.capture, tmp_path / "again", tuple(made.prediction.views), steps=1)
+    again = predict(made.network, made.capture, tmp_path / "again", tuple(made.prediction.views), steps=1)
     assert again.views == made.prediction.views
     first, second = (load_run(run.run_dir).scene.gaussians.tensors().values() for run in (made.prediction, again))
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
 def test_a_prediction_can_be_refined(made: Made, tmp_path: Path) -> None:
-    out = predict_person(made.network, made.capture, tmp_path / "run", 2, steps=0).run_dir
+    out = predict(made.network, made.capture, tmp_path / "run", 2, steps=0).run_dir
     config = load_resolved(out)
     short = config.model_copy(update={"train": config.train.model_copy(update={"steps": 3})})
     save_config(short, out / "config.yaml")
@@ -73,20 +73,20 @@ def test_a_prediction_can_be_refined(made: Made, tmp_path: Path) -> None:
 def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
     run = made.prediction.run_dir
     with pytest.raises(DyngsError, match="exists already"):
-        predict_person(made.network, made.capture, run, 3)
-    with pytest.raises(DyngsError, match="kind=human; a prediction needs one of human_predictor"):
+        predict(made.network, made.capture, run, 3)
+    with pytest.raises(DyngsError, match="kind=human; a prediction needs one of human_predictor or gps"):
         network_config(run)
     with pytest.raises(DyngsError, match="not a run folder"):
-        predict_person(tmp_path, made.capture, tmp_path / "out", 3)
+        predict(tmp_path, made.capture, tmp_path / "out", 3)
     with pytest.raises(DyngsError, match="no training view is named 'x'"):
-        predict_person(made.network, made.capture, tmp_path / "out", ("x",))
+        predict(made.network, made.capture, tmp_path / "out", ("x",))
     for count in (0, TINY.num_cameras + 1):
         with pytest.raises(DyngsError, match=f"cannot choose {count} of its 8"):
-            predict_person(made.network, made.capture, tmp_path / "out", count)
+            predict(made.network, made.capture, tmp_path / "out", count)
     with pytest.raises(DyngsError, match="no such folder"):
-        predict_person(made.network, tmp_path / "nowhere", tmp_path / "out", 3)
+        predict(made.network, tmp_path / "nowhere", tmp_path / "out", 3)
     with pytest.raises(DyngsError, match="-1 steps"):
-        predict_person(made.network, made.capture, tmp_path / "out", 3, steps=-1)
+        predict(made.network, made.capture, tmp_path / "out", 3, steps=-1)
     assert not (tmp_path / "out").exists()
     with pytest.raises(DyngsError, match="a network, not a scene; `dyngs predict"):
         load_run(made.network)
@@ -100,11 +100,11 @@ def test_a_body_is_fitted_where_none_is_given(made: Made, tmp_path: Path, monkey
         asked.append((data.root, only_if_needed))
         return data
 
-    monkeypatch.setattr("dyngs.api.predict.with_fitted_body", fit)
+    monkeypatch.setattr("dyngs.human.prediction.learner.with_fitted_body", fit)
     kept = [path.rename(tmp_path / path.name) for path in sorted(made.capture.glob("body_*.npz"))]
     try:
         with pytest.raises(DyngsError, match="no body parameters"):
-            predict_person(made.network, made.capture, tmp_path / "out", 3)
+            predict(made.network, made.capture, tmp_path / "out", 3)
     finally:
         for path in kept:
             path.rename(made.capture / path.name)

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
+from tiny_people import NET, people
+from tiny_stereo import stereo_config, stereo_people
 
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.cli.predict import parse_views
+from dyngs.config import Config
+from dyngs.runs.checkpoint import checkpoint_paths
 
 
 def test_views_are_a_number_or_names() -> None:
@@ -26,3 +37,112 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
+
+
+# --- what gps cannot predict from -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stereo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A stereo network of two steps, and the capture of a person."""
+    folder = tmp_path_factory.mktemp("stereo")
+    root = stereo_people(folder / "people")
+    run = train(stereo_config(root, folder / "net", steps=2))
+    return run, root / "s0000" / "p000000"
+
+
+Frames = list[dict[str, Any]]
+
+
+def same_place(frames: Frames) -> None:
+    frames[2]["transform_matrix"] = frames[1]["transform_matrix"]
+
+
+def twice_as_long(frames: Frames) -> None:
+    frames[2] |= {"fl_x": 110.0, "fl_y": 110.0}
+
+
+def turned_away(frames: Frames) -> None:
+    """The pose of a camera that looks past the person, of an image that shows the person: nothing fits."""
+    pose = np.array(frames[2]["transform_matrix"])
+    c, s = np.cos(0.6), np.sin(0.6)
+    pose[:3, :3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ pose[:3, :3]
+    frames[2]["transform_matrix"] = pose.tolist()
+
+
+def as_it_is(_: Frames) -> None:
+    return
+
+
+def opaque(folder: Path) -> None:
+    for file in folder.rglob("images/**/*.png"):
+        Image.open(file).convert("RGB").save(file)
+
+
+def nobody(folder: Path) -> None:
+    file = folder / "images" / "train" / "f000_c02.png"
+    Image.fromarray(np.zeros((40, 40, 4), np.uint8)).save(file)
+
+
+def no_change(_: Path) -> None:
+    return
+
+
+@pytest.mark.parametrize(
+    ("views", "poses", "files", "message"),
+    [
+        ("c01", as_it_is, no_change, "depth comes from two neighbouring views at least, not one"),
+        ("c01,c01", as_it_is, no_change, "named twice"),
+        ("c01,c02", same_place, no_change, "look from the same direction"),
+        ("c01,c13", as_it_is, no_change, "degrees apart; give neighbours, at most 50"),
+        ("c01,c07", as_it_is, no_change, "look from directions 89 degrees apart"),
+        ("c01,c02", twice_as_long, no_change, "the calibration is wrong"),
+        ("c01,c02", turned_away, no_change, "c02"),
+        ("c01,c02", as_it_is, nobody, "c02: shows no silhouette of a person"),
+        ("c01,c02", as_it_is, opaque, "no silhouettes"),
+    ],
+)
+def test_views_that_do_not_suit_are_one_line(
+    stereo: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    views: str,
+    poses: Callable[[Frames], None],
+    files: Callable[[Path], None],
+    message: str,
+) -> None:
+    run, person = stereo
+    capture = shutil.copytree(person, tmp_path / "ann")
+    listed = json.loads((capture / "transforms_train.json").read_text())
+    poses(listed["frames"])
+    (capture / "transforms_train.json").write_text(json.dumps(listed))
+    files(capture)
+    names = ",".join(f"f000_{view}.png" for view in views.split(","))
+    assert main(["predict", str(run), str(capture), "--out", str(tmp_path / "out"), "--views", names]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ann"], "nothing is written"
+
+
+def test_weights_that_do_not_suit_are_one_line(
+    stereo: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of another kind of network, and a file of which the second half is missing."""
+    run, person = stereo
+    values = {"data": {"root": people(tmp_path / "p", (1,))}, "model": NET, "train": {"steps": 1}}
+    other = train(Config.model_validate(values | {"run": {"dir": tmp_path / "other", "threads": 1}}))
+    capsys.readouterr()
+    for name, written in (
+        ("mixed", checkpoint_paths(other)[-1].read_bytes()),
+        ("half", checkpoint_paths(run)[-1].read_bytes()[: checkpoint_paths(run)[-1].stat().st_size // 2]),
+    ):
+        copy = shutil.copytree(run, tmp_path / name)
+        file = checkpoint_paths(copy)[-1]
+        file.write_bytes(written)
+        assert main(["predict", str(copy), str(person), "--out", str(tmp_path / "out"), "--views", "2"]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert str(file) in error
+        assert ("is not of this network" in error) == (name == "mixed")
+    assert not (tmp_path / "out").exists()

@@ -53,7 +53,7 @@ def test_nested_keys_name_the_kinds_that_have_them() -> None:
     names = [(key.name, key.kinds) for key in config_keys()]
     assert len(set(names)) == len(names)
     assert ("data.root", ()) in names
-    assert ("model.sh_degree", ("static or dynamic or human or human_predictor",)) in names, "fields have none"
+    assert ("model.sh_degree", ("static or dynamic or human or human_predictor or gps",)) in names, "fields have none"
     assert ("model.motion_from", ("dynamic",)) in names
     assert ("model.deform.kind", ("dynamic",)) in names
     assert ("model.deform.move_scales", ("dynamic", "hexplane or mlp or control_nodes")) in names, "those have it alike"

@@ -63,3 +63,9 @@ def test_full_disk_is_one_line(tmp_path: Path) -> None:
         pytest.skip("this system has no /dev/full")
     with pytest.raises(DyngsError, match="No space left"), atomic_file(tmp_path / "a.txt"):
         full.write_text("x")
+
+
+def test_whole_numbers_of_16_bits_stay_as_they_are(tmp_path: Path) -> None:
+    values = np.array([[0, 1, 255], [256, 40000, 65535]], dtype=np.uint16)
+    write_image(tmp_path / "a.png", values)
+    assert np.array_equal(oiio.ImageBuf(str(tmp_path / "a.png")).get_pixels(oiio.UINT16)[..., 0], values)

@@ -10,20 +10,31 @@ import pytest
 import torch
 from moving_scene import camera
 from tiny_people import NET, people, person
+from tiny_stereo import stereo_config, stereo_people
 from toy_kind import registered
 
 from dyngs.config import Config, ModelSection
 from dyngs.config.io import load_config
 from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
+from dyngs.human.prediction.learner import PersonPredictor, new_network
 from dyngs.kinds import build, restored_model
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import KINDS, kind_of
-from dyngs.models.model import Predictor
+from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.state import Role
-from dyngs.training.prediction import PersonPredictor, new_network
 from dyngs.training.trainer import Trainer
+
+
+def people_config(folder: Path) -> Config:
+    values = {"data": {"root": people(folder, (1,))}, "model": NET.model_dump(), "train": {"steps": 3}}
+    return Config.model_validate(json.loads(json.dumps(values, default=str)))
+
+
+def stereo_config_of(folder: Path) -> Config:
+    return stereo_config(stereo_people(folder / "set"), folder / "run")
+
 
 TRAINED = {
     "static": ("still", ["init.num_random=40"]),
@@ -35,7 +46,7 @@ TRAINED = {
     "toy": ("still", []),
 }
 """Fixture with a capture for each kind that is trained on one, and other keys of a small run."""
-NETWORKS = {"human_predictor"}
+NETWORKS = {"human_predictor": people_config, "gps": stereo_config_of}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -67,7 +78,7 @@ def same(one: Checkpoint, other: Checkpoint) -> bool:
 
 
 def test_every_kind_is_here() -> None:
-    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == TRAINED.keys() | NETWORKS
+    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == TRAINED.keys() | NETWORKS.keys()
     for kind in KINDS:
         assert kind_of(kind.section()) is kind
         assert issubclass(kind.section, ModelSection)
@@ -142,8 +153,7 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config) -> None:
 @pytest.mark.parametrize("name", sorted(NETWORKS))
 def test_a_network_is_trained_stored_and_restored(tmp_path: Path, name: str) -> None:
     """It is no scene, but predicts one."""
-    values = {"data": {"root": people(tmp_path, (1,))}, "model": NET.model_dump(), "train": {"steps": 3}}
-    config = Config.model_validate(json.loads(json.dumps(values, default=str)))
+    config = NETWORKS[name](tmp_path)
     assert config.model.kind == name
     trainer, again = build(config), build(config, restored=True)
     trainer.step()
@@ -159,7 +169,7 @@ def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
     root = people(tmp_path, (1,)) / "p1"
     network, mean = new_network(NET, torch.Generator().manual_seed(0)), torch.full((3, 32, 32), 0.5)
     config = Config.model_validate({"data": {"root": root}, "model": NET})
-    predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root))
+    predictor: Predictor = PersonPredictor(config, NET, network, mean, person(root), config.data)
     one, three = predictor.predict([0]), predictor.predict([0, 3, 6])
     for scene in (one, three):
         assert isinstance(scene, Renderable)

@@ -86,7 +86,7 @@ def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
 
     def checkpoints(device: torch.device) -> list[Checkpoint]:
         """After the last step but one and the last, which is done on what was stored."""
-        monkeypatch.setattr("dyngs.training.prediction.device_for", lambda _: device)
+        monkeypatch.setattr("dyngs.human.prediction.learner.device_for", lambda _: device)
         config = Config.model_validate({"data": {"root": folder}, "model": NET.model_dump(), "train": {"steps": steps}})
         trainer, resumed = build(config), build(config)
         for _ in range(steps - 1):

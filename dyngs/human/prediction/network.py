@@ -18,11 +18,11 @@ from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.prediction.person import CapturedPerson
 from dyngs.human.prediction.texel_maps import HULL_LIMIT, TexelMaps, from_atlas, to_atlas
+from dyngs.models.convolution import GROUPS, ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import unit_quats
 
 HEADS = {"rotation": 4, "scale": 3, "opacity": 1, "height": 1, "colour": 3, "image_weight": 1, "guess": 3}
 """Outputs per texel of a scaffold and their number of channels; see ``dyngs.human.prediction.network``."""
-_GROUPS = 8
 
 
 class AtlasNetwork(nn.Module):
@@ -38,24 +38,23 @@ class AtlasNetwork(nn.Module):
         The network is made on the CPU, with weights of ``generator``. Raises DyngsError: a width is no multiple of 8.
         """
         super().__init__()
-        if any(width % _GROUPS for width in widths):
-            raise DyngsError(f"model.widths must be multiples of {_GROUPS}, not {list(widths)}")
+        if any(width % GROUPS for width in widths):
+            raise DyngsError(f"model.widths must be multiples of {GROUPS}, not {list(widths)}")
         self.scaffolds, self.halvings = scaffolds, len(widths)
         with torch.device("cpu"):
             self._make_layers(channels, scaffolds, widths)
-        for layer in self.modules():
-            if isinstance(layer, nn.Conv2d):
-                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
-                nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
+        begin_weights(self, generator)
         nn.init.zeros_(self.heads.weight)
 
     def _make_layers(self, channels: int, scaffolds: int, widths: Sequence[int]) -> None:
         self.down = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1), _Block(width))
+            nn.Sequential(
+                nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1), ResidualBlock(width)
+            )
             for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
         )
         self.up = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), _Block(width))
+            nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), ResidualBlock(width))
             for below, width in zip(widths[:0:-1], widths[-2::-1], strict=True)
         )
         self.last = nn.Sequential(nn.Conv2d(widths[0] + channels, widths[0], 3, padding=1), nn.SiLU())
@@ -68,27 +67,9 @@ class AtlasNetwork(nn.Module):
             levels.append(layer(levels[-1]))
         features = levels.pop()
         for layer in self.up:
-            features = layer(torch.cat([_upsampled(features), levels.pop()], dim=1))
-        features = self.last(torch.cat([_upsampled(features), maps[None]], dim=1))
+            features = layer(torch.cat([upsampled(features), levels.pop()], dim=1))
+        features = self.last(torch.cat([upsampled(features), maps[None]], dim=1))
         return self.heads(features)[0].unflatten(0, (self.scaffolds, -1))
-
-
-class _Block(nn.Module):
-    """Residual block of two convolutions."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            *(nn.GroupNorm(_GROUPS, width), nn.SiLU(), nn.Conv2d(width, width, 3, padding=1)),
-            *(nn.GroupNorm(_GROUPS, width), nn.SiLU(), nn.Conv2d(width, width, 3, padding=1)),
-        )
-
-    def forward(self, features: Tensor) -> Tensor:
-        return features + self.layers(features)
-
-
-def _upsampled(features: Tensor) -> Tensor:
-    return nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
 
 
 _MAX_LOG_SCALE = 1.5  # limit on the difference of log scales from those of the initial Gaussian

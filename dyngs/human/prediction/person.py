@@ -5,7 +5,6 @@ Local letters: P texels, K scaffolds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -105,25 +104,6 @@ def spread_views(person: CapturedPerson, count: int, first: int | None = None) -
         if chosen == before:
             break
     return sorted(allowed[i] for i in chosen)
-
-
-def named_views(person: CapturedPerson, names: Sequence[str]) -> list[int]:
-    """Return the indices of the views with these names, or with images of these file names.
-
-    Raises DyngsError: an unknown name, or the same view twice.
-    """
-    files = [view.image_path.name for view in person.views]
-    known = {name: i for i, name in enumerate(files) if files.count(name) == 1}
-    known |= {view.name: i for i, view in enumerate(person.views)}
-    for name in names:
-        if name not in known:
-            raise DyngsError(
-                f"{person.name}: no training view is named {name!r}; the first is {person.views[0].name!r}"
-            )
-    found = [known[name] for name in names]
-    if len(set(found)) < len(found):
-        raise DyngsError(f"{person.name}: a view is named twice; name each once")
-    return found
 
 
 def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:

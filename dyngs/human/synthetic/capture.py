@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.data.images.maps import MILLIMETRE
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.errors import DyngsError
@@ -30,11 +31,13 @@ from dyngs.human.synthetic.clothes import (
     texel_coordinates,
     texture_coordinates,
 )
+from dyngs.human.synthetic.keypoints import KEYPOINTS_FILE, is_seen, joint_positions, joints_of_triangles
 from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.template.body_reader import default_template
 from dyngs.human.template.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 
 _RADIUS = 3.5  # radius of the ring of cameras, m
+_UNSTEADY = 0.08  # of a ring that a seed chooses: cameras lie up to so far above or below its height, m
 _TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
 
 POINTS = 600  # on the surface of a person, whose tracks are known
@@ -70,6 +73,9 @@ class HumanOptions:
     clip_seed: int | None = None
     # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
     usual_clothes: bool = False
+    # of radius and height of the ring, whose cameras are nearly level; None: alternately low and high, 3.5 m away
+    ring_seed: int | None = None
+    with_truth: bool = False  # depth maps, and key points of the body with the views that see them
 
 
 def varied(options: HumanOptions, seed: int) -> HumanOptions:
@@ -102,8 +108,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     body, betas = _person(options.body_seed)
     outfit = random_outfit(options.seed, options.usual_clothes)
     clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
-    train = dict(enumerate(_ring(options.num_cameras)))
-    test = {len(train) + i: pose for i, pose in enumerate(_ring_between(options.num_test, options.num_cameras))}
+    train, test = _cameras(options)
     seed, lengths = options.clip_seed, {"train": options.num_frames}
     if options.num_new and test:
         lengths["pose"] = options.num_new
@@ -116,8 +121,11 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
             motion = replace(clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas)
             meshes = list(_posed_meshes(clothed, motion, texture))
             splits = {"train": train, "test": test} if name == "train" else {"pose": test}
+            frames: list[_Frame] = []
             for split, cameras in splits.items():
-                _write_split(started, split, meshes, cameras, options)
+                frames += _write_split(started, split, meshes, cameras, options)
+            if options.with_truth and name == "train":
+                write_true_tracks(started, _keypoints(body, motion, meshes, frames, options.size), KEYPOINTS_FILE)
             write_amass(motion, started / f"body_{name}.npz", "smpl" if options.body_seed is None else "anny")
     return out
 
@@ -137,9 +145,10 @@ def write_walking_capture(out: Path, options: HumanOptions = HumanOptions(num_fr
     meshes = list(_posed_meshes(dress_body(body, outfit), motion, paint_texture(body, outfit)))
     order = np.random.default_rng(options.seed).permutation(options.num_frames)
     between = 2 * (np.arange(options.num_test) * (options.num_frames - 1) // options.num_test) + 1
+    around, midway = _cameras(replace(options, num_cameras=options.num_frames))
     shots = {
-        "train": [*zip(range(0, len(times), 2), _ring(options.num_frames)[order], strict=True)],
-        "test": [*zip(between.tolist(), _ring_between(options.num_test, options.num_frames), strict=True)],
+        "train": [*zip(range(0, len(times), 2), (around[int(i)] for i in order), strict=True)],
+        "test": [*zip(between.tolist(), midway.values(), strict=True)],
     }
     taken: list[tuple[str, int, np.ndarray]] = []
     with new_folder(out) as started:
@@ -169,16 +178,44 @@ def _tracks(
     return TrueTracks(points.astype(np.float32), times, names, rows, np.stack(visible))
 
 
+def _keypoints(
+    body: BodyTemplate, motion: Motion, meshes: Sequence[PosedMesh], frames: Sequence[_Frame], size: int
+) -> TrueTracks:
+    """Return the tracks of the key points of ``body``, and which views of ``size`` pixels see them."""
+    points, owners = joint_positions(body, motion), joints_of_triangles(body)
+    visible = []
+    for frame in frames:
+        surface, near = _surface(meshes[frame.row], frame.world_from_cam, size)
+        owner = np.full(size * size, -1)
+        owner[surface.index] = owners[surface.faces]
+        index, depth = _pixels_of(points[frame.row], frame.world_from_cam, size)
+        visible.append(is_seen(depth, near[index], np.where(index < 0, -1, owner[index])))
+    names, rows = [frame.name.removesuffix(".png") for frame in frames], [frame.row for frame in frames]
+    times = np.linspace(0.0, 1.0, len(points)) if len(points) > 1 else np.zeros(1)
+    return TrueTracks(points.astype(np.float32), times, np.array(names), np.array(rows, np.int64), np.stack(visible))
+
+
 def _seen(mesh: PosedMesh, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
     """Return (P,) bool: points (P, 3) in the image to which nothing of the mesh is nearer than ``_SKIN``."""
-    image, size = _image_of(mesh.vertices, world_from_cam, _SEEN_SIZE), _SEEN_SIZE
-    surface, near = rasterize(image[mesh.faces], size, size), np.full(size * size, -np.inf)
-    corners = 1.0 / image[mesh.faces[surface.faces], 2:]
-    near[surface.index] = interpolate(surface.barycentric, corners)[:, 0]
+    index, depth = _pixels_of(points, world_from_cam, _SEEN_SIZE)
+    near = _surface(mesh, world_from_cam, _SEEN_SIZE)[1]
+    return (index >= 0) & (depth < near[index] + _SKIN)
+
+
+def _pixels_of(points: np.ndarray, world_from_cam: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixel (P,) of each of the points (P, 3), -1 outside of the image, and their depth (P,), m."""
     x, y, inverse = _image_of(points, world_from_cam, size).T
     inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
-    index = np.where(inside, y.astype(int) * size + x.astype(int), 0)
-    return inside & (1.0 / inverse < near[index] + _SKIN)
+    return np.where(inside, y.astype(int) * size + x.astype(int), -1), 1.0 / inverse
+
+
+def _surface(mesh: PosedMesh, world_from_cam: np.ndarray, size: int) -> tuple[Fragments, np.ndarray]:
+    """Return what is seen at pixel centres, and its depth (size^2,) along the view axis, m; 0 where nothing is."""
+    image = _image_of(mesh.vertices, world_from_cam, size) - [0.5, 0.5, 0.0]
+    surface, depth = rasterize(image[mesh.faces], size, size), np.zeros(size * size)
+    corners = 1.0 / image[mesh.faces[surface.faces], 2:]
+    depth[surface.index] = interpolate(surface.barycentric, corners)[:, 0]
+    return surface, depth
 
 
 def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
@@ -243,32 +280,40 @@ class _Frame:
     mesh: PosedMesh
     world_from_cam: np.ndarray
     keys: dict[str, object]
+    row: int = 0  # of its mesh among those of the clip
 
 
 def _write_split(
     out: Path, split: str, meshes: list[PosedMesh], cameras: dict[int, np.ndarray], options: HumanOptions
-) -> None:
+) -> list[_Frame]:
     frames = [
         _Frame(
             f"images/{split}/f{i:03d}_c{camera:02d}.png",
             mesh,
             pose,
             {"frame": i, "camera": camera, "time": i / max(len(meshes) - 1, 1)},
+            i,
         )
         for i, mesh in enumerate(meshes)
         for camera, pose in cameras.items()
     ]
     if frames:
         _write_frames(out, split, frames, options)
+    return frames
 
 
 def _write_frames(out: Path, split: str, frames: Sequence[_Frame], options: HumanOptions) -> None:
-    entries, light = [], random_light(options.light_seed)
+    entries, light, size = [], random_light(options.light_seed), options.size
     for frame in frames:
-        image = render_mesh(frame.mesh, frame.world_from_cam, options.size, options.samples, light)
+        image = render_mesh(frame.mesh, frame.world_from_cam, size, options.samples, light)
         write_image(out / frame.name, image)
-        entries.append({"file_path": frame.name, **frame.keys, "transform_matrix": frame.world_from_cam.tolist()})
-    size, focal = options.size, _focal(options.size)
+        keys = dict(frame.keys)
+        if options.with_truth:
+            keys["depth_file_path"] = path = f"depth/{frame.name.removeprefix('images/')}"
+            depth = _surface(frame.mesh, frame.world_from_cam, size)[1].reshape(size, size)
+            write_image(out / path, (depth / MILLIMETRE + 0.5).astype(np.uint16))
+        entries.append({"file_path": frame.name, **keys, "transform_matrix": frame.world_from_cam.tolist()})
+    focal = _focal(size)
     lens = {"w": size, "h": size, "fl_x": focal, "fl_y": focal, "cx": 0.5 * size, "cy": 0.5 * size}
     write_text(out / f"transforms_{split}.json", json.dumps(lens | {"frames": entries}, indent=1) + "\n")
 
@@ -281,21 +326,27 @@ def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> It
         yield PosedMesh(vertices, faces, uv, uv_faces, texture)
 
 
-def _ring(count: int) -> np.ndarray:
-    """Return OpenGL camera-to-world poses (count, 4, 4) on a ring, the first in front, alternately low and high."""
-    fraction = np.arange(count) / max(count, 1)
-    return _look_at_target(2 * np.pi * fraction, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
+def _cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """Return the OpenGL poses (4, 4) of the training and the test cameras by number, on a ring around the person."""
+    count, others = options.num_cameras, options.num_test
+    around = np.arange(count) / max(count, 1)
+    between = (np.arange(others) * count // max(others, 1) + 0.5) / count
+    if options.ring_seed is None:
+        train = _on_ring(around, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
+        test = _on_ring(between, np.full(others, 1.3))
+    else:
+        make = np.random.default_rng([options.ring_seed, 5])
+        radius, height = make.uniform(3.3, 4.2), make.uniform(0.7, 1.6)
+        train = _on_ring(around, height + make.uniform(-_UNSTEADY, _UNSTEADY, count), radius)
+        test = _on_ring(between, np.full(others, height), radius)
+    return dict(enumerate(train)), {len(train) + i: pose for i, pose in enumerate(test)}
 
 
-def _ring_between(count: int, others: int) -> np.ndarray:
-    """Return poses (count, 4, 4) on the ring of ``others`` cameras, each midway between two of them."""
-    fraction = (np.arange(count) * others // max(count, 1) + 0.5) / others
-    return _look_at_target(2 * np.pi * fraction, np.full(count, 1.3))
-
-
-def _look_at_target(azimuths: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Return OpenGL camera-to-world poses (V, 4, 4), y up, of azimuths (V,) from +z to +x, rad, and heights (V,), m."""
-    centers = np.stack([_RADIUS * np.sin(azimuths), heights, _RADIUS * np.cos(azimuths)], axis=-1)
+def _on_ring(fractions: np.ndarray, heights: np.ndarray, radius: float = _RADIUS) -> np.ndarray:
+    """Return OpenGL camera-to-world poses (V, 4, 4), y up, at ``fractions`` (V,) of a turn from +z to +x, and
+    ``heights`` (V,), m."""
+    azimuths = 2 * np.pi * fractions
+    centers = np.stack([radius * np.sin(azimuths), heights, radius * np.cos(azimuths)], axis=-1)
     backward = normalized(centers - _TARGET)
     right = normalized(np.cross([0.0, 1.0, 0.0], backward))
     poses = np.tile(np.eye(4), (len(centers), 1, 1))

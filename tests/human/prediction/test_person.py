@@ -11,7 +11,7 @@ from tiny_people import NET, body, people, person
 from dyngs.config import DataConfig
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
-from dyngs.human.prediction.person import CapturedPerson, captured_person, named_views, spread_views
+from dyngs.human.prediction.person import CapturedPerson, captured_person, spread_views
 
 
 @pytest.fixture(scope="module")
@@ -41,15 +41,6 @@ def test_a_given_view_is_among_them(sitter: CapturedPerson, first: int) -> None:
     chosen = spread_views(sitter, 3, first)
     assert first in chosen
     np.testing.assert_allclose(gaps(sitter, chosen), [90, 135, 135])
-
-
-def test_views_by_name(sitter: CapturedPerson) -> None:
-    """In the order given; of the view, or of its file."""
-    assert named_views(sitter, ["f000_c05.png", sitter.views[2].name]) == [5, 2]
-    with pytest.raises(DyngsError, match="no training view is named 'nobody'; the first is"):
-        named_views(sitter, ["nobody"])
-    with pytest.raises(DyngsError, match="named twice"):
-        named_views(sitter, ["f000_c05.png", sitter.views[5].name])
 
 
 def test_a_sitter_has_a_disc_per_texel_and_scaffold(sitter: CapturedPerson) -> None:

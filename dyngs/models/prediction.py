@@ -1,0 +1,173 @@
+"""Networks that predict scenes from a few images: what each of them is, in training and at work.
+
+A kind of network has a module with ``learner(config, generator)``, which returns its ``Learner``, and
+``predictor(config, checkpoint, data)``, which returns its ``Predictor`` for one capture. One trainer
+(``dyngs.training.prediction``) and one command (``dyngs.api.predict``) serve all kinds. What is predicted is any
+``Renderable``: Gaussians, an avatar, a field.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from dyngs.config import Config, TrainConfig
+from dyngs.conventions import ReportProgress
+from dyngs.data.capture import View
+from dyngs.data.loader import Image
+from dyngs.errors import DyngsError, reading
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
+from dyngs.models.model import Model
+from dyngs.models.renderable import Renderable
+from dyngs.ops.device import CPU
+from dyngs.ops.loss import l1_ssim_loss
+from dyngs.tensor_checks import require_tensor
+
+N = TypeVar("N", bound=nn.Module)
+
+MAX_GRADIENT = 1.0  # Norm to which gradients are clipped
+
+
+class Predictor(Protocol):
+    """A trained network with the capture of one person."""
+
+    @property
+    def name(self) -> str:
+        """Name of the capture, for messages."""
+        ...
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Views that can be predicted from."""
+        ...
+
+    def chosen(self, count: int) -> list[int]:
+        """Return the indices of ``count`` of the views that suit a prediction."""
+        ...
+
+    def adapt(self, views: Sequence[int], steps: int | None, report: ReportProgress) -> int:
+        """Train the network for ``steps`` on these images alone, None: as many as usual; return how many these were."""
+        ...
+
+    def predict(self, views: Sequence[int]) -> Renderable:
+        """Return the scene that these views show. Raises DyngsError: they do not suit, one line that says why."""
+        ...
+
+    def run_config(self, views: Sequence[int]) -> Config:
+        """Return the configuration of the run that the scene becomes, which training can refine."""
+        ...
+
+    def begin(self, model: Model[Any], scene: Renderable, config: Config) -> None:
+        """Let training of ``model``, of that ``config``, begin with ``scene``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Example:
+    """What a network in training has predicted, next to the truth."""
+
+    loss: Tensor  # (), differentiable
+    image: Image  # that the prediction was compared with last
+    # rendered, truth: (H, W, 3) on the same background
+    rendered: Tensor
+    truth: Tensor
+    num_gaussians: int = 0
+
+
+class Learner(ABC, Generic[N]):
+    """A network in training and the people that it is trained on.
+
+    Attributes:
+        network: its weights are learned.
+        names: of the people.
+        background: "white", "black" or "random".
+    """
+
+    network: N
+    names: Sequence[str]
+    background: str
+
+    @abstractmethod
+    def example(self, person: int, step: int, generator: torch.Generator) -> Example:
+        """Return a prediction of a person; what is random is drawn from ``generator``, on the CPU."""
+
+    def kept(self) -> dict[str, Tensor]:
+        """Return what is stored next to the weights."""
+        return {}
+
+    def load(self, checkpoint: Checkpoint) -> None:
+        """Take over weights, and what is stored next to them. Raises DyngsError."""
+        load_weights(self.network, checkpoint)
+
+
+def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
+    """Let ``network`` take the weights of a checkpoint. Raises DyngsError: of another network, or damaged."""
+    weights, own = checkpoint.part("model.network"), network.state_dict()
+    if {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
+        raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
+    with reading(checkpoint.name, OTHER_CONFIG):
+        for name, x in weights.items():
+            require_tensor(name, x, tuple(x.shape), own[name].dtype)
+        network.load_state_dict(weights)
+
+
+def image_loss(rendered: Tensor, alpha: Tensor, image: Image, truth: Tensor, options: TrainConfig) -> Tensor:
+    """Return L1 and D-SSIM of ``rendered`` (H, W, 3) against ``truth``, and the weighted error of ``alpha`` (H, W)."""
+    loss = l1_ssim_loss(rendered, truth, options.ssim_weight, image.mask)
+    if options.alpha_weight and image.alpha is not None:
+        loss = loss + options.alpha_weight * (alpha - image.alpha).abs().mean()
+    return loss
+
+
+def updated(optimizer: torch.optim.Optimizer, network: nn.Module, loss: Tensor, rate: float) -> bool:
+    """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are not finite."""
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    if not bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT).isfinite()):
+        return False
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    optimizer.step()
+    return True
+
+
+def optimizer_state(optimizer: torch.optim.Optimizer, network: nn.Module) -> dict[str, Tensor]:
+    """Return the moments of Adam by parameter; one that had no gradient yet has none."""
+    states = {name: optimizer.state.get(x, {}) for name, x in network.named_parameters()}
+    return {f"{key}.{name}": x for name, state in states.items() for key, x in state.items()}
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, network: nn.Module, state: dict[str, Tensor]) -> None:
+    """Take over the moments of Adam. Raises KeyError or ValueError: a state that does not fit."""
+    for name, parameter in network.named_parameters():
+        shapes = {"step": (), "exp_avg": tuple(parameter.shape), "exp_avg_sq": tuple(parameter.shape)}
+        if not any(f"{key}.{name}" in state for key in shapes):
+            continue
+        optimizer.state[parameter] = {
+            key: require_tensor(name, state[f"{key}.{name}"], shape).to(
+                CPU if key == "step" else parameter.device, copy=True
+            )
+            for key, shape in shapes.items()
+        }
+
+
+def named_views(capture: str, views: Sequence[View], names: Sequence[str]) -> list[int]:
+    """Return the indices of the views with these names, or with images of these file names.
+
+    Raises DyngsError: an unknown name, or the same view twice.
+    """
+    files = [view.image_path.name for view in views]
+    known = {name: i for i, name in enumerate(files) if files.count(name) == 1}
+    known |= {view.name: i for i, view in enumerate(views)}
+    for name in names:
+        if name not in known:
+            raise DyngsError(f"{capture}: no training view is named {name!r}; the first is {views[0].name!r}")
+    found = [known[name] for name in names]
+    if len(set(found)) < len(found):
+        raise DyngsError(f"{capture}: a view is named twice; name each once")
+    return found

@@ -1,0 +1,30 @@
+"""Folders of captures of people, and folders of those."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dyngs.config import DataConfig
+from dyngs.data.people_set import PEOPLE_FILE, captures_in
+from dyngs.errors import DyngsError
+
+
+def found(root: Path) -> list[str]:
+    return [one.root.relative_to(root).as_posix() for one in captures_in(DataConfig(root=root))]
+
+
+def test_people_are_in_folders_or_in_shards(tmp_path: Path) -> None:
+    for name in ("s1/b", "s1/a", "s0/c", "s0/.half_written", ".hidden/d"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "s0" / "file").touch()
+    assert found(tmp_path) == ["s0", "s1"]
+    (tmp_path / PEOPLE_FILE).write_text("{}")
+    assert found(tmp_path) == ["s0/c", "s1/a", "s1/b"]
+
+
+def test_where_there_are_none_one_line_says_so(tmp_path: Path) -> None:
+    for root in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(DyngsError, match="holds no folders"):
+            captures_in(DataConfig(root=root))

@@ -1,0 +1,133 @@
+"""The stereo network in training and at work: the same bytes, exact resuming, scenes for other commands, refusals."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_stereo import STEREO, stereo_config, stereo_people
+
+from dyngs.api.predict import predict
+from dyngs.api.train import train
+from dyngs.config import DataConfig
+from dyngs.data.people_set import captures_in
+from dyngs.errors import DyngsError
+from dyngs.evaluate.report import evaluate_run
+from dyngs.gps.learner import learner, predictor
+from dyngs.models.prediction import Predictor
+from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
+from dyngs.static.scene import StaticScene
+from dyngs.training.prediction import network_trainer
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return stereo_people(tmp_path_factory.mktemp("people") / "set")
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(stereo_config(folder, tmp_path_factory.mktemp("run") / "net"))
+
+
+def person_of(folder: Path) -> Path:
+    return captures_in(DataConfig(root=folder))[0].root
+
+
+def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_path: Path) -> None:
+    """Resumed between the two stages: of what is learned in the second alone there are no moments yet."""
+    middle, last = checkpoint_paths(run)
+    again = train(stereo_config(folder, tmp_path / "again"))
+    assert checkpoint_paths(again)[-1].read_bytes() == last.read_bytes()
+    checkpoint_paths(again)[-1].unlink()
+    resumed = train(stereo_config(folder, tmp_path / "again"), resume_from=again)
+    assert checkpoint_paths(resumed)[-1].read_bytes() == last.read_bytes()
+    before, after = load_checkpoint(middle), load_checkpoint(last)
+    assert not any(name.startswith("optimizer.exp_avg.heads") for name in before.tensors)
+    assert any(name.startswith("optimizer.exp_avg.heads") for name in after.tensors)
+    assert not torch.equal(before.tensors["model.network.heads.bias"], after.tensors["model.network.heads.bias"])
+
+
+def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:
+    """Of depth first, then of images."""
+    trainer = network_trainer(stereo_config(folder, tmp_path / "run", steps=80))
+    losses = [trainer.step().loss for _ in range(80)]
+    assert sum(losses[32:40]) < 0.8 * sum(losses[:8])
+    assert sum(losses[72:]) < 0.9 * sum(losses[40:48])
+    assert trainer.num_gaussians > 200
+
+
+def test_a_prediction_is_a_run_of_a_static_scene(run: Path, folder: Path, tmp_path: Path) -> None:
+    """Which is drawn, measured and trained on like any other; the same views give the same bytes."""
+    person = person_of(folder)
+    made = predict(run, person, tmp_path / "two", ("f000_c03.png", "f000_c05.png"))
+    found = load_run(made.run_dir)
+    assert isinstance(found.scene, StaticScene)
+    assert (found.config.model.kind, found.step, found.config.data.root) == ("static", 0, person)
+    assert len(found.scene) == made.num_gaussians > 200
+    assert (made.steps, len(made.views)) == (0, 2)
+    again = predict(run, person, tmp_path / "again", ("f000_c05.png", "f000_c03.png"))
+    assert torch.equal(load_run(again.run_dir).scene.gaussians.means, found.scene.gaussians.means)
+    report = evaluate_run(made.run_dir, "train", threads=1)
+    assert report.psnr > 5
+    longer = found.config.model_copy(update={"train": found.config.train.model_copy(update={"steps": 2})})
+    assert load_run(train(longer, resume_from=made.run_dir)).step == 2
+
+
+def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) -> None:
+    one, all_round = (predict(run, person_of(folder), tmp_path / str(n), n) for n in (2, 12))
+    assert len(all_round.views) == 12
+    assert all_round.num_gaussians > 6 * one.num_gaussians
+
+
+def changed(person: Path, out: Path, change: Callable[[list[dict[str, Any]]], list[dict[str, Any]]]) -> Path:
+    """A copy of the capture with other frames."""
+    shutil.copytree(person, out)
+    whole = json.loads((out / "transforms_train.json").read_text())
+    (out / "transforms_train.json").write_text(json.dumps(whole | {"frames": change(whole["frames"])}))
+    return out
+
+
+def test_one_moment_of_several_is_what_its_run_is_trained_on(run: Path, folder: Path, tmp_path: Path) -> None:
+    person = changed(
+        person_of(folder),
+        tmp_path / "moving",
+        lambda frames: [frame | {"frame": i % 2, "time": float(i % 2)} for i, frame in enumerate(frames)],
+    )
+    (person / "body_train.npz").unlink()
+    data = DataConfig(root=person)
+    found: Predictor = predictor(stereo_config(folder, tmp_path), load_checkpoint(checkpoint_paths(run)[-1]), data)
+    later = [i for i, view in enumerate(found.views) if view.frame == 1][:2]
+    assert found.run_config(later).data.frames == "1:2"
+    made = predict(run, person, tmp_path / "out", tuple(found.views[i].name for i in later))
+    assert load_run(made.run_dir).scene.is_static
+    assert evaluate_run(made.run_dir, "train", threads=1).num_views == 10, "two of twelve are held out for testing"
+
+
+def without_depth(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{key: x for key, x in frame.items() if key != "depth_file_path"} for frame in frames]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda frames: frames[::3], "p: no view stands between two others that are at most 50 degrees apart"),
+        (without_depth, "p: has no depth maps, from which depth is learned"),
+    ],
+)
+def test_what_cannot_be_trained_on_is_refused(folder: Path, tmp_path: Path, change: Any, message: str) -> None:
+    changed(person_of(folder), tmp_path / "set" / "p", change)
+    with pytest.raises(DyngsError, match=message):
+        learner(stereo_config(tmp_path / "set", tmp_path), torch.Generator())
+
+
+def test_steps_on_the_images_are_refused(run: Path, folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="gps is not trained on the images of one person"):
+        predict(run, person_of(folder), tmp_path / "out", 2, steps=3)
+    assert not (tmp_path / "out").exists()
+    assert STEREO.source_views == 2
