@@ -446,11 +446,11 @@ def with_capture(
         return config  # its folder holds a capture per person
     if not model.is_posed:
         data = with_poses(data, needs_times=model.may_move, say=say, report=report)
-    elif is_unposed(data):
-        raise DyngsError(
-            f"{data.root}: a person needs a capture with body parameters (docs/human.md); of photos or videos alone a "
-            f"scene can be made: `dyngs train static data.root={data.root}`, or dynamic"
-        )
-    elif isinstance(model, HumanModel) and model.body is None:
-        data = with_fitted_body(data, only_if_needed=not model.fit, say=say, report=report)
+    else:
+        if is_unposed(data):
+            from dyngs.human.detection.find_person import with_found_person  # late: other kinds need no detector
+
+            data = with_found_person(data, say=say, report=report)
+        if isinstance(model, HumanModel) and model.body is None:
+            data = with_fitted_body(data, only_if_needed=not model.fit, say=say, report=report)
     return config.model_copy(update={"data": data})

@@ -35,6 +35,9 @@ SHADE = (0.5, 0.97)  # range of brightness, as a fraction of the background's, t
 SHADE_SPREAD = 0.08  # largest spread of that fraction, of its mean, in a window where it is a shadow
 _WINDOW = 5
 _SMOOTH = 0.7
+UNSURE, SEEN_BARE = 0.02, 3
+"""How far off the outline of a detector may be, in heights of the person, and in how many images a pixel must be seen
+without them."""
 EDGE, HALF = 2, 0.45
 """Width of the rim of a mask, px, and the fraction of the largest difference nearby that a pixel in it has: a pixel at
 the outline is a mixture."""
@@ -86,10 +89,11 @@ def background_of(images: np.ndarray) -> Background:
     return Background(colours, np.clip(noise, max(NOISE, typical), 3 * max(NOISE, typical)))
 
 
-def person_mask(background: Background, image: np.ndarray) -> np.ndarray:
+def person_mask(background: Background, image: np.ndarray, likely: np.ndarray | None = None) -> np.ndarray:
     """Return the mask (H, W) bool of what stands before the background in an image (H, W, 3) uint8.
 
-    Shadows are left out: there the image is the background times a number that hardly varies.
+    Shadows are left out: there the image is the background times a number that hardly varies. Holes are filled, as
+    clothes may have the colours of the background: all of them, or where a detector sees the person, ``likely`` (H, W).
     """
     away = _difference(background, image)
     sure = ndimage.binary_opening(away > HIGH, iterations=1)
@@ -98,7 +102,8 @@ def person_mask(background: Background, image: np.ndarray) -> np.ndarray:
     # Closing with room around, so that who is cut off by the border is not eaten from there.
     padded = np.pad(seen, 2 * radius, mode="edge")
     closed = ndimage.binary_closing(padded, _disc(radius))[2 * radius : -2 * radius, 2 * radius : -2 * radius]
-    opened = ndimage.binary_opening(ndimage.binary_fill_holes(closed), _disc(1))
+    filled = ndimage.binary_fill_holes(closed)
+    opened = ndimage.binary_opening(filled if likely is None else closed | (filled & likely), _disc(1))
     rim = opened & np.logical_not(ndimage.binary_erosion(opened, iterations=EDGE, border_value=1))
     opened = opened & np.logical_not(rim & (away < HALF * ndimage.maximum_filter(away, 2 * EDGE + 1)))
     labels = np.empty(opened.shape, np.int32)
@@ -106,6 +111,34 @@ def person_mask(background: Background, image: np.ndarray) -> np.ndarray:
         return opened
     sizes = np.bincount(labels.ravel())[1:]
     return np.isin(labels, 1 + np.flatnonzero(sizes >= LEAST_FRACTION * sizes.max()))
+
+
+def outlined(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
+    """Return masks (F, H, W) bool that are near the person as a detector has them, with outlines by the background.
+
+    The background of a pixel is the median of the images in which the detector is sure that nobody is there; where
+    fewer than ``SEEN_BARE`` are, the masks stay as they are. None: the camera moves.
+
+    Args:
+        images: (F, H, W, 3) uint8, of one camera.
+        masks: (F, H, W) bool.
+    """
+    if displaced_by(np.where(masks, np.median(images[..., 1], axis=0).astype(np.uint8), images[..., 1])) > STANDS:
+        return None
+    heights = [np.ptp(mask.any(1).nonzero()[0]) + 1 for mask in masks if mask.any()]
+    radius = max(2, round(UNSURE * float(np.mean(heights)))) if heights else 2
+    near = np.stack([ndimage.binary_dilation(mask, iterations=radius) for mask in masks])
+    known = (~near).sum(0) >= SEEN_BARE
+    bare = np.ma.masked_array(images, np.broadcast_to(near[..., None], images.shape))
+    colours = np.ma.median(bare, axis=0).filled(0).astype(np.float32)
+    away = np.ma.masked_array(np.stack([_away(colours, image) for image in images]), near | ~known)
+    noise = (1.4826 * np.ma.median(away, axis=0)).filled(NOISE).astype(np.float32)
+    typical = max(NOISE, float(np.median(noise[known]))) if known.any() else NOISE
+    background = Background(colours, np.clip(noise, typical, 3 * typical))
+    core = np.stack([ndimage.binary_erosion(mask, iterations=radius) for mask in masks])
+    reached = np.stack([ndimage.binary_dilation(mask, iterations=2 * radius) for mask in near])
+    different = np.stack([person_mask(background, x, mask) for x, mask in zip(images, masks, strict=True)])
+    return np.where(known, (different & reached) | core, masks)
 
 
 def separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
@@ -203,7 +236,7 @@ def with_background_masks(
         worst = found if worst is None or found.on_edges < worst.on_edges else worst
         for view in camera.views:
             target = folder / f"{re.sub(r'[^A-Za-z0-9_-]', '_', view.name)}.{len(silhouettes):06d}.png"
-            write_image(target, _at_size(person_mask(background, camera.image(view)), view))
+            write_image(target, at_size(person_mask(background, camera.image(view)), view))
             silhouettes[view.name] = Silhouette(target, "white")
     if worst is not None:
         say(
@@ -284,7 +317,7 @@ def _require_clear(camera: _Camera, found: Separation, *, with_plate: bool) -> N
     )
 
 
-def _at_size(mask: np.ndarray, view: View) -> np.ndarray:
+def at_size(mask: np.ndarray, view: View) -> np.ndarray:
     """Return the mask as grey levels (H, W, 1) uint8 at the size of the view's image, bilinear."""
     values = torch.from_numpy(mask.astype(np.float32))[None, None]
     sized = torch.nn.functional.interpolate(values, (view.height, view.width), mode="bilinear", align_corners=False)

@@ -58,6 +58,7 @@ def add_parser(commands: args.Commands) -> None:
     _add_inspect(verbs)
     _add_sfm(verbs)
     _add_fit(verbs)
+    _add_people(verbs)
     _add_motion(verbs)
     _add_synth(verbs)
 
@@ -109,6 +110,27 @@ def _add_fit(verbs: args.Commands) -> None:
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     for name, (metavar, about) in _OF_A_FIT.items():
         parser.add_argument(f"--{name}", type=args.input_path, metavar=metavar, help=about)
+    args.add_overrides(parser, "data.key=value", "keys of data")
+
+
+def _add_people(verbs: args.Commands) -> None:
+    parser = args.add_command(
+        verbs,
+        "people",
+        run_people,
+        "find a person in a video and fit the body to them",
+        "Find a person in every frame, their silhouette and key points, follow them through the clip, and fit the body "
+        "as `data fit` does. OUT is a capture for `dyngs train human`. MediaPipe does it in an environment of its own, "
+        "or torchvision's R-CNN with weights of yours (docs/person.md).",
+    )
+    about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
+    parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
+    parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
+    parser.add_argument("--person", type=int, default=1, metavar="N", help="which of several people (1: the largest)")
+    about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
+    parser.add_argument("--mediapipe", type=args.input_path, metavar="PYTHON", help=about)
+    about = "weights of torchvision's Keypoint R-CNN, and once more of its Mask R-CNN, instead of MediaPipe"
+    parser.add_argument("--weights", type=args.input_path, action="append", default=[], metavar="FILE", help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
 
 
@@ -263,6 +285,19 @@ def run_fit(arguments: argparse.Namespace) -> int:
     with ProgressBar() as report:
         inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person))
         result = write_fitted_capture(options, arguments.out, report, inputs)
+    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    return 0
+
+
+def run_people(arguments: argparse.Namespace) -> int:
+    """Find a person and fit a body; print what was found, and the next command."""
+    from dyngs.human.detection.detector import chosen_detector
+    from dyngs.human.detection.find_person import write_found_person
+
+    options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
+    detector = chosen_detector(arguments.weights, arguments.mediapipe)
+    with ProgressBar() as report:
+        result = write_found_person(options, arguments.out, detector, report, number=arguments.person)
     print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 

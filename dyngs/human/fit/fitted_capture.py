@@ -87,7 +87,8 @@ def read_person(options: DataConfig, given: FitInputs, work: Path, say: Callable
         if capture.format == "neuman":
             raise DyngsError(f"{source}: no silhouettes, and the camera moves; add masks of the person")
         capture = with_background_masks(capture, work, given.background, say)
-    return _without_empty_frames(capture, options, say) if has_guessed_lens(capture) else capture
+    found_only = has_guessed_lens(capture) or given.masks is not None
+    return _without_empty_frames(capture, options, say) if found_only else capture
 
 
 def with_lens(capture: Capture, lens: LensFit | None) -> Capture:
@@ -112,7 +113,7 @@ def _without_empty_frames(capture: Capture, options: DataConfig, say: Callable[[
     if len(kept) < len(views):
         gone = [view.name for view in views if view not in kept]
         say(f"{len(gone)} frames in which hardly anybody is seen are left out, first {gone[0]}")
-    return capture.replace(splits={"train": kept})
+    return capture.replace(splits={**capture.splits, "train": kept})
 
 
 FRAME_RATE = 30.0  # frames per second of a clip whose capture does not say
