@@ -102,8 +102,8 @@ def person_mask(background: Background, image: np.ndarray, likely: np.ndarray | 
     # Closing with room around, so that who is cut off by the border is not eaten from there.
     padded = np.pad(seen, 2 * radius, mode="edge")
     closed = ndimage.binary_closing(padded, _disc(radius))[2 * radius : -2 * radius, 2 * radius : -2 * radius]
-    filled = ndimage.binary_fill_holes(closed)
-    opened = ndimage.binary_opening(filled if likely is None else closed | (filled & likely), _disc(1))
+    filled = np.asarray(ndimage.binary_fill_holes(closed), bool)
+    opened = ndimage.binary_opening(filled if likely is None else np.where(filled & likely, True, closed), _disc(1))
     rim = opened & np.logical_not(ndimage.binary_erosion(opened, iterations=EDGE, border_value=1))
     opened = opened & np.logical_not(rim & (away < HALF * ndimage.maximum_filter(away, 2 * EDGE + 1)))
     labels = np.empty(opened.shape, np.int32)
@@ -127,8 +127,8 @@ def outlined(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
         return None
     heights = [np.ptp(mask.any(1).nonzero()[0]) + 1 for mask in masks if mask.any()]
     radius = max(2, round(UNSURE * float(np.mean(heights)))) if heights else 2
-    near = np.stack([ndimage.binary_dilation(mask, iterations=radius) for mask in masks])
-    known = (~near).sum(0) >= SEEN_BARE
+    near: np.ndarray = np.stack([ndimage.binary_dilation(mask, iterations=radius) for mask in masks]).astype(bool)
+    known = np.logical_not(near).sum(0) >= SEEN_BARE
     bare = np.ma.masked_array(images, np.broadcast_to(near[..., None], images.shape))
     colours = np.ma.median(bare, axis=0).filled(0).astype(np.float32)
     away = np.ma.masked_array(np.stack([_away(colours, image) for image in images]), near | ~known)

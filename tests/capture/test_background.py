@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from dyngs.capture.background import background_of, person_mask, separation, with_background_masks
+from dyngs.capture.background import background_of, outlined, person_mask, separation, with_background_masks
 from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
@@ -50,6 +50,50 @@ def test_who_walks_by_is_cut_out(noise: float, shade: float, least: float) -> No
     found = np.stack([person_mask(background, image) for image in images])
     assert worst_iou(found, true) > least
     assert separation(background, images, found).is_clear
+
+
+def rough(masks: np.ndarray) -> np.ndarray:
+    """Masks as a detector has them: too wide in odd images, too narrow in even ones."""
+    return np.stack([(ndimage.binary_dilation if i % 2 else ndimage.binary_erosion)(x) for i, x in enumerate(masks)])
+
+
+@pytest.mark.parametrize("speed", [16.0, 6.0])
+def test_a_detector_and_the_background_outline_better_than_each(speed: float) -> None:
+    """Also of somebody whose median over time is not the background."""
+    images, true = clip(speed)
+    found = outlined(images, rough(true))
+    assert found is not None
+    assert worst_iou(found, true) > 0.96 > worst_iou(rough(true), true)
+    background = background_of(images)
+    alone = np.stack([person_mask(background, image) for image in images])
+    assert worst_iou(found, true) > worst_iou(alone, true)
+
+
+def test_where_the_background_is_never_seen_a_detector_decides() -> None:
+    images, true = clip(0.0)
+    np.testing.assert_array_equal(outlined(images, rough(true)), rough(true))
+
+
+def test_a_moving_camera_has_no_outlines_and_nobody_no_mask() -> None:
+    images, true = clip(6.0)
+    moved = np.stack([np.roll(image, 6 * t, axis=1) for t, image in enumerate(images)])
+    assert outlined(moved, np.zeros_like(true)) is None
+    nobody = outlined(images, np.zeros_like(true))
+    assert nobody is not None
+    assert not nobody.any()
+
+
+def test_gaps_between_legs_stay_open() -> None:
+    """A hole that the outline closes is filled where a detector sees the person, not where it does not."""
+    images, true = clip(16.0)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    background = background_of(images)
+    image, mask = images[3].copy(), true[3].copy()
+    hole = (abs(rows - 56) < 8) & (abs(columns - 78) < 8)
+    image[hole] = np.clip(background.colours[hole].round(), 0, 255).astype(np.uint8)
+    mask &= ~hole
+    assert (person_mask(background, image)[hole]).all(), "without a detector holes are clothes"
+    assert (~person_mask(background, image, mask)[hole]).mean() > 0.5
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0])

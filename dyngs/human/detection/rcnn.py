@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from dyngs.data.images.images import read_image
-from dyngs.errors import DyngsError, reading
+from dyngs.errors import DyngsError, printable, reading
 from dyngs.human.detection.detector import Detection
 
 LEAST_SCORE = 0.7  # of a detection
@@ -31,8 +31,11 @@ class Rcnn:
         """``weights``: files of one network or both. Raises DyngsError: no torchvision, or other weights."""
         try:
             models = importlib.import_module("torchvision.models.detection")
-        except ImportError as error:
-            raise DyngsError(f"--weights needs torchvision: pip install 'dyngs[detect]' ({error})") from None
+        except (ImportError, RuntimeError, OSError) as error:  # a torchvision of another torch has no operators
+            said = printable(str(error), 120)
+            raise DyngsError(
+                f"--weights needs the torchvision of this torch: pip install torchvision ({said})"
+            ) from None
         self._keypoints: nn.Module | None = None
         self._masks: nn.Module | None = None
         empty: dict[str, Any] = {"weights": None, "weights_backbone": None}

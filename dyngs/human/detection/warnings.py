@@ -16,9 +16,7 @@ from dyngs.human.detection.detector import SURE, Detection
 OFTEN = 0.1  # fraction of the images from which on something is said
 SMALL = 120.0  # height of a person below which an avatar has little to learn from, px
 BLURRED = 0.3  # sharpness, as a fraction of the clip's median, below which an image is called blurred
-FACING = (
-    0.1  # width of the shoulders, of the person's height, from which on they are seen from the front or from behind
-)
+FACING = 0.1  # width of the shoulders, of the person's height, from which on they are seen from the front or behind
 _SHOULDERS, _ANKLES = (5, 6), (15, 16)
 
 
