@@ -38,6 +38,8 @@ _SMOOTH = 0.7
 UNSURE, SEEN_BARE = 0.02, 3
 """How far off the outline of a detector may be, in heights of the person, and in how many images a pixel must be seen
 without them."""
+AGREED = 0.8
+"""Overlap (IoU) with a detector's mask below which somebody else before the background is taken for the person."""
 EDGE, HALF = 2, 0.45
 """Width of the rim of a mask, px, and the fraction of the largest difference nearby that a pixel in it has: a pixel at
 the outline is a mixture."""
@@ -117,7 +119,8 @@ def outlined(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
     """Return masks (F, H, W) bool that are near the person as a detector has them, with outlines by the background.
 
     The background of a pixel is the median of the images in which the detector is sure that nobody is there; where
-    fewer than ``SEEN_BARE`` are, the masks stay as they are. None: the camera moves.
+    fewer than ``SEEN_BARE`` are, and in images where the background disagrees, as where other people pass, the masks
+    stay as they are. None: the camera moves.
 
     Args:
         images: (F, H, W, 3) uint8, of one camera.
@@ -138,7 +141,16 @@ def outlined(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
     core = np.stack([ndimage.binary_erosion(mask, iterations=radius) for mask in masks])
     reached = np.stack([ndimage.binary_dilation(mask, iterations=2 * radius) for mask in near])
     different = np.stack([person_mask(background, x, mask) for x, mask in zip(images, masks, strict=True)])
-    return np.where(known, (different & reached) | core, masks)
+    found = np.where(known, (different & reached) | core, masks)
+    found = np.stack([_touching(mask, own) for mask, own in zip(found, core, strict=True)])
+    common, either = (found & masks).sum((1, 2)), (found | masks).sum((1, 2))
+    return np.where((common > AGREED * either)[:, None, None], found, masks)
+
+
+def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
+    """Return the connected parts of a mask (H, W) that hold a pixel of ``core``."""
+    labels, _ = ndimage.label(mask)  # pyright: ignore[reportGeneralTypeIssues]
+    return np.isin(labels, np.unique(labels[core & mask]))
 
 
 def separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:

@@ -20,6 +20,10 @@ SAME_BOX = 0.5  # overlap (IoU) of the boxes of one person in both networks
 PERSON = 1  # label in COCO
 LOGIT_SCALE = 4.0  # a key point's score is a logit; half as sure as can be at 0
 NAMES = "keypointrcnn_resnet50_fpn, and for silhouettes maskrcnn_resnet50_fpn, both trained on COCO"
+CONVERT = (
+    '`python -c "import sys, torch; from safetensors.torch import save_file; save_file(torch.load(sys.argv[1], '
+    'weights_only=True), sys.argv[2])" IN.pth OUT.safetensors`'
+)
 
 
 class Rcnn:
@@ -67,15 +71,12 @@ class Rcnn:
 
 def _state(path: Path) -> dict[str, Tensor]:
     """Return the tensors of a file of weights; nothing else in it is loaded."""
-    with reading(path, "give the file as torchvision publishes it"):
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
+    if path.suffix != ".safetensors":
+        raise DyngsError(f"{path}: files that could run code are not read; make it .safetensors by {CONVERT}")
+    from safetensors.torch import load_file
 
-            return load_file(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    if not isinstance(state, dict) or not all(isinstance(x, Tensor) for x in state.values()):
-        raise DyngsError(f"{path}: is no file of weights; give torchvision's {NAMES}")
-    return state
+    with reading(path, "make it anew from the file that torchvision publishes"):
+        return load_file(path)
 
 
 def _loaded(path: Path, network: nn.Module, state: Mapping[str, Tensor]) -> nn.Module:

@@ -52,7 +52,7 @@ def clip(tmp_path: Path) -> Path:
 
 
 class Rough:
-    """Finds the person with outlines that are 2 px off, and nobody in image 4; smaller, somebody who stands apart."""
+    """Finds the person with outlines that are 1 px off, and nobody in image 4; smaller, somebody who stands apart."""
 
     name = "Rough"
 
@@ -67,7 +67,7 @@ class Rough:
         return [[] if self.nobody or n == 4 else self._people(n, scale) for n in numbers]
 
     def _people(self, number: int, scale: float) -> list[Detection]:
-        grown = (ndimage.binary_dilation, ndimage.binary_erosion)[number % 2](truth(number), iterations=2)
+        grown = (ndimage.binary_dilation, ndimage.binary_erosion)[number % 2](truth(number))
         grown = grown[:: round(1 / scale), :: round(1 / scale)]
         points = person(30 + 10 * number, 90.0).keypoints * np.array([scale, scale, 1.0], np.float32)
         walker = Detection(points.astype(np.float32), (255 * grown).astype(np.uint8))

@@ -8,6 +8,7 @@ from types import ModuleType
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from dyngs.errors import DyngsError
 from dyngs.human.detection.detector import chosen_detector
@@ -73,15 +74,17 @@ def _detection() -> ModuleType:
 
 def test_weights_of_other_networks_are_refused(tmp_path: Path) -> None:
     _detection()
-    other = tmp_path / "other.pth"
-    torch.save({"fc.weight": torch.zeros(2, 2)}, other)
+    other = tmp_path / "other.safetensors"
+    save_file({"fc.weight": torch.zeros(2, 2)}, other)
     with pytest.raises(DyngsError, match="weights of another network"):
         chosen_detector([other], None)
     other.write_bytes(b"rubbish")
-    with pytest.raises(DyngsError, match=r"other\.pth"):
+    with pytest.raises(DyngsError, match=r"other\.safetensors"):
         chosen_detector([other], None)
-    cut = tmp_path / "cut.pth"
-    torch.save({"roi_heads.keypoint_predictor.kps_score_lowres.weight": torch.zeros(1)}, cut)
+    with pytest.raises(DyngsError, match="files that could run code are not read"):
+        chosen_detector([tmp_path / "other.pth"], None)
+    cut = tmp_path / "cut.safetensors"
+    save_file({"roi_heads.keypoint_predictor.kps_score_lowres.weight": torch.zeros(1)}, cut)
     with pytest.raises(DyngsError, match="keypointrcnn_resnet50_fpn"):
         chosen_detector([cut], None)
 
@@ -93,8 +96,8 @@ def test_torchvision_s_own_layout_is_taken(tmp_path: Path) -> None:
 
     files = []
     for name in ("keypointrcnn_resnet50_fpn", "maskrcnn_resnet50_fpn"):
-        files.append(tmp_path / f"{name}.pth")
-        torch.save(getattr(detection, name)(weights=None, weights_backbone=None).state_dict(), files[-1])
+        files.append(tmp_path / f"{name}.safetensors")
+        save_file(getattr(detection, name)(weights=None, weights_backbone=None).state_dict(), files[-1])
     write_image(tmp_path / "a.png", torch.full((32, 32, 3), 128, dtype=torch.uint8).numpy())
     assert Rcnn(files).detect([tmp_path / "a.png"]) == [[]]
     with pytest.raises(DyngsError, match="no weights for key points"):
