@@ -69,7 +69,7 @@ def empty_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.M
 def same_numbers() -> None:
     """What a test draws without a generator of its own does not depend on the tests before it.
 
-    Of the CPU alone: ``torch.manual_seed`` notes a call, with all of its stack, for each kind of device that is not here.
+    Of the CPU alone: ``torch.manual_seed`` keeps a stack of calls for each kind of device that is not here, each time.
     """
     torch.default_generator.manual_seed(0)
 
