@@ -220,7 +220,7 @@ def gpu() -> Iterator[tuple[str, str]]:
     pytest: Any = __import__("pytest")
     emulated: Any = __import__("emulated_gpu")
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        module = emulated.build_module(Path(folder), Path(folder))
+        module = emulated.build_module(Path(folder))
         emulated.on_emulated_gpu(patch, module)
         yield "cpu", f"emulated, since {reason}"
 

@@ -36,6 +36,18 @@ from dyngs.ops.native import built_isas, core
 
 SHARED = Path(__file__).parents[1] / "../shared/data"
 
+LONGEST = (
+    "test_emulated_gpu.py",
+    "test_fuzz.py",
+    "test_quality.py",
+    "test_pretend_gpu.py",
+    "test_train.py",
+    "test_following.py",
+    "test_docs.py",
+    "test_choose.py",
+    "test_captures.py",
+)
+"""Test files in the order of the processor time that they take."""
 FEW, MANY = 100, 1000  # examples of a test that does not say how many
 # No deadlines: whether a busy machine is slow says nothing about what is tested.
 settings.register_profile("ci", derandomize=True, max_examples=FEW, deadline=None)
@@ -45,11 +57,11 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the longest module: in the end no process waits for another one.
+    """Begin with the longest modules: in the end no process waits for another one.
 
     Tests that say how many examples they need in ``ci`` draw more by the same factor in ``long``.
     """
-    items.sort(key=lambda item: item.path.name != "test_fuzz.py")
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
     factor = settings.default.max_examples // FEW
     for test in {id(item.obj): item.obj for item in items if isinstance(item, pytest.Function)}.values():
         own = getattr(test, "_hypothesis_internal_use_settings", None)  # hypothesis has no public way to reach these
@@ -67,8 +79,11 @@ def empty_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.M
 
 @pytest.fixture(autouse=True)
 def same_numbers() -> None:
-    """What a test draws without a generator of its own does not depend on the tests before it."""
-    torch.manual_seed(0)
+    """What a test draws without a generator of its own does not depend on the tests before it.
+
+    Of the CPU alone: ``torch.manual_seed`` keeps a stack of calls for each kind of device that is not here, each time.
+    """
+    torch.default_generator.manual_seed(0)
 
 
 @pytest.fixture

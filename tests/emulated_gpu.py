@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from importlib import util
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 
 import pytest
@@ -33,59 +36,58 @@ def compiler() -> str:
     return found
 
 
-def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str], common: Iterable[str] = ()) -> list[str]:
-    """Object files of ``sources`` in ``folder``, each compiled unless it is there.
+def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str], common: Iterable[str]) -> list[str]:
+    """Object files of ``sources``.
 
     Args:
-        folder: that exists; of these sources and flags alone.
+        folder: a new one, in which they lie.
         sources: C++, also with the endings of CUDA.
         flags: of the compiler.
-        common: headers below csrc that most of them include; they are read once for all.
+        common: headers that most of them include; they are read once for all.
     """
     command = [compiler(), "-std=gnu++20", "-fPIC", "-w", f"-I{ROOT / 'csrc'}", *flags]
+    folder.mkdir()
     headers = folder / "common.hpp"
     headers.write_text("".join(f'#include "{name}"\n' for name in common), encoding="utf-8")
-    if common and not (folder / "common.hpp.gch").exists():
-        own = ["-x", "c++-header", str(headers), "-o", f"{headers}.gch"]
-        subprocess.run([*command, *own], check=True, timeout=500)
+    own = ["-x", "c++-header", str(headers), "-o", f"{headers}.gch"]
+    subprocess.run([*command, *own], check=True, timeout=500)
     command += ["-include", str(headers), "-x", "c++", "-c"]
 
     def compile_one(source: Path) -> str:
-        target = folder / f"{source.name}.o"
-        if not target.exists():
-            subprocess.run([*command, str(source), "-o", f"{target}.part"], check=True, timeout=500)
-            os.replace(f"{target}.part", target)
-        return str(target)
+        target = str(folder / f"{source.name}.o")
+        subprocess.run([*command, str(source), "-o", target], check=True, timeout=500)
+        return target
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(compile_one, sources))
 
 
-def emulated_kernels(base: Path) -> list[str]:
-    """Object files of csrc/cuda for the emulation, compiled once for all processes of a test session.
+def digest_of_all(folders: Iterable[Path]) -> str:
+    """A number that differs as soon as a source, this file, the compiler, or Python does."""
+    found = hashlib.sha256()
+    below = (x for folder in folders for x in sorted(folder.rglob("*")) if x.is_file() and x.suffix != ".pyc")
+    version = subprocess.run([compiler(), "--version"], capture_output=True, check=True).stdout
+    for text in (sys.version.encode(), version, *(x.read_bytes() for x in (Path(__file__), *below))):
+        found.update(len(text).to_bytes(8, "little") + text)
+    return found.hexdigest()[:20]
 
-    Args:
-        base: folder of the session.
-    """
-    folder = base / "emulated_kernels"
-    folder.mkdir(exist_ok=True)
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Other processes wait."""
     with open(folder / "lock", "w", encoding="utf-8") as lock:
         if sys.platform != "win32":
             import fcntl
 
             fcntl.flock(lock, fcntl.LOCK_EX)
-        # nothing contracted, as in CMakeLists.txt
-        return compiled(folder, KERNELS, ["-O1", "-ffp-contract=off"], ("cuda/device.hpp", "cuda/sort.hpp"))
+        yield
 
 
-def session_folder(factory: pytest.TempPathFactory) -> Path:
-    """The folder that all processes of a test session share."""
-    base = factory.getbasetemp()
-    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+def build_module(cache: Path) -> ModuleType:
+    """The module, compiled unless that of the same sources is in the folder ``cache``.
 
-
-def build_module(base: Path, folder: Path) -> ModuleType:
-    """The module, compiled in ``folder``; skips the test where nanobind or Python's headers are missing."""
+    Skips the test where nanobind or Python's headers are missing.
+    """
     nanobind = pytest.importorskip("nanobind")
     python = Path(sysconfig.get_paths()["include"])
     if not (python / "Python.h").is_file():
@@ -95,9 +97,26 @@ def build_module(base: Path, folder: Path) -> ModuleType:
     names = {"DYNGS_GPU": 1, "DYNGS_EMULATED": 1, "DYNGS_MODULE": NAME, "NB_DOMAIN": "dyngs_emulated"}
     flags = ["-O0", "-fvisibility=hidden", *(f"-I{x}" for x in includes), *(f"-D{k}={v}" for k, v in names.items())]
     own = [*sorted((ROOT / "csrc/bind_cuda").glob("*.cpp")), *BINDINGS, ROOT / "csrc/cpu/memory.cpp"]
-    objects = compiled(folder, [*own, sources / "nb_combined.cpp"], flags)
-    library = folder / f"{NAME}.so"
-    subprocess.run([compiler(), "-shared", *objects, *emulated_kernels(base), "-o", str(library)], check=True)
+    library = cache / f"{digest_of_all([ROOT / 'csrc', Path(nanobind.__file__).parent])}.so"
+    with alone_in(cache):
+        if library.exists():
+            return loaded(library)
+        for old in cache.glob("*.so"):
+            old.unlink()
+        with TemporaryDirectory(dir=cache) as work:
+            of_bindings = ("nanobind/ndarray.h", "nanobind/stl/optional.h", "nanobind/stl/tuple.h")
+            objects = compiled(Path(work) / "bindings", [*own, sources / "nb_combined.cpp"], flags, of_bindings)
+            # nothing contracted, as in CMakeLists.txt
+            optimized = ["-O1", "-ffp-contract=off"]
+            objects += compiled(Path(work) / "kernels", KERNELS, optimized, ("cuda/device.hpp", "cuda/sort.hpp"))
+            linked = Path(work) / library.name
+            subprocess.run([compiler(), "-shared", *objects, "-o", str(linked)], check=True)
+            os.replace(linked, library)
+        return loaded(library)
+
+
+def loaded(library: Path) -> ModuleType:
+    """The module in a file."""
     spec = util.spec_from_file_location(NAME, library)
     assert spec is not None
     assert spec.loader is not None

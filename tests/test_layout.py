@@ -226,18 +226,19 @@ def test_every_mutation_names_a_place_and_its_tests() -> None:
         assert all((ROOT / "tests" / test).is_file() for test in tests.split()), (file, tests)
 
 
-def test_import_is_cheap() -> None:
+def test_import_is_cheap_and_leaves_heavy_packages_alone() -> None:
     """One of three processes suffices, because a busy machine only ever makes it slower."""
-    code = "import time, torch, numpy; t = time.perf_counter(); import dyngs; print(time.perf_counter() - t)"
-    assert any(float(run_python(code)) < 1.0 for _ in range(3))
-
-
-def test_import_leaves_heavy_packages_alone() -> None:
     code = (
-        "import sys, torch; before = set(sys.modules); import dyngs, dyngs.gaussians.rendering\n"
+        "import sys, time, torch, numpy; before = set(sys.modules); t = time.perf_counter(); import dyngs\n"
+        "print(time.perf_counter() - t); import dyngs.gaussians.rendering\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules and m not in before])"
     )
-    assert run_python(code).strip() == "[]"
+    for _ in range(3):
+        seconds, heavy = run_python(code).splitlines()
+        assert heavy == "[]"
+        if float(seconds) < 1.0:
+            return
+    pytest.fail(f"dyngs takes {seconds} s to import")
 
 
 def test_drawing_and_evaluating_leave_packages_alone_that_few_scenes_need() -> None:

@@ -245,20 +245,20 @@ def write_rolling_ball(root: Path) -> None:
         Image.fromarray((255 * rgba).round().byte().numpy()).save(view.image_path)
 
 
-@pytest.mark.parametrize(("moves", "steps"), [(True, 300), (False, 500)])
+@pytest.mark.parametrize(("moves", "steps"), [(True, 300), (False, 300)])
 def test_never_worse_than_static(moves: bool, steps: int, tmp_path: Path) -> None:
     """Real small runs: motion wins where something moves, the static model where nothing does."""
     root, keys = tmp_path / "capture", ["init.num_random=200", "model.num_random_moving=60"]
     if moves:
         write_rolling_ball(root)
     else:
-        write_still_capture(root, StillOptions(size=32, num_train=48, num_test=1, samples=1))
-        keys = ["init.num_random=400", "model.num_random_moving=200", "data.times=order"]
+        write_still_capture(root, StillOptions(size=24, num_train=48, num_test=1, samples=1))
+        keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
     config = preset(root, "train.steps=40_000", "train.initial_downscale=1", *keys)
     capture = read_capture(config.data)
     plan = replace(_Plan.of(config, capture, 1), steps=steps, runs=2)
     moving = config.model_copy(update={"model": config.model.model_copy(update={"choose": False})})
     settings, base = [OpenSetting("model.kind=dynamic", lambda _: moving)], module._at_rest(config)
     best, (choice,) = module._decided(base, settings, plan, with_points(capture, base))
-    assert choice.taken is moves, choice
+    print(choice); assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves

@@ -59,7 +59,10 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
 
 
 def test_on_a_gpu_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The search, its file, and the comparison with the run before."""
+    """The search, of few candidates, its file, and the comparison with the run before."""
+    few = {"LEFT_GAUSSIANS": (0.7, 0.5), "CUT_OFFS": (0.02,), "FIELD_LOSSES": (0.1,), "HARMONIC_LOSSES": (0.03,)}
+    for name, candidates in few.items():
+        monkeypatch.setattr(f"dyngs.prune.search.{name}", candidates)
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
     here = compared([run_dir, file_of(tmp_path / "here")], 1)

@@ -54,7 +54,7 @@ def config_of(kind: str, captures: dict[str, Path], run_dir: Path, budget: Budge
     )
     if kind != "human":
         return config
-    model = HumanModel(resolution=24, sh_degree=0)
+    model = HumanModel(resolution=24, sh_degree=0, fit=False)
     return config.model_copy(update={"data": DataConfig(root=captures["person"]), "model": model})
 
 

@@ -94,7 +94,7 @@ def still_config(capture: Path, run_dir: Path, strategy: DefaultStrategy | McmcS
 def human_config(capture: Path, run_dir: Path) -> Config:
     return Config(
         data=DataConfig(root=capture),
-        model=HumanModel(resolution=24, refine_from=0.2, sh_degree=0),
+        model=HumanModel(resolution=24, refine_from=0.2, sh_degree=0, fit=False),
         strategy=DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.11),
         train=TrainConfig(steps=10, log_every=1),
         run=RunConfig(dir=run_dir, threads=1),

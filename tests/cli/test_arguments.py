@@ -135,10 +135,12 @@ def test_the_walk_finds_the_commands_that_write() -> None:
 def test_no_output_of_any_command_replaces_what_it_reads(
     name: str, output: str, kind: str, known: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for number, target in enumerate(read_of(known, kind)):
-        outs = names_of(target, tmp_path / "links" / str(number))
+    """However it is named: by its path, and in turn by another spelling and by links."""
+    turn = WRITING.index((name, output))
+    for number, target in enumerate(read_of(known, kind), turn):
+        named, *others = names_of(target, tmp_path / "links" / str(number))
         before = contents(tmp_path)
-        for out in outs:
+        for out in (named, others[number % len(others)]):
             line = line_of(name, output, known[kind], out)
             if line is None:
                 assert name in ("demo", "data synth")

@@ -42,7 +42,10 @@ TRAINED = {
     "human": ("person", ["model.resolution=16", "model.fit=false", "model.sh_degree=0"]),
     "ngp": ("still", ["model.levels=4", "model.log2_rows=10", "model.log2_samples=10", "model.cells=16"]),
     "nerf": ("still", ["model.width=16", "model.coarse=8", "model.fine=8", "model.rays=32"]),
-    "bg_triangle": ("still", ["init.num_random=40", "model.segments=2"]),
+    "bg_triangle": (
+        "still",
+        ["init.num_random=40", "model.segments=2", "model.gaussian_steps=20", "model.num_first=40"],
+    ),
     "toy": ("still", []),
 }
 """Fixture with a capture for each kind that is trained on one, and other keys of a small run."""

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 import torch
-from emulated_gpu import build_module, on_emulated_gpu, session_folder
+from emulated_gpu import build_module, on_emulated_gpu
 from scenes import Scene, random_scene
 from torch import Tensor
 
@@ -39,8 +39,8 @@ Made = list[Tensor]
 
 
 @pytest.fixture(scope="module")
-def module(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
-    return build_module(session_folder(tmp_path_factory), tmp_path_factory.mktemp("emulated"))
+def module(request: pytest.FixtureRequest) -> ModuleType:
+    return build_module(request.config.cache.mkdir("emulated_gpu"))
 
 
 @pytest.fixture

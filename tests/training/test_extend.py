@@ -58,7 +58,7 @@ def _config(captures: Path, folder: Path, kind: str, **changes: object) -> Confi
     }
     config = Config(
         data=DataConfig(root=captures / still),
-        model=HumanModel(resolution=16, sh_degree=0) if person else StaticModel(sh_degree=2),
+        model=HumanModel(resolution=16, sh_degree=0, fit=False) if person else StaticModel(sh_degree=2),
         init=RandomInit(num_random=60),
         strategy=strategies[kind],
         train=TrainConfig(steps=12, log_every=1),

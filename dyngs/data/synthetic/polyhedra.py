@@ -124,8 +124,8 @@ def face_ids(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int) 
             here = np.flatnonzero((nearest == index) & np.isfinite(distance))
             points = origin + distance[here, None] * directions[here]
             ids[here] = _FACES * index + _face(primitive, points)
-        found.append(ids.reshape(size, size))
-    return np.stack(found)
+        found.append(ids.reshape(-1, size, size))
+    return np.concatenate(found)
 
 
 def _face(primitive: Primitive, points: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from dyngs.cli.data import SYNTHETIC_SCENES
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.geometry import camera_center
+from dyngs.data.people_set import PEOPLE_FILE
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic import raytrace
 from dyngs.data.synthetic.captures import (
@@ -37,6 +38,7 @@ from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
+SHORT = {"human": ("--cameras", "1"), "people": ("--people", "1", "--cameras", "2")}
 TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_val=2, num_cameras=3, samples=1)
 
 
@@ -192,7 +194,8 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path) ->
 def test_an_interrupted_command_leaves_nothing_and_may_be_repeated(
     scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["data", "synth", scene, str(tmp_path / "out"), "--size", "8", "--views", "2"]
+    """Of people, those that are finished stay, to be added to."""
+    words = ["data", "synth", scene, str(tmp_path / "out"), "--size", "8", "--views", "2", *SHORT.get(scene, ())]
     calls: list[Path] = []
 
     def interrupted(path: Path, pixels: np.ndarray) -> None:
@@ -204,14 +207,15 @@ def test_an_interrupted_command_leaves_nothing_and_may_be_repeated(
     for module in ("dyngs.data.synthetic.captures", "dyngs.human.synthetic.capture"):
         monkeypatch.setattr(f"{module}.write_image", interrupted)
     assert main(words) == 130
-    assert list(tmp_path.iterdir()) == []
+    left = sorted(path.name for path in tmp_path.rglob("*"))
+    assert left == (["out", PEOPLE_FILE, "s0000"] if scene == "people" else [])
     monkeypatch.undo()
     assert main(words) == 0
     assert "written: " in capsys.readouterr().out
 
 
 def test_the_command_knows_all_scenes() -> None:
-    assert ("still", "polyhedra", *get_args(SceneName), "human") == SYNTHETIC_SCENES
+    assert ("still", "polyhedra", *get_args(SceneName), "human", "people") == SYNTHETIC_SCENES
 
 
 @pytest.mark.parametrize(

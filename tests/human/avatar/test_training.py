@@ -45,6 +45,7 @@ def tiny(capture: Path, run_dir: Path | None = None, steps: int = 10, **changes:
         "resolution": 24,
         "refine_from": 0.2,
         "sh_degree": 0,
+        "fit": False,
     } | changes
     return Config(
         data=DataConfig(root=capture),
