@@ -23,6 +23,7 @@ examples:
   dyngs edit runs/site --geo points.csv --out site.ply                        in the coordinates of control points
   dyngs edit room.ply --merge chair.ply lamp.spz --out all.ply
   dyngs edit table.ply --undo --out before.ply                                the frame of before
+  dyngs edit runs/room --up auto --scale 2 --out runs/upright                 a run: its cameras, motion, exports, too
 
 What is asked for is done in this order: --clean, --crop, --merge, the frame. docs/edit.md explains it.
 """
@@ -34,14 +35,14 @@ def add_parser(commands: args.Commands) -> None:
         "edit",
         run,
         "another frame, a part, cleaned, several in one: a scene as an edited file",
-        "Edit a run or a file of Gaussians, and write the result as another file. Points are given in the coordinates "
-        "of a file, or of the capture of a run. How the frame was changed is stored, so that it can be undone.",
+        "Edit a run or a file of Gaussians, and write the result as another file or run. Points are given in the "
+        "coordinates of a file, or of the capture of a run. How the frame was changed is stored: it can be undone.",
         _EPILOG,
     )
     parser._negative_number_matcher = _NEGATIVE  # else "-1,0,2" would be taken for an option
     parser.add_argument("source", type=args.input_path, metavar="RUN|FILE", help="run folder, or file of Gaussians")
-    about = "file to write, such as a .ply, .spz, .glb, or .4dgs of what moves; the suffix names the format"
-    parser.add_argument("--out", type=args.output_path, required=True, metavar="FILE", help=about)
+    about = "file to write, such as a .ply, .spz, .glb, or .4dgs of what moves; without a suffix the folder of a run"
+    parser.add_argument("--out", type=args.output_path, required=True, metavar="FILE|RUN2", help=about)
     frame = parser.add_argument_group("frame")
     about = "direction that is up: an axis such as -y, x,y,z, or auto, by the cameras of the run"
     frame.add_argument("--up", metavar="DIRECTION", help=about)
@@ -78,9 +79,12 @@ def run(arguments: argparse.Namespace) -> int:
     reads = [path for path in (arguments.geo, mesh) if path is not None]
     edits = _edits(arguments)
     written = edit_scene(source, arguments.out, edits, reads, args.data_root(arguments), _note)
-    print_redrawn(written.notes, [written.redrawn])
-    args.print_written(written.path)
-    if written.path.suffix.lower() == ".ply":
+    if written.redrawn is None:
+        print(f"written: {written.path}")
+    else:
+        print_redrawn(written.notes, [written.redrawn])
+        args.print_written(written.path)
+    if written.redrawn is None or written.path.suffix.lower() == ".ply":
         print(f"next:    dyngs view {as_word(written.path)}")
     return 0
 

@@ -14,7 +14,7 @@ from dyngs.errors import DyngsError, counted, printable, require_regular
 from dyngs.files.limits import require_at_most
 from dyngs.splats.rotation import AXES, turn_between
 from dyngs.splats.similarity import Similarity, fitted
-from dyngs.splats.splat_file import GEO_OFFSET
+from dyngs.splats.splat_file import geo_comment
 
 _FACTORS = (1e-9, 1e9)
 _MOST_BYTES = 1 << 20  # of a file of control points
@@ -142,7 +142,7 @@ class GeoFrame:
     @property
     def comment(self) -> str:
         """What the header of the file says of the offset."""
-        return f"{GEO_OFFSET} " + " ".join(f"{x:.10g}" for x in self.offset)
+        return geo_comment(self.offset)
 
 
 def geo_frame(path: Path) -> GeoFrame:

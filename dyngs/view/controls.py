@@ -259,7 +259,7 @@ def add_path_controls(browsing: Browsing) -> None:
             return
         opened, first = session.opened, recorded[0].keyframes[0].camera
         width, height = (2 * (side // 2) for side in (first.width, first.height))  # as videos need it
-        text = recorded[0].turned_back(opened.turned).document((width, height), FPS, opened.world_offset)
+        text = recorded[0].moved(opened.frame).document((width, height), FPS, opened.world_offset)
         browsing.client.send_file_download(FILE_NAME, text.encode(), save_immediately=True)
 
     gui.add_button("Add keyframe", hint="this camera, at this time").on_click(add)
