@@ -134,6 +134,17 @@ def edit_scene(
     return _written_moving(found, out, edits, tell) if moves else _written(found, out, edits, tell)
 
 
+def write_part(opened: Opened, rows: torch.Tensor, out: Path, time: float | None = None) -> EditedFile:
+    """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of the format.
+
+    Raises DyngsError: it was opened from no file or run, or cannot be written.
+    """
+    if opened.path is None:
+        raise DyngsError("this scene has no file or run of its own yet, so it cannot be edited")
+    found = _opened(opened.path, None) if opened.captured is None else _Source(opened)
+    return _written(found.kept(rows), out, Edits(time=time), lambda _: None)
+
+
 def _opened(source: Path, data_root: Path | None) -> _Source:
     if source.is_file() and known_format(source) is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")

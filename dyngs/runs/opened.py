@@ -94,6 +94,8 @@ class Opened(LoadedRun):
         fps: frame rate of the motion that a person plays instead of that of training; None: it is that of training.
         as_captured: a person is in the poses of the capture.
         notes: lines about what was changed or left out in reading.
+        path: run folder or file that it was opened from; None: none.
+        scaled: an edit has told how long something is, so that a unit of ``world`` is a metre.
         in_training: it still changes; what does not move yet may do so later.
     """
 
@@ -105,6 +107,8 @@ class Opened(LoadedRun):
     fps: float | None = None
     as_captured: bool = True
     notes: tuple[str, ...] = ()
+    path: Path | None = None
+    scaled: bool = False
     in_training: bool = False
     _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -289,14 +293,15 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
     if data_root is not None:
         raise DyngsError(f"{path}: a file, not a run, so it has no capture; leave out data.root")
     if path.suffix.lower() == AVATAR_SUFFIX:
-        return Opened(**vars(read_avatar(path)), name=path.name)
+        return Opened(**vars(read_avatar(path)), name=path.name, path=path)
     if known_format(path) is None:
         known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
         other = command_for(path)
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path, nonfinite=nonfinite)
     opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), path)
-    opened = replace(opened, stated_up=splat.up, notes=splat.notes)
+    scaled = splat.edited.scale != 1
+    opened = replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
     if splat.edited != UNMOVED:  # then its own frame is the one that people mean
         return opened
     info = replace(opened.info, world_offset=splat.world_offset)
@@ -307,8 +312,10 @@ def open_run(folder: Path, capture: Capture | None = None, data_root: Path | Non
     """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it is read already."""
     run = load_run(folder, data_root)
     edited, captured = read_frame(folder), Captured(run.config.data, capture)
-    up = None if edited is None else edited.up
-    return Opened(**vars(run), name=folder.absolute().name, captured=captured, edited=edited, stated_up=up)
+    opened = Opened(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
+    if edited is None:
+        return opened
+    return replace(opened, edited=edited, stated_up=edited.up, scaled=edited.similarity.scale != 1)
 
 
 def opened_scene(scene: GaussianScene, file: Path = Path("scene")) -> Opened:
