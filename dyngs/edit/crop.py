@@ -92,7 +92,7 @@ def region_of(words: Sequence[str]) -> Region:
     """
     text = " ".join(words)
     parts = text.split()
-    if "," not in parts[0] or mesh_path(words) is not None:
+    if not parts or "," not in parts[0] or mesh_path(words) is not None:
         return read_mesh(Path(text))
     if len(parts) != 2:
         shown = printable(repr(text), 60)
