@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from dyngs.edit.scene_file import Edits
 
 _NEGATIVE = re.compile(r"-([xyz]$|\.?\d)")  # values of options that begin with a minus
+_EXIF = Path("exif")
 _EPILOG = """\
 examples:
   dyngs edit runs/room --up auto --scale "0,0,0 1,0,0 1.25m" --out room.ply   upright, in metres
@@ -21,6 +23,7 @@ examples:
   dyngs edit room.ply --crop 0,0,0 1.5 --outside --out rest.ply               all but a sphere
   dyngs edit runs/room --clean --out clean.ply                                without what spoils it, for 0.1 dB at most
   dyngs edit runs/site --geo points.csv --out site.ply                        in the coordinates of control points
+  dyngs edit runs/site --geo exif --out runs/site_m                           north, up and metres by GPS of the photos
   dyngs edit room.ply --merge chair.ply lamp.spz --out all.ply
   dyngs edit table.ply --undo --out before.ply                                the frame of before
   dyngs edit runs/room --up auto --scale 2 --out runs/upright                 a run: its cameras, motion, exports, too
@@ -49,8 +52,8 @@ def add_parser(commands: args.Commands) -> None:
     frame.add_argument("--origin", metavar="X,Y,Z", help="point that becomes the origin")
     about = 'factor, or "x,y,z x,y,z LENGTH": two points, and what their distance is to be'
     frame.add_argument("--scale", metavar="FACTOR", help=about)
-    about = "control points: rows of x,y,z in the scene and X,Y,Z in the world, three or more"
-    frame.add_argument("--geo", type=args.input_path, metavar="FILE", help=about)
+    about = "control points: rows of x,y,z in the scene and X,Y,Z in the world, three or more; exif: GPS of the photos"
+    frame.add_argument("--geo", type=args.input_path, metavar="FILE|exif", help=about)
     frame.add_argument("--undo", action="store_true", help="the frame from before the first edit")
     part = parser.add_argument_group("Gaussians")
     about = "what stays: two corners x,y,z x,y,z of a box, centre and radius of a sphere, or the file of a closed mesh"
@@ -76,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     source = args.run_of_scene_file(arguments.source)
     mesh = None if arguments.crop is None else mesh_path(arguments.crop)
-    reads = [path for path in (arguments.geo, mesh) if path is not None]
+    reads = [path for path in (arguments.geo, mesh) if path is not None and path != _EXIF]
     edits = _edits(arguments)
     written = edit_scene(source, arguments.out, edits, reads, args.data_root(arguments), _note)
     if written.redrawn is None:
@@ -120,7 +123,8 @@ def _edits(arguments: argparse.Namespace) -> Edits:
             None if arguments.origin is None else point(arguments.origin, "--origin"),
             None if arguments.scale is None else scale_of(arguments.scale),
         ),
-        geo=None if arguments.geo is None else geo_frame(arguments.geo),
+        geo=None if arguments.geo in (None, _EXIF) else geo_frame(arguments.geo),
+        gps=arguments.geo == _EXIF,
         undo=arguments.undo,
         time=arguments.time,
         threads=arguments.threads,

@@ -65,12 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
     """Train as the first of ``processes``, or alone."""
-    begun: Path | None = arguments.begun
-    if begun is not None and arguments.resume is not None:
-        raise DyngsError("--from begins a run, --resume goes on with one: give one of them")
-    begins = [] if begun is None else ["init.kind=scene", f"init.scene={begun}"]
-    words = [*arguments.overrides, *begins, *args.run_device(arguments)]
-    config = parse_config(words, arguments.resume)
+    words = [*arguments.overrides, *args.run_device(arguments)]
+    config = parse_config(words, arguments.resume, arguments.begun)
     args.computing_device(config.run.device)  # where none is, before anything else is done
     if arguments.port is not None and not arguments.view:
         raise DyngsError("--port goes with --view")
@@ -121,10 +117,14 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     return [f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"]
 
 
-def parse_config(words: Sequence[str], resume: Path | None) -> Config:
-    """Return the configuration for the words after ``dyngs train``. Raises DyngsError."""
+def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None = None) -> Config:
+    """Return the configuration for the words after ``dyngs train``; ``begun``: of ``--from``. Raises DyngsError."""
     from dyngs.config.io import load_config, load_resolved
 
+    if begun is not None and resume is not None:
+        raise DyngsError("--from begins a run, --resume goes on with one: give one of them")
+    if begun is not None:
+        words = [*words, "init.kind=scene", f"init.scene={begun}"]
     has_preset = bool(words) and "=" not in words[0]
     preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)
     paths = [word for word in overrides if "=" not in word and Path(word).exists()]

@@ -12,6 +12,7 @@ import torch
 from dyngs.edit.clean import cleaned_file, cleaned_run
 from dyngs.edit.crop import Region, held_by
 from dyngs.edit.frame import Frame, GeoFrame
+from dyngs.edit.gps import gps_frame
 from dyngs.edit.merge import merged
 from dyngs.edit.run_folder import write_edited_run
 from dyngs.errors import DyngsError, counted
@@ -48,6 +49,7 @@ class Edits:
         region: part that is kept, or left out where ``outside``.
         merge: files or runs whose Gaussians are added.
         frame, geo: the frame that all of it gets.
+        gps: ``geo`` is found from the positions in the photos of the run.
         undo: it gets the frame that it had before it was edited first.
         time: in [0, 1], at which a moving scene is written.
         threads: number of them that cleaning takes; 0: one per core.
@@ -59,6 +61,7 @@ class Edits:
     merge: tuple[Path, ...] = ()
     frame: Frame = field(default_factory=Frame)
     geo: GeoFrame | None = None
+    gps: bool = False
     undo: bool = False
     time: float | None = None
     threads: int = 0
@@ -123,6 +126,8 @@ def edit_scene(
     found = _opened(source, data_root)
     for note in found.opened.notes:
         tell(note)
+    if edits.gps:
+        edits = replace(edits, geo=gps_frame(found.opened))
     if edits.max_loss is not None:
         if found.splat is None:
             found = found.kept(cleaned_run(source, edits.max_loss, edits.threads, data_root, tell))

@@ -92,7 +92,7 @@ class Wild(Densifier):
 
 def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_path: Path) -> None:
     """While the set grows, is shaken and ordered anew around it; also from a checkpoint."""
-    config = settled(going_on(capture, run, tmp_path / "new", f"init.box={list(BOX)}"))
+    config = settled(going_on(capture, run, tmp_path / "new", f"init.box={list(BOX)}", "strategy.kind=fixed"))
     first = first_of(config, read_capture(config.data))
     assert first is not None
     assert first.frozen is not None
