@@ -9,7 +9,7 @@ import torch
 
 from dyngs.capture.first_points import with_first_points
 from dyngs.capture.inspection.problems import before_training
-from dyngs.config import Config, ModelSection, PointsInit
+from dyngs.config import Config, ModelSection, PointsInit, RandomInit
 from dyngs.data.capture import Capture
 from dyngs.data.decoding import usual_threads
 from dyngs.data.loader import ImageLoader
@@ -20,6 +20,7 @@ from dyngs.errors import DyngsError, reading
 from dyngs.gaussians.init import surroundings
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
+from dyngs.gaussians.start import FirstGaussians
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.kind import RunStart, kind_of
 from dyngs.models.renderable import Renderable
@@ -46,11 +47,17 @@ from dyngs.training.trainer import Trainer, ViewSampler
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
 
-def build(config: Config, capture: Capture | None = None, *, restored: bool = False) -> Trainable:
+def build(
+    config: Config,
+    capture: Capture | None = None,
+    *,
+    restored: bool = False,
+    first: FirstGaussians | None = None,
+) -> Trainable:
     """Return what the loop steps; see ``assemble`` for arguments and errors."""
     if config.model.is_network:
         return network_trainer(config)
-    return assemble(config, capture, restored=restored)
+    return assemble(config, capture, restored=restored, first=first)
 
 
 def assemble(
@@ -60,6 +67,7 @@ def assemble(
     restored: bool = False,
     images: ImageLoader | None = None,
     held_out: frozenset[int] = frozenset(),
+    first: FirstGaussians | None = None,
 ) -> Trainer[Any]:
     """Return the trainer of a scene: its model begun, nothing trained.
 
@@ -68,6 +76,7 @@ def assemble(
         restored: a checkpoint will be, so that it does not matter where the model begins: no points are triangulated.
         images: the training images of another trainer of the same ones; None: they are opened.
         held_out: indices of training views that are never trained on.
+        first: Gaussians that it goes on from; None: it begins as ``config.init`` says.
     """
     if capture is None:
         capture = read_capture(config.data) if restored else prepared(config)
@@ -81,7 +90,7 @@ def assemble(
     if not priors.masks:
         images = images.without_motion_masks()
     background, extent = resolved_background(config, capture), surroundings(capture).extent
-    model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator))
+    model = kind_of(config.model).start(RunStart(config, asked, capture, images, background, extent, generator, first))
     refinement = _refinement(config, images, extent)  # before what asks the images for corrected cameras
     robust, exposures = _robust(config, capture, images), exposures_of(config.train, images)
     alpha_weight, findings = _alpha_weight(config, capture, images)
@@ -146,7 +155,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
         init = config.init
         if isinstance(init, PointsInit):
             capture, lines = with_first_points(capture, config.data, init)
-        else:
+        elif isinstance(init, RandomInit):
             why = outside_of_cube(capture.splits["train"], init.half_extent)
             lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]
     for line in [] if quiet else [*lines, *before_training(capture)]:

@@ -73,6 +73,7 @@ KINDS = (
     ("colour.kind=network",),
     ("strategy.kind=mcmc",),
     ("init.kind=random",),
+    ("init.kind=scene", "init.scene=x"),
     *(("model.kind=dynamic", f"model.deform.kind={kind}") for kind in ("mlp", "hexplane", "control_nodes")),
 )
 PRESETS = ("static", "dynamic", "human", "human_predictor", "ngp")
@@ -170,7 +171,7 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
         assert not Path(word.partition("=")[2] or word).is_absolute(), f"{command}: a path of one machine"
     overrides = [word for word in getattr(arguments, "overrides", []) if "=" in word]
     if command.verb == "train" and arguments.resume is None:
-        parse_config(arguments.overrides, None)
+        parse_config(arguments.overrides, None, arguments.begun)
     elif command.verb == "tradeoff":
         is_config = arguments.target.startswith("configs/")
         parse_variations(arguments.vary, trains=arguments.train or is_config)

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 
+from dyngs.api.from_scene import first_of
 from dyngs.api.pair_scores import PairScore, after_colour_fit, after_pose_fit, explained, plain
 from dyngs.config import (
     BudgetConfig,
@@ -240,7 +241,7 @@ class _Plan:
 
 
 def _trained(config: Config, capture: Capture, held_out: frozenset[int]) -> GaussianTrainer:
-    trainer = assemble(config, capture, held_out=held_out)
+    trainer = assemble(config, capture, held_out=held_out, first=first_of(config, capture))
     with Interrupts() as interrupts:
         while trainer.done < config.train.steps:
             if interrupts.requested:

@@ -26,6 +26,7 @@ from dyngs.prune.search import MOST_HELD_OUT, Promise, Search
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, latest_checkpoint, save_checkpoint, seconds_at
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import EXPORT_FOLDER, require_empty
+from dyngs.runs.frame import FRAME_NAME
 from dyngs.runs.log import LOG_NAME
 from dyngs.storage.file import write_scene
 
@@ -127,6 +128,6 @@ def unseen_images(config: Config, device: torch.device) -> list[Image]:
 
 
 def _copy_start(run_dir: Path, folder: Path) -> None:
-    for name in (TIMING_NAME, LOG_NAME):
+    for name in (TIMING_NAME, LOG_NAME, FRAME_NAME):
         if (run_dir / name).is_file():
             shutil.copyfile(run_dir / name, folder / name)

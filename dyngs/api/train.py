@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dyngs.api.choose import Choice, choose, write_choices
 from dyngs.api.following import Leader
+from dyngs.api.from_scene import first_of, settled
 from dyngs.budget.cost import CostMeter
 from dyngs.budget.count import count_limit
 from dyngs.budget.run import LimitedRun
@@ -139,7 +140,7 @@ def train(
         return folder
     if resume_from is None:
         with progress() as report:
-            config = with_capture(config, report=report)
+            config = settled(with_capture(config, report=report))
     keep_freed_memory()
     threads = config.run.threads or max(1, num_cores() // processes.local_size)
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
@@ -210,7 +211,8 @@ class _Run:
         watch = Stopwatch()
         if resumed is None:
             require_room(config)
-        trainer = build(config, capture, restored=resumed is not None)
+        first = None if resumed is not None or capture is None else first_of(config, capture)
+        trainer = build(config, capture, restored=resumed is not None, first=first)
         self._held, self._capture = held, capture
         self.folder, self.limits = folder, dict[str, Limit]()
         self.loop = Loop(trainer, config.total_steps, watch, lambda: last_good(self.folder))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from dyngs.edit.scene_file import Edits
 
 _NEGATIVE = re.compile(r"-([xyz]$|\.?\d)")  # values of options that begin with a minus
+_EXIF = Path("exif")
 _EPILOG = """\
 examples:
   dyngs edit runs/room --up auto --scale "0,0,0 1,0,0 1.25m" --out room.ply   upright, in metres
@@ -21,8 +23,10 @@ examples:
   dyngs edit room.ply --crop 0,0,0 1.5 --outside --out rest.ply               all but a sphere
   dyngs edit runs/room --clean --out clean.ply                                without what spoils it, for 0.1 dB at most
   dyngs edit runs/site --geo points.csv --out site.ply                        in the coordinates of control points
+  dyngs edit runs/site --geo exif --out runs/site_m                           north, up and metres by GPS of the photos
   dyngs edit room.ply --merge chair.ply lamp.spz --out all.ply
   dyngs edit table.ply --undo --out before.ply                                the frame of before
+  dyngs edit runs/room --up auto --scale 2 --out runs/upright                 a run: its cameras, motion, exports, too
 
 What is asked for is done in this order: --clean, --crop, --merge, the frame. docs/edit.md explains it.
 """
@@ -34,22 +38,22 @@ def add_parser(commands: args.Commands) -> None:
         "edit",
         run,
         "another frame, a part, cleaned, several in one: a scene as an edited file",
-        "Edit a run or a file of Gaussians, and write the result as another file. Points are given in the coordinates "
-        "of a file, or of the capture of a run. How the frame was changed is stored, so that it can be undone.",
+        "Edit a run or a file of Gaussians, and write the result as another file or run. Points are given in the "
+        "coordinates of a file, or of the capture of a run. How the frame was changed is stored: it can be undone.",
         _EPILOG,
     )
     parser._negative_number_matcher = _NEGATIVE  # else "-1,0,2" would be taken for an option
     parser.add_argument("source", type=args.input_path, metavar="RUN|FILE", help="run folder, or file of Gaussians")
-    about = "file to write, such as a .ply, .spz, .glb, or .4dgs of what moves; the suffix names the format"
-    parser.add_argument("--out", type=args.output_path, required=True, metavar="FILE", help=about)
+    about = "file to write, such as a .ply, .spz, .glb, or .4dgs of what moves; without a suffix the folder of a run"
+    parser.add_argument("--out", type=args.output_path, required=True, metavar="FILE|RUN2", help=about)
     frame = parser.add_argument_group("frame")
     about = "direction that is up: an axis such as -y, x,y,z, or auto, by the cameras of the run"
     frame.add_argument("--up", metavar="DIRECTION", help=about)
     frame.add_argument("--origin", metavar="X,Y,Z", help="point that becomes the origin")
     about = 'factor, or "x,y,z x,y,z LENGTH": two points, and what their distance is to be'
     frame.add_argument("--scale", metavar="FACTOR", help=about)
-    about = "control points: rows of x,y,z in the scene and X,Y,Z in the world, three or more"
-    frame.add_argument("--geo", type=args.input_path, metavar="FILE", help=about)
+    about = "control points: rows of x,y,z in the scene and X,Y,Z in the world, three or more; exif: GPS of the photos"
+    frame.add_argument("--geo", type=args.input_path, metavar="FILE|exif", help=about)
     frame.add_argument("--undo", action="store_true", help="the frame from before the first edit")
     part = parser.add_argument_group("Gaussians")
     about = "what stays: two corners x,y,z x,y,z of a box, centre and radius of a sphere, or the file of a closed mesh"
@@ -75,12 +79,15 @@ def run(arguments: argparse.Namespace) -> int:
 
     source = args.run_of_scene_file(arguments.source)
     mesh = None if arguments.crop is None else mesh_path(arguments.crop)
-    reads = [path for path in (arguments.geo, mesh) if path is not None]
+    reads = [path for path in (arguments.geo, mesh) if path is not None and path != _EXIF]
     edits = _edits(arguments)
     written = edit_scene(source, arguments.out, edits, reads, args.data_root(arguments), _note)
-    print_redrawn(written.notes, [written.redrawn])
-    args.print_written(written.path)
-    if written.path.suffix.lower() == ".ply":
+    if written.redrawn is None:
+        print(f"written: {written.path}")
+    else:
+        print_redrawn(written.notes, [written.redrawn])
+        args.print_written(written.path)
+    if written.redrawn is None or written.path.suffix.lower() == ".ply":
         print(f"next:    dyngs view {as_word(written.path)}")
     return 0
 
@@ -116,7 +123,8 @@ def _edits(arguments: argparse.Namespace) -> Edits:
             None if arguments.origin is None else point(arguments.origin, "--origin"),
             None if arguments.scale is None else scale_of(arguments.scale),
         ),
-        geo=None if arguments.geo is None else geo_frame(arguments.geo),
+        geo=None if arguments.geo in (None, _EXIF) else geo_frame(arguments.geo),
+        gps=arguments.geo == _EXIF,
         undo=arguments.undo,
         time=arguments.time,
         threads=arguments.threads,

@@ -289,7 +289,7 @@ def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[f
     from dyngs.export.splat_files import tracks_of, write_tracks
 
     part = "moving" if arguments.dynamic else "all"
-    tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.info.world_offset, part=part)
+    tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.world, part=part)
     count, moments, _ = tracks.positions.shape
     moving = f"{int(tracks.moving.sum()):,} of them moving"
     args.print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
@@ -330,10 +330,10 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
 
 def _export_avatar(arguments: argparse.Namespace) -> int:
     from dyngs.runs.avatar import write_avatar
-    from dyngs.runs.checkpoint import load_run
+    from dyngs.runs.opened import open_run
 
     path = arguments.out or arguments.run_dir / "avatar.safetensors"
-    args.print_written(write_avatar(load_run(arguments.run_dir), path))
+    args.print_written(write_avatar(open_run(arguments.run_dir).in_own_frame(), path))
     return 0
 
 
@@ -381,7 +381,7 @@ def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
         raise DyngsError(f"{out}: {option} writes one file; give --out {name}")
     if suffix == ".ply" and arguments.motion is not None:
         raise DyngsError("--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb")
-    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
+    opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments))).in_own_frame()
     played = Played(arguments.motion.stem, opened.fps or FRAME_RATE) if arguments.motion is not None else None
     written = (write_rigged_splats if arguments.joints else write_mesh)(opened, out, played)
     args.print_notes(written.notes)
@@ -445,17 +445,17 @@ def _export_page(arguments: argparse.Namespace) -> int:
 def _export_cameras(arguments: argparse.Namespace) -> int:
     """Write the cameras of a run as a transforms.json, refined where training refined them."""
     from dyngs.data.capture import all_views
-    from dyngs.data.read import read_capture
     from dyngs.export.cameras import NAME, write_cameras
-    from dyngs.runs.checkpoint import found_corrections, load_run
+    from dyngs.runs.checkpoint import found_corrections
+    from dyngs.runs.opened import open_run
 
     source: Path = arguments.run_dir
     if args.is_avatar_file(source):
         raise DyngsError(f"{source}: an avatar file has no cameras; give a run")
     out: Path = arguments.out or source / "cameras"
     path = out if out.suffix.lower() == ".json" else out / NAME
-    run = load_run(source, args.data_root(arguments))
-    capture = read_capture(run.config.data)
+    run = open_run(source, data_root=args.data_root(arguments))
+    capture = run.capture
     if path.resolve().parent == capture.root.resolve():
         raise DyngsError(f"{path}: would stand in for the cameras of the capture; give another folder")
     found = found_corrections(source, run, capture.splits["train"])
@@ -469,7 +469,7 @@ def _export_cameras(arguments: argparse.Namespace) -> int:
         args.print_notes(
             ("training cameras as training found them; others have the capture's poses, and known lenses",)
         )
-    written = write_cameras(path, capture, splits)
+    written = write_cameras(path, capture, splits, run.world)
     count, root = counted(len(all_views(capture.splits)), "camera"), as_word(path.parent)
     print(f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them")
     return 0

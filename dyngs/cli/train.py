@@ -27,6 +27,7 @@ examples:
   dyngs train --resume runs/bench
   dyngs train --resume runs/bench train.steps=60000
   dyngs train configs/static.yaml data.root=scans/bench --view
+  dyngs train configs/static.yaml data.root=scans/bench --from runs/bench init.trains=colour run.dir=runs/recoloured
   torchrun --nproc-per-node 4 -m dyngs train configs/static.yaml data.root=scans/bench
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
@@ -46,6 +47,8 @@ def add_parser(commands: args.Commands) -> None:
     args.add_overrides(parser, "CONFIG key=value", "preset or YAML file, and overrides")
     resume = "continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one"
     parser.add_argument("--resume", type=args.input_path, metavar="RUN", help=resume)
+    about = "begin with the Gaussians of a scene; init.trains=colour, init.box=[x,y,z,x,y,z] freeze a part of it"
+    parser.add_argument("--from", dest="begun", type=args.input_path, metavar="RUN|FILE", help=about)
     parser.add_argument("--view", action="store_true", help="show the scene in a browser while it trains")
     add_serving_arguments(parser)
     args.add_run_device(parser)
@@ -62,7 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
     """Train as the first of ``processes``, or alone."""
-    config = parse_config([*arguments.overrides, *args.run_device(arguments)], arguments.resume)
+    words = [*arguments.overrides, *args.run_device(arguments)]
+    config = parse_config(words, arguments.resume, arguments.begun)
     args.computing_device(config.run.device)  # where none is, before anything else is done
     if arguments.port is not None and not arguments.view:
         raise DyngsError("--port goes with --view")
@@ -113,10 +117,14 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     return [f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"]
 
 
-def parse_config(words: Sequence[str], resume: Path | None) -> Config:
-    """Return the configuration for the words after ``dyngs train``. Raises DyngsError."""
+def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None = None) -> Config:
+    """Return the configuration for the words after ``dyngs train``; ``begun``: of ``--from``. Raises DyngsError."""
     from dyngs.config.io import load_config, load_resolved
 
+    if begun is not None and resume is not None:
+        raise DyngsError("--from begins a run, --resume goes on with one: give one of them")
+    if begun is not None:
+        words = [*words, "init.kind=scene", f"init.scene={begun}"]
     has_preset = bool(words) and "=" not in words[0]
     preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)
     paths = [word for word in overrides if "=" not in word and Path(word).exists()]

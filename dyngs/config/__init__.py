@@ -3,7 +3,7 @@
 from dyngs.config.keys.colour import AutoColour, ColourSection, NetworkColour, ShColour
 from dyngs.config.keys.config import BudgetConfig, CameraConfig, Config, PruneConfig, RunConfig
 from dyngs.config.keys.data import DataConfig
-from dyngs.config.keys.start import PointsInit, RandomInit
+from dyngs.config.keys.start import PointsInit, RandomInit, SceneInit
 from dyngs.config.keys.strategy import DefaultStrategy, FixedStrategy, McmcStrategy, OptimConfig, Strategy
 from dyngs.config.keys.train import TrainConfig
 from dyngs.deform.keys import (
@@ -50,6 +50,7 @@ __all__ = [
     "PruneConfig",
     "RandomInit",
     "RunConfig",
+    "SceneInit",
     "SceneModel",
     "Section",
     "ShColour",

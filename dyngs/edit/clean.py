@@ -13,19 +13,18 @@ from torch import Tensor
 
 from dyngs.api.prune import unseen_images
 from dyngs.api.train import num_cores
-from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.data.loader import Image
+from dyngs.edit.run_folder import at_end
 from dyngs.errors import DyngsError, counted
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.kinds import GaussianTrainer, assemble
+from dyngs.kinds import GaussianTrainer
 from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FEWEST_VIEWS, floaters
 from dyngs.prune.search import evenly_held_out
 from dyngs.prune.stage import importance, quality_of, scoring_views
-from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
 
 NEEDLE = 20.0  # longest axis over the second longest
 VEIL, LARGE = 0.1, 4.0  # opacity below which large Gaussians veil what is behind; size over the median size
@@ -101,7 +100,7 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
     if not config.model.made_of_gaussians:
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to clean")
     with kernel_threads(threads or num_cores()), deterministic(device_for(config.run.device), True), torch.no_grad():
-        trainer = _at_end(config, run_dir)
+        trainer = at_end(config, run_dir)
         unseen = unseen_images(config, trainer.device)
         held = () if unseen else evenly_held_out(len(trainer.images))
         if not unseen and not held:
@@ -115,18 +114,6 @@ def cleaned_run(run_dir: Path, max_loss: float, threads: int, data_root: Path | 
         lost = f"{max(judge.loss_of(kept), 0):.3f} of {max_loss:g} dB lost, with training views"
         tell(f"{gone}; {cost}; {lost}")
         return kept.cpu()
-
-
-def _at_end(config: Config, run_dir: Path) -> GaussianTrainer:
-    """Return the trainer of a run where it ended; without checkpoints with nothing but its scene."""
-    trainer: GaussianTrainer = assemble(config, restored=True)
-    if has_only_scene_file(run_dir):
-        scene = load_run(run_dir, config.data.root).scene.to(trainer.device)
-        trainer.model.begin_with(scene, trainer.model.training)
-        trainer.model.exchange(scene)
-    else:
-        trainer.restore(latest_checkpoint(run_dir))
-    return trainer
 
 
 def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> list[Suspects]:

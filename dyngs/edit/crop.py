@@ -17,6 +17,7 @@ from dyngs.edit.frame import Point, number, point
 from dyngs.errors import DyngsError, printable, reading, require_regular
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.splats.similarity import Similarity
 
 _TIMES = 24
 _AT_ONCE = 1_000_000  # pairs of a point and a triangle
@@ -91,7 +92,7 @@ def region_of(words: Sequence[str]) -> Region:
     """
     text = " ".join(words)
     parts = text.split()
-    if "," not in parts[0] or mesh_path(words) is not None:
+    if not parts or "," not in parts[0] or mesh_path(words) is not None:
         return read_mesh(Path(text))
     if len(parts) != 2:
         shown = printable(repr(text), 60)
@@ -137,14 +138,14 @@ def read_mesh(path: Path) -> ClosedMesh:
     return ClosedMesh(corners)
 
 
-def held_by(region: Region, scene: GaussianScene, offset: np.ndarray) -> Tensor:
+def held_by(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
     """Return (N,) bool which Gaussians have their centre in ``region``, at one training time or more.
 
-    ``offset``: (3,) to be added to positions for those that ``region`` means.
+    ``world``: from positions of the scene to those that ``region`` means.
     """
     times = scene.times if not scene.is_static else ()
     moments = [times[i] for i in evenly_spaced(len(times), _TIMES)] or [None]
     found = np.zeros(len(scene), bool)
     for time in moments:
-        found |= region.holds(scene.at(time).means.double().cpu().numpy() + offset)
+        found |= region.holds(world.points(scene.at(time).means.cpu().numpy()))
     return torch.from_numpy(found)

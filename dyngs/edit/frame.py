@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.data.scene_space import HARMLESS_DISTANCE, MAX_DISTANCE, MAX_DISTANCE_PER_SPREAD
-from dyngs.errors import DyngsError, counted, printable, require_regular
+from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.limits import require_at_most
 from dyngs.splats.rotation import AXES, turn_between
 from dyngs.splats.similarity import Similarity, fitted
-from dyngs.splats.splat_file import GEO_OFFSET
+from dyngs.splats.splat_file import geo_comment
 
 _FACTORS = (1e-9, 1e9)
 _MOST_BYTES = 1 << 20  # of a file of control points
@@ -117,32 +117,35 @@ def scale_of(text: str) -> float | Distance:
 
 @dataclass(frozen=True)
 class GeoFrame:
-    """Control points, and what follows from them.
+    """Control points, or positions of photos, and what follows from them.
 
     Attributes:
         similarity: from the scene to the file.
         offset: (3,) to be added to positions in the file for those in the world: 0, unless these are too large for
             float32.
         residuals: (P,) distances in the world that remain.
+        what, notes: what the points are, and lines about them.
     """
 
     similarity: Similarity
     offset: Point
     residuals: np.ndarray
+    what: str = "control points"
+    notes: tuple[str, ...] = ()
 
     @property
     def lines(self) -> tuple[str, ...]:
         """Lines about the result for people."""
         each = ", ".join(f"{x:.3g}" for x in self.residuals[:12]) + (", ..." if len(self.residuals) > 12 else "")
         mean = math.sqrt(float(np.square(self.residuals).mean()))
-        points = counted(len(self.residuals), "control point")
-        found = f"{points}: scale {self.similarity.scale:.6g}; residuals {each}; root mean square {mean:.3g}"
-        return (found, self.comment) if any(self.offset) else (found,)
+        count = f"{len(self.residuals):,} {self.what}"
+        found = f"{count}: scale {self.similarity.scale:.6g}; residuals {each}; root mean square {mean:.3g}"
+        return (found, *self.notes, *([self.comment] if any(self.offset) else []))
 
     @property
     def comment(self) -> str:
         """What the header of the file says of the offset."""
-        return f"{GEO_OFFSET} " + " ".join(f"{x:.10g}" for x in self.offset)
+        return geo_comment(self.offset)
 
 
 def geo_frame(path: Path) -> GeoFrame:

@@ -1,4 +1,4 @@
-"""One command's edits of a run or a file of Gaussians, in their order, and the file that they end in."""
+"""One command's edits of a run or a file of Gaussians, in their order, and the file or run that they end in."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ import torch
 from dyngs.edit.clean import cleaned_file, cleaned_run
 from dyngs.edit.crop import Region, held_by
 from dyngs.edit.frame import Frame, GeoFrame
+from dyngs.edit.gps import gps_frame
 from dyngs.edit.merge import merged
+from dyngs.edit.run_folder import write_edited_run
 from dyngs.errors import DyngsError, counted
 from dyngs.export.redrawn import Redrawn, compare_run, compare_splats
 from dyngs.export.splat_files import SUFFIX, UP, Writing, read_moment, splats_at, up_of, write_moving
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.runs.frame import RunFrame
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened, open_scene, opened_scene
 from dyngs.splats.formats import (
@@ -46,6 +49,7 @@ class Edits:
         region: part that is kept, or left out where ``outside``.
         merge: files or runs whose Gaussians are added.
         frame, geo: the frame that all of it gets.
+        gps: ``geo`` is found from the positions in the photos of the run.
         undo: it gets the frame that it had before it was edited first.
         time: in [0, 1], at which a moving scene is written.
         threads: number of them that cleaning takes; 0: one per core.
@@ -57,6 +61,7 @@ class Edits:
     merge: tuple[Path, ...] = ()
     frame: Frame = field(default_factory=Frame)
     geo: GeoFrame | None = None
+    gps: bool = False
     undo: bool = False
     time: float | None = None
     threads: int = 0
@@ -64,29 +69,40 @@ class Edits:
 
 @dataclass(frozen=True)
 class EditedFile:
-    """A file that was written, how it differs from the edited scene when drawn, and what the format does not hold."""
+    """A file that was written, how it differs from the edited scene when drawn, and what the format does not hold.
+
+    Of a run, which holds all of it, there is only the path.
+    """
 
     path: Path
-    redrawn: Redrawn
-    notes: tuple[str, ...]
+    redrawn: Redrawn | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class _Source:
-    """What is edited: a scene; of a file also its contents, and what is up in files of its format by default."""
+    """What is edited: a scene; of a file also its contents, and what is up in files of its format by default.
+
+    ``rows``: (N,) indices of the Gaussians that are left, of a run; None: all.
+    """
 
     opened: Opened
     splat: SplatFile | None = None
     usual: str | None = None
+    rows: torch.Tensor | None = None
 
     @property
-    def offset(self) -> np.ndarray:
-        """(3,) to be added to positions for those that people give: of a run, those of its capture."""
-        return np.zeros(3) if self.splat is not None else self.opened.world_offset
+    def fixed(self) -> bool:
+        """Whether its axes stay, as control points have left them."""
+        if self.splat is not None:
+            return self.splat.up != self.usual
+        return self.opened.edited is not None and self.opened.edited.fixed
 
     def kept(self, rows: torch.Tensor) -> _Source:
         """Return the Gaussians where ``rows`` (N,) is true."""
-        return replace(self, opened=self.opened.showing(self.opened.scene.select(rows.to(self.opened.scene.device))))
+        scene: GaussianScene = self.opened.scene
+        before = torch.arange(len(scene)) if self.rows is None else self.rows
+        return replace(self, opened=self.opened.showing(scene.select(rows.to(scene.device))), rows=before[rows.cpu()])
 
     def at(self, time: float) -> SplatFile:
         """Return the Gaussians of one time, in the axes of the source."""
@@ -98,24 +114,40 @@ class _Source:
 def edit_scene(
     source: Path, out: Path, edits: Edits, reads: Sequence[Path] = (), data_root: Path | None = None, tell: Tell = print
 ) -> EditedFile:
-    """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the format.
+    """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the format, none is a run.
 
     ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done, and nothing is written.
     """
     moves = out.name.lower().endswith(SUFFIX)
-    if known_format(out) is None and not moves:
-        raise DyngsError(f"{out}: edits end in a file of Gaussians; give a name in {all_suffixes()} or {SUFFIX}")
+    if known_format(out) is None and not moves and out.suffix:
+        wanted = f"give a name in {all_suffixes()} or {SUFFIX}, or without a suffix for a run"
+        raise DyngsError(f"{out}: edits end in a file of Gaussians or a run; {wanted}")
     inputs_of(source, *edits.merge, *reads).require_output(out)
     found = _opened(source, data_root)
     for note in found.opened.notes:
         tell(note)
+    if edits.gps:
+        edits = replace(edits, geo=gps_frame(found.opened))
     if edits.max_loss is not None:
         if found.splat is None:
             found = found.kept(cleaned_run(source, edits.max_loss, edits.threads, data_root, tell))
         else:
             found = found.kept(cleaned_file(found.opened.scene.gaussians, tell))
     found = _cropped(found, source, edits, tell)
+    if not out.suffix:
+        return EditedFile(_written_run(found, source, out, edits, data_root, tell))
     return _written_moving(found, out, edits, tell) if moves else _written(found, out, edits, tell)
+
+
+def write_part(opened: Opened, rows: torch.Tensor, out: Path, time: float | None = None) -> EditedFile:
+    """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of the format.
+
+    Raises DyngsError: it was opened from no file or run, or cannot be written.
+    """
+    if opened.path is None:
+        raise DyngsError("this scene has no file or run of its own yet, so it cannot be edited")
+    found = _opened(opened.path, None) if opened.captured is None else _Source(opened)
+    return _written(found.kept(rows), out, Edits(time=time), lambda _: None)
 
 
 def _opened(source: Path, data_root: Path | None) -> _Source:
@@ -130,12 +162,11 @@ def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
     if edits.region is None:
         return found
     scene: GaussianScene = found.opened.scene
-    rows = held_by(edits.region, scene, found.offset) ^ edits.outside
+    rows = held_by(edits.region, scene, found.opened.world) ^ edits.outside
     count = int(rows.sum())
     if not count:
-        low, high = (
-            ", ".join(f"{x:.4g}" for x in end.tolist()) for end in scene.bounds.double().cpu().numpy() + found.offset
-        )
+        points = found.opened.world.points(scene.at(None).means.cpu().numpy())
+        low, high = (", ".join(f"{x:.4g}" for x in end.tolist()) for end in (points.min(0), points.max(0)))
         raise DyngsError(
             f"{source}: --crop leaves none of {counted(len(scene), 'Gaussian')}; they lie between {low} and {high}"
         )
@@ -183,6 +214,27 @@ def _written_moving(found: _Source, out: Path, edits: Edits, tell: Tell) -> Edit
     return EditedFile(out, redrawn, written.notes)
 
 
+def _written_run(found: _Source, source: Path, out: Path, edits: Edits, data_root: Path | None, tell: Tell) -> Path:
+    """Write a run, which keeps all that it has learned."""
+    opened = found.opened
+    if opened.captured is None or edits.merge or edits.time is not None:
+        what = "a run of its own, of a run, without --merge and --time"
+        raise DyngsError(f"{out}: a name without a suffix is {what}; give a name in {all_suffixes()}")
+    frame = opened.edited
+    if edits.undo:
+        if frame is None:
+            raise DyngsError("--undo: the frame of this run was not edited")
+        frame = None
+        tell("the frame is that of before the first edit")
+    elif _has_frame(edits):
+        how, up = _frame(found, edits, _up(found, edits.frame), "z")
+        offset = (0.0, 0.0, 0.0) if edits.geo is None else edits.geo.offset
+        fixed = edits.geo is not None or (found.fixed and edits.frame.up is None)
+        frame = RunFrame(how.after(opened.frame), offset, up, fixed)
+        _tell_frame(edits, up, "z", tell)
+    return write_edited_run(source, out, found.rows, frame, data_root)
+
+
 def _has_frame(edits: Edits) -> bool:
     return edits.geo is not None or edits.frame != Frame()
 
@@ -195,7 +247,7 @@ def _up(found: _Source, frame: Frame) -> tuple[float, ...] | None:
         known = None if found.splat is not None else found.opened.up
         if known is None:
             raise DyngsError("--up auto needs the cameras of a run, and there are none; give the direction, as --up=-y")
-        return tuple(known[0].tolist())
+        return tuple((found.opened.frame.rotation @ known[0]).tolist())
     known_axis = up_of(found.opened)
     return None if known_axis is None else known_axis[0]
 
@@ -205,12 +257,12 @@ def _frame(
 ) -> tuple[Similarity, str | None]:
     """Return the similarity to the frame that is asked for, and what is up there; ``wanted``: up for viewers."""
     if edits.geo is not None:
-        x, y, z = found.offset.tolist()
+        x, y, z = found.opened.world_offset.tolist()
         return edits.geo.similarity.after(Similarity(shift=(x, y, z))), "z"
-    x, y, z = (np.array(edits.frame.origin or (0.0, 0.0, 0.0)) - found.offset).tolist()
+    x, y, z = (np.array(edits.frame.origin or (0.0, 0.0, 0.0)) - found.opened.world_offset).tolist()
     frame = edits.frame if edits.frame.origin is None else replace(edits.frame, origin=(x, y, z))
-    if found.splat is not None and found.splat.up != found.usual and frame.up is None:  # as control points leave it
-        return frame.similarity(None, ()), found.splat.up
+    if found.fixed and frame.up is None:
+        return frame.similarity(None, ()), found.opened.stated_up
     return frame.similarity(direction, axis_of(wanted)), None if direction is None else wanted
 
 
@@ -223,4 +275,4 @@ def _tell_frame(edits: Edits, up: str | None, wanted: str, tell: Tell) -> None:
     elif up is None:
         tell("nothing says which way is up, so nothing is turned; --up tells it")
     else:
-        tell(f"up is {up} in the file")
+        tell(f"up is {up} in what is written")

@@ -20,6 +20,7 @@ from dyngs.ops.quaternions import shorter_ways, unit_quats
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.gltf import EXTENSION, add_gaussians
+from dyngs.splats.similarity import Similarity
 from dyngs.splats.splat_file import SplatFile, require_writable, unit_rotations, with_degree
 
 SUFFIX = ".glb"
@@ -55,7 +56,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     gaussians = with_degree(gaussians, min(gaussians.sh_degree, _MOST_DEGREE))
     labels = torch.full((len(scene),), -1, device=scene.moving.device).index_copy(0, scene.moving, field.rest.labels)
     moments = np.linspace(0.0, 1.0, _STEPS_PER_TIME * max(len(scene.times) - 1, 1) + 1)
-    here, there = _poses(field, [time], how), _poses(field, moments, how)
+    here, there = _poses(field, [time], splat.frame), _poses(field, moments, splat.frame)
     document, nodes, meshes, channels = GlbDocument(), [], [], []
     for body in range(-1, len(field.rest.centers)):
         own = gaussians.picked(torch.nonzero(labels == body)[:, 0])
@@ -97,10 +98,10 @@ class _Poses:
         return Rotation.from_quat(self.quats[:, body])
 
 
-def _poses(field: BodyField, times: Sequence[float] | np.ndarray, how: Writing) -> _Poses:
-    axes = Rotation.from_quat(np.asarray(how.turn)[[1, 2, 3, 0]])
+def _poses(field: BodyField, times: Sequence[float] | np.ndarray, frame: Similarity) -> _Poses:
+    axes = Rotation.from_quat(np.asarray(frame.turn)[[1, 2, 3, 0]])
     found = [field.poses(float(time)) for time in times]
     places = torch.stack([place for place, _ in found]).double().numpy()
     quats = unit_quats(torch.stack([quat for _, quat in found])).double().numpy()[..., [1, 2, 3, 0]]
     turned = (axes * Rotation.from_quat(quats.reshape(-1, 4))).as_quat()
-    return _Poses(axes.apply(places.reshape(-1, 3)).reshape(places.shape), turned.reshape(quats.shape))
+    return _Poses(frame.points(places), turned.reshape(quats.shape))

@@ -14,40 +14,46 @@ from dyngs.data.geometry import opengl_from_cam
 from dyngs.files.write import atomic_file, write_text
 from dyngs.runs.inputs import inputs_of
 from dyngs.splats.ply_header import header_bytes
+from dyngs.splats.similarity import Similarity
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
-def write_cameras(path: Path, capture: Capture, splits: Mapping[Split, Sequence[View]]) -> Path:
+def write_cameras(
+    path: Path, capture: Capture, splits: Mapping[Split, Sequence[View]], world: Similarity | None = None
+) -> Path:
     """Write cameras of train, val and test in nerfstudio's layout, and the capture's points; return ``path``.
 
-    ``file_path`` is the way to the images from the folder of ``path``. Poses are in the world of the capture's files;
-    coefficients of distortion are those of the capture.
+    ``file_path`` is the way to the images from the folder of ``path``. Poses are moved by ``world``; without it they
+    are in the world of the capture's files. Coefficients of distortion are those of the capture.
     """
     for out in (path, path.with_name(POINTS_NAME)):
         inputs_of(capture).require_output(out)
+    if world is None:
+        x, y, z = capture.world_offset.tolist()
+        world = Similarity(shift=(x, y, z))
     folder = Path(os.path.abspath(path.parent))
     frames: list[dict[str, object]] = []
     content: dict[str, object] = {}
     for split, views in splits.items():
-        own = [_frame(view, folder, capture) for view in views]
+        own = [_frame(view, folder, capture, world) for view in views]
         content[f"{split}_filenames"] = [frame["file_path"] for frame in own]
         frames += own
     if capture.fps is not None:
         content["fps"] = capture.fps
     if capture.points is not None:
-        _write_points(path.with_name(POINTS_NAME), capture.points, capture.world_offset)
+        _write_points(path.with_name(POINTS_NAME), capture.points, world)
         content["ply_file_path"] = POINTS_NAME
     write_text(path, json.dumps(content | {"frames": frames}, indent=1) + "\n")
     return path
 
 
-def _frame(view: View, folder: Path, capture: Capture) -> dict[str, object]:
+def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dict[str, object]:
     """Return the entry of a view; its files are named as seen from ``folder``."""
     pose = opengl_from_cam(view.cam_from_world)
-    pose[:3, 3] += capture.world_offset
+    pose[:3] = np.concatenate([world.rotation @ pose[:3, :3], world.points(pose[:3, 3])[:, None]], axis=1)
     first, last = capture.span or (0.0, 1.0)
     (fx, _, cx), (_, fy, cy) = (view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1])).tolist()[:2]
     frame: dict[str, object] = {
@@ -88,11 +94,11 @@ def _way(file: Path, folder: Path) -> str:
         return file.as_posix()
 
 
-def _write_points(path: Path, points: PointCloud, offset: np.ndarray) -> None:
+def _write_points(path: Path, points: PointCloud, world: Similarity) -> None:
     colours = ("red", "green", "blue")
     rows = np.empty(len(points.xyz), dtype=[*((name, "<f8") for name in "xyz"), *((name, "u1") for name in colours)])
-    for i, name in enumerate("xyz"):
-        rows[name] = points.xyz[:, i] + offset[i]
+    for name, values in zip("xyz", world.points(points.xyz).T, strict=True):
+        rows[name] = values
     for i, name in enumerate(colours):
         rows[name] = points.rgb[:, i]
     properties = [*(("double", name) for name in "xyz"), *(("uchar", name) for name in colours)]

@@ -20,7 +20,7 @@ from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, cameras_for_paths, split_views
-from dyngs.splats.rotation import AXES, with_scene
+from dyngs.splats.rotation import AXES
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
@@ -144,7 +144,7 @@ def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
         found = _placed(opened, name, options)
     else:
         found = read_path(file, opened.world_offset)
-        found = replace(found, cameras=with_scene(found.cameras, opened.turned))
+        found = replace(found, cameras=opened.frame.inverse().cameras(found.cameras))
     if options.times is None:
         return found
     times = options.times * len(found) if len(options.times) == 1 else options.times
@@ -154,7 +154,7 @@ def _moving(opened: Opened, name: str, options: PathOptions) -> CameraPath:
 def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by the scene."""
     frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(opened.renderable.times))
-    up = None if opened.stated_up is None else np.array(AXES[opened.stated_up])
+    up = None if opened.stated_up is None else opened.direction_of(opened.stated_up)
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
         if name == "orbit":

@@ -16,6 +16,7 @@ from dyngs.kinds import restored_scene
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
+from dyngs.runs.frame import read_frame, write_frame
 from dyngs.runs.inputs import inputs_of
 from dyngs.storage.file import decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
@@ -61,6 +62,9 @@ def write_scene_file(
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
             write_config(config, folder)
+            frame = read_frame(run_dir)
+            if frame is not None:
+                write_frame(folder, frame)
     return SceneFile(out / SCENE_FILE, precision, len(data), num_bytes_exact(scene))
 
 

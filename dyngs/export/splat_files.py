@@ -25,7 +25,7 @@ from dyngs.runs.opened import Opened
 from dyngs.splats.formats import Written, moved_file, turned_file, write_splats
 from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
 from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.splat_file import SplatFile, drawable, from_linear, unit_rotations
+from dyngs.splats.splat_file import SplatFile, drawable, from_linear, geo_comment, unit_rotations
 
 Part = Literal["all", "moving", "still"]
 
@@ -34,7 +34,7 @@ Part = Literal["all", "moving", "still"]
 class Writing:
     """How Gaussians are written."""
 
-    # unit quaternion wxyz, from the axes of the capture to those of the file
+    # unit quaternion wxyz, from the axes of the capture, or of the frame of an edited run, to those of the file
     turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     up: str | None = None  # axis that then points up, such as "-y"; None: not known
     sh_degree: int | None = None  # degree of the harmonics in the file; None: as they are, up to what the format holds
@@ -52,8 +52,12 @@ def writing_of(
     ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep": nothing is turned.
     ``from_up``: axis that is up in the scene; None: found as ``up_of`` does. Raises DyngsError: no such axis.
     """
-    if up == "keep":
-        return Writing(sh_degree=sh_degree), "axes are those of the capture"
+    edited = opened.edited
+    if up == "keep" or (edited is not None and edited.fixed and up is None):
+        if edited is None:
+            return Writing(sh_degree=sh_degree), "axes are those of the capture"
+        said = f", {edited.up} up" if edited.up is not None else ""
+        return Writing(up=edited.up, sh_degree=sh_degree), f"axes are those of the edit{said}"
     found = (axis_of(from_up), "--from-up") if from_up is not None else up_of(opened)
     wanted = target if up is None else up
     if found is None:
@@ -62,16 +66,22 @@ def writing_of(
     direction, who = found
     name = nearest_axis(direction)
     here = name if name is not None and AXES[name] == tuple(direction) else "a slanted direction"
-    turned = "the axes of the capture are kept" if here == wanted else f"turned, it was {here} in the capture"
+    frame = "capture" if edited is None else "edited run"
+    turned = f"the axes of the {frame} are kept" if here == wanted else f"turned, it was {here} in the {frame}"
     how = Writing(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
 def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
-    """Return the direction (3,) that is up and what says so: an axis where one is within 30 degrees; None: nothing."""
+    """Return the direction (3,) that is up and what says so: an axis where one is within 30 degrees; None: nothing.
+
+    In the axes in which ``splats_at`` gives the scene as it is.
+    """
     if opened.up is None:
         return None
     found, who = opened.up
+    if opened.edited is not None:
+        found = opened.frame.rotation @ found
     name = nearest_axis(tuple(found.tolist()))
     return (tuple(found.tolist()) if name is None else AXES[name]), who
 
@@ -143,7 +153,10 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = AS_THEY_ARE) -> SplatFile:
-    """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked for."""
+    """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked for.
+
+    A run that was edited is in its frame, which the file can undo.
+    """
     model = opened.config.model
     with torch.no_grad():
         moment = scene.time_step(time)
@@ -155,6 +168,10 @@ def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = 
         comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     x, y, z = opened.info.world_offset
     splat = SplatFile(gaussians.detach(), model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
+    if opened.edited is not None:
+        splat = moved_file(splat, opened.frame, opened.edited.up)
+        if any(opened.edited.offset):
+            splat = replace(splat, comments=(*splat.comments, geo_comment(opened.edited.offset)))
     splat = turned_file(splat, how.turn, how.up)
     return splat if how.edit == UNMOVED else moved_file(splat, how.edit, how.up)
 
@@ -185,8 +202,8 @@ MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in me
 class Tracks:
     """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays of the file."""
 
-    # (N, T, 3) in the coordinates of the capture, float32; float64 if the scene was rebased because it is far from its
-    # origin, where float32 is too coarse
+    # (N, T, 3) in the coordinates of the capture, or of the frame of an edited run, float32; float64 if the scene was
+    # rebased because it is far from its origin, where float32 is too coarse, or edited
     positions: np.ndarray
     times: np.ndarray  # (T,) float64 in [0, 1]
     moving: np.ndarray  # (N,) bool, false if the position never changes
@@ -194,9 +211,9 @@ class Tracks:
 
 
 def tracks_of(
-    scene: GaussianScene, times: Sequence[float], world_offset: Sequence[float] = (0.0, 0.0, 0.0), *, part: str = "all"
+    scene: GaussianScene, times: Sequence[float], frame: Similarity = UNMOVED, *, part: str = "all"
 ) -> Tracks:
-    """Return the tracks of a scene, or with ``part`` "moving" of what moves, in coordinates of the capture.
+    """Return the tracks of a scene, or with ``part`` "moving" of what moves, moved by ``frame`` to what people mean.
 
     Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
     """
@@ -205,7 +222,7 @@ def tracks_of(
     moves[scene.rows] = not scene.is_static
     moving = scene_part(scene, "moving") if part == "moving" or not scene.is_static else None
     ids = torch.nonzero(moves)[:, 0] if part == "moving" else torch.arange(len(scene), device=device)
-    kind = np.float64 if any(world_offset) else np.float32
+    kind = np.float32 if frame == UNMOVED else np.float64
     size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
     if size > MAX_BYTES:
         raise DyngsError(
@@ -218,8 +235,8 @@ def tracks_of(
         rows = moves[ids].numpy()
         for k, time in enumerate(times):
             positions[rows, k] = moving.at(time).means.numpy()
-    if any(world_offset):
-        positions += np.asarray(world_offset)
+    if frame != UNMOVED:
+        positions = frame.points(positions)
     return Tracks(positions, np.array(times, np.float64), moves[ids].numpy(), ids.numpy())
 
 

@@ -62,7 +62,7 @@ class Cut:
 
 
 def write_surface(opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | None = None) -> Surface:
-    """Write the surface of a scene at ``time`` in the capture's own coordinates, and return it.
+    """Write the surface of a scene at ``time`` in the coordinates of its capture or its edit, and return it.
 
     Raises DyngsError: a person, a suffix of no mesh, an option of another kind, no capture where that is needed, or no
     surface is there.
@@ -75,7 +75,7 @@ def write_surface(opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | No
     import trimesh
 
     surface = _surface(opened, time, cut)
-    vertices = surface.vertices + opened.world_offset
+    vertices = opened.world.points(surface.vertices)
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, surface.faces, vertex_colors=colours, process=False)
     with atomic_file(out) as temporary:

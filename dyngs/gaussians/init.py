@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dyngs.capture.first_points import AROUND_ORIGIN
-from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, Strategy
+from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, SceneInit, Strategy
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import Capture, View
 from dyngs.data.scene_space import MIN_VIEWS, outside_of_cube, points_in_frusta
@@ -84,7 +84,7 @@ def surroundings(capture: Capture) -> Surroundings:
 
 def initial_gaussians(
     scene: Surroundings,
-    options: PointsInit | RandomInit,
+    options: PointsInit | RandomInit | SceneInit,
     start: StartValues,
     sh_degree: int,
     generator: torch.Generator,
@@ -108,7 +108,7 @@ def initial_gaussians(
 
 
 def _random_points(
-    scene: Surroundings, options: PointsInit | RandomInit, max_points: int, generator: torch.Generator
+    scene: Surroundings, options: PointsInit | RandomInit | SceneInit, max_points: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Positions (N, 3) float64, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
     count = min(options.num_random, max_points)

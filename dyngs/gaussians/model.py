@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.config import AutoColour, Config, DefaultStrategy, SceneModel
+from dyngs.config import AutoColour, Config, DefaultStrategy, SceneInit, SceneModel
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
@@ -17,7 +17,7 @@ from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, TrainingLooks
 from dyngs.gaussians.colour.view_dependence import MeasuredView
 from dyngs.gaussians.densify import Densifier
-from dyngs.gaussians.optimizer import GaussianOptimizer
+from dyngs.gaussians.optimizer import GaussianOptimizer, Still
 from dyngs.gaussians.order import morton_order
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
@@ -65,6 +65,10 @@ class SceneTraining(Generic[S]):
 
     def resting(self, scene: S) -> Tensor | None:
         """Return the indices of the Gaussians that stay as they are in steps that do not show them; None: of none."""
+        return None
+
+    def still(self) -> Still | None:
+        """Return what stays as it is, whatever the images say."""
         return None
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
@@ -201,13 +205,15 @@ class GaussianModel(Model[GaussianScene]):
         before, generator = self._optimizer.parameters, self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
         frozen, dense = self.colours.frozen_rest(), self.densifier.touches_all
-        resting = self.training.resting(self._scene)
-        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen, resting=resting)
+        resting, still = self.training.resting(self._scene), self.training.still()
+        bad = self._optimizer.step(step, lr_means, dense=dense, frozen_rest=frozen, resting=resting, still=still)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:
+            if still is not None:
+                result = still.grown(result, self._optimizer.parameters)
             self._apply(self._in_memory_order(result))
-        self.densifier.perturb(self._optimizer.parameters, lr_means, generator)
+        self._perturb(lr_means)
         self._scene = self.training.after_step(self._scene, step, result is not None)
         revised = self.training.revised(self._scene, step)
         if revised is not None:
@@ -217,6 +223,14 @@ class GaussianModel(Model[GaussianScene]):
         self._scene.changed()
         text = "; ".join(text for text in findings if text) or None
         return Updated(bad, text, self._optimizer.parameters is not before)
+
+    def _perturb(self, lr_means: float) -> None:
+        """Let the strategy shake the Gaussians, but for those that stay as they are."""
+        still, means = self.training.still(), self._optimizer.parameters.means
+        kept = None if still is None or still.rows is None else means.detach()[still.rows]
+        self.densifier.perturb(self._optimizer.parameters, lr_means, self._generator)
+        if still is not None and kept is not None:
+            means.detach()[still.rows] = kept
 
     def exchange(self, scene: GaussianScene) -> None:
         """Go on with ``scene``: the same Gaussians, moved, masked or drawn in another way."""
@@ -280,7 +294,9 @@ class GaussianModel(Model[GaussianScene]):
         self._scene = replace(scene, colour=self.colours.network)
 
     def _options(self, step: int) -> RenderOptions:
-        degree = active_sh_degree(self._config.train, step, self._scene.gaussians.sh_degree)
+        degree = self._scene.gaussians.sh_degree
+        if not isinstance(self._config.init, SceneInit):  # whose harmonics are there already
+            degree = active_sh_degree(self._config.train, step, degree)
         return replace(self.options, sh_degree=degree)
 
     def _apply(self, result: EditResult, edited: GaussianScene | None = None) -> None:

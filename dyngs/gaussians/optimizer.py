@@ -3,17 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyngs.adam import AdamState
 from dyngs.config import OptimConfig
-from dyngs.gaussians import EditResult, Gaussians
+from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.adam import Count, seen_rows
 from dyngs.state import State
 
 ADAM_EPS = 1e-15
+
+
+@dataclass(frozen=True)
+class Still:
+    """What training leaves as it is: Gaussians (N,) bool, None: none; with ``shapes`` all but the colours of all."""
+
+    rows: Tensor | None = None
+    shapes: bool = False
+
+    def grown(self, result: EditResult, parameters: Gaussians) -> EditResult:
+        """Return a change of the set without what it does to Gaussians that stay: they come last, as they were."""
+        if self.rows is None:
+            return result
+        old = parameters.tensors()
+        if result.edit is None:
+            shown = {name: self.rows.reshape(-1, *[1] * (x.ndim - 1)) for name, x in result.changes.items()}
+            changes = {name: torch.where(shown[name], old[name].detach(), x) for name, x in result.changes.items()}
+            return replace(result, changes=changes)
+        goes, stays = ~self.rows[result.edit.source], torch.nonzero(self.rows)[:, 0]
+        source = torch.cat([result.edit.source[goes], stays])
+        is_new = torch.cat([result.edit.is_new[goes], torch.zeros_like(stays, dtype=torch.bool)])
+        changes = {name: torch.cat([x[goes], old[name].detach()[stays]]) for name, x in result.changes.items()}
+        return replace(result, edit=TopologyEdit(source, is_new), changes=changes)
 
 
 class GaussianOptimizer:
@@ -36,6 +60,7 @@ class GaussianOptimizer:
         dense: bool,
         frozen_rest: Tensor | None = None,
         resting: Tensor | None = None,
+        still: Still | None = None,
     ) -> Count:
         """Update the parameters, drop the gradients, and return the number of rows left out for bad gradients.
 
@@ -44,11 +69,14 @@ class GaussianOptimizer:
             dense: update all Gaussians; otherwise, if ``optim.sparse``, only those that received a gradient: the others
                 keep parameters and moments.
             resting: (M,) indices of Gaussians that are only updated if they received one, dense or not; None: none.
+            still: what keeps parameters and moments whatever it receives.
         """
         rows = None if dense or not self.options.sparse else self._rows_with_gradient()
         if rows is None and resting is not None:
             rows = torch.ones(len(self.parameters), dtype=torch.bool, device=resting.device)
             rows[resting] = self._rows_with_gradient()[resting]
+        if still is not None and still.rows is not None:
+            rows = ~still.rows if rows is None else rows & ~still.rows
         rates: dict[str, float | Tensor] = {
             "means": lr_means,
             "quats": self.options.lr_quats,
@@ -59,6 +87,8 @@ class GaussianOptimizer:
         if frozen_rest is not None and self.parameters.sh.grad is not None:
             self.parameters.sh.grad[frozen_rest, 1:] = 0
         updates = [self._adam.update(name, x, rates[name], rows) for name, x in self.parameters.tensors().items()]
+        if still is not None and still.shapes:
+            updates = updates[-1:]  # of the harmonics
         return self._adam.steps_(updates, step=step, eps=ADAM_EPS)
 
     def apply(self, result: EditResult) -> None:

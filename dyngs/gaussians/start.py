@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from torch import Tensor
 from typing_extensions import assert_never
 
 from dyngs.config import AutoColour, DefaultStrategy, FixedStrategy, McmcStrategy, NetworkColour, ShColour
@@ -17,8 +20,18 @@ from dyngs.models.kind import RunStart
 from dyngs.models.views import training_cameras
 
 
+@dataclass(frozen=True)
+class FirstGaussians:
+    """Gaussians of a scene that a run goes on from, and which of them (N,) bool stay as they are; None: none."""
+
+    gaussians: Gaussians
+    frozen: Tensor | None = None
+
+
 def first_gaussians(run: RunStart) -> Gaussians:
-    """Return the Gaussians at the points of the capture, or at random."""
+    """Return the Gaussians of the scene to go on from, at the points of the capture, or at random."""
+    if run.first is not None:
+        return run.first.gaussians
     config, start = run.config, StartValues.for_strategy(run.asked.strategy)
     where = surroundings(run.capture)
     return initial_gaussians(where, config.init, start, config.stored_sh_degree, run.generator)

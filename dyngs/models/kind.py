@@ -38,6 +38,7 @@ class RunStart:
     background: str
     extent: float
     generator: torch.Generator
+    first: Any = None  # ``FirstGaussians`` that it goes on from; None: it begins as ``config.init`` says
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import HumanScene, avatar_of
-from dyngs.human.motion.motion import captured_motion, motion_clip, same_bodies
+from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.renderable import Renderable
@@ -28,9 +29,10 @@ from dyngs.models.views import background_colour, training_cameras
 from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
 from dyngs.runs.avatar import read_avatar
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
+from dyngs.runs.frame import RunFrame, read_frame
 from dyngs.splats.formats import all_suffixes, known_format, read_splats
-from dyngs.splats.rotation import AXES
-from dyngs.splats.similarity import UNMOVED
+from dyngs.splats.rotation import AXES, inverse
+from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import Nonfinite, splat_options
 from dyngs.static.scene import StaticScene
 
@@ -87,20 +89,26 @@ class Opened(LoadedRun):
         name: of the run or file.
         captured: what it was trained on; None: a file, which does not say.
         turned: (4,) wxyz, the rotation from the axes of the capture's files to those of the scene.
-        stated_up: axis that the file or the user says is up, such as "-y"; None: neither does.
+        edited: the frame that a run was given after training; None: it is that of its capture.
+        stated_up: axis that the file, the frame or the user says is up, such as "-y"; None: none does.
         fps: frame rate of the motion that a person plays instead of that of training; None: it is that of training.
         as_captured: a person is in the poses of the capture.
         notes: lines about what was changed or left out in reading.
+        path: run folder or file that it was opened from; None: none.
+        scaled: an edit has told how long something is, so that a unit of ``world`` is a metre.
         in_training: it still changes; what does not move yet may do so later.
     """
 
     name: str = ""
     captured: Captured | None = None
     turned: tuple[float, float, float, float] = _NO_TURN
+    edited: RunFrame | None = None
     stated_up: str | None = None
     fps: float | None = None
     as_captured: bool = True
     notes: tuple[str, ...] = ()
+    path: Path | None = None
+    scaled: bool = False
     in_training: bool = False
     _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -133,8 +141,24 @@ class Opened(LoadedRun):
 
     @property
     def world_offset(self) -> np.ndarray:
-        """(3,) float64; added to coordinates, once they are turned back, it gives those of the capture's files."""
-        return np.asarray(self.info.world_offset, np.float64)
+        """(3,) float64; added to coordinates that ``frame`` has moved, it gives those that people mean."""
+        return np.asarray(self.info.world_offset if self.edited is None else self.edited.offset, np.float64)
+
+    @property
+    def frame(self) -> Similarity:
+        """From the scene, as it is drawn, to the frame it was given, else to the capture's files less their offset."""
+        return Similarity(inverse(self.turned)) if self.edited is None else self.edited.similarity
+
+    @property
+    def world(self) -> Similarity:
+        """``frame``, with the offset: from the scene to the coordinates that people mean, in float64."""
+        x, y, z = self.world_offset.tolist()
+        return Similarity(shift=(x, y, z)).after(self.frame)
+
+    def direction_of(self, axis: str) -> np.ndarray:
+        """Return the direction (3,) in the scene of an axis such as "-y": of its frame, else of the scene itself."""
+        own = np.array(AXES[axis])
+        return own if self.edited is None else self.edited.similarity.rotation.T @ own
 
     @property
     def person(self) -> HumanScene | None:
@@ -145,7 +169,7 @@ class Opened(LoadedRun):
     def up(self) -> tuple[np.ndarray, str] | None:
         """Direction (3,) that is up, and what says so: the file, a body at rest, or the cameras; None: nothing does."""
         if self.stated_up is not None:
-            return np.array(AXES[self.stated_up]), "the file"
+            return self.direction_of(self.stated_up), "the file" if self.edited is None else "the edit"
         if self.person is not None:
             from dyngs.human.motion.placement import up_direction as up_of_body  # late: scipy, as below
 
@@ -219,6 +243,25 @@ class Opened(LoadedRun):
         rest = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         return replace(self, renderable=scene.playing(rest), as_captured=False)
 
+    def in_own_frame(self) -> Opened:
+        """Return the same with its person moved into the frame of the edit, for files that hold nothing but them."""
+        person, how = self.person, self.frame
+        if self.edited is None or person is None:
+            return self
+        from dyngs.human.motion.placement import moved  # late: scipy, as above
+
+        like = person.clip.trans
+        pelvis = person.learned_skeleton.joints[0] * math.exp(person.fit.log_scale)
+        rotation, shift = torch.from_numpy(how.rotation).to(like), torch.tensor(how.shift).to(like)
+
+        def there(clip: MotionClip) -> MotionClip:
+            return moved(clip, rotation, how.scale, shift, pelvis)
+
+        played = None if person.played is None else there(person.played)
+        scene = replace(person, clip=there(person.clip), played=played)
+        info = replace(self.info, world_offset=self.edited.offset)
+        return replace(self, renderable=scene, info=info, edited=None, stated_up=None)
+
     def _person_for(self, wanted: str) -> tuple[HumanScene, HumanModel]:
         model = self.config.model
         if self.person is None or not isinstance(model, HumanModel):
@@ -250,14 +293,15 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
     if data_root is not None:
         raise DyngsError(f"{path}: a file, not a run, so it has no capture; leave out data.root")
     if path.suffix.lower() == AVATAR_SUFFIX:
-        return Opened(**vars(read_avatar(path)), name=path.name)
+        return Opened(**vars(read_avatar(path)), name=path.name, path=path)
     if known_format(path) is None:
         known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()})"
         other = command_for(path)
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path, nonfinite=nonfinite)
     opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), path)
-    opened = replace(opened, stated_up=splat.up, notes=splat.notes)
+    scaled = splat.edited.scale != 1
+    opened = replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
     if splat.edited != UNMOVED:  # then its own frame is the one that people mean
         return opened
     info = replace(opened.info, world_offset=splat.world_offset)
@@ -267,7 +311,11 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
 def open_run(folder: Path, capture: Capture | None = None, data_root: Path | None = None) -> Opened:
     """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it is read already."""
     run = load_run(folder, data_root)
-    return Opened(**vars(run), name=folder.absolute().name, captured=Captured(run.config.data, capture))
+    edited, captured = read_frame(folder), Captured(run.config.data, capture)
+    opened = Opened(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
+    if edited is None:
+        return opened
+    return replace(opened, edited=edited, stated_up=edited.up, scaled=edited.similarity.scale != 1)
 
 
 def opened_scene(scene: GaussianScene, file: Path = Path("scene")) -> Opened:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.camera import Cameras
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -142,13 +140,3 @@ def nearest_axis(direction: tuple[float, ...]) -> str | None:
         if length > 0 and float(np.dot(direction, axis)) / length >= _ALONG_AXIS:
             return name
     return None
-
-
-def with_scene(cameras: Cameras, rotation: tuple[float, float, float, float]) -> Cameras:
-    """Return the cameras turned about the origin as a scene was, by a quaternion wxyz: they see the same."""
-    if rotation == _NO_TURN:
-        return cameras
-    turn = torch.eye(4, dtype=torch.float64, device="cpu")
-    turn[:3, :3] = rotation_matrices(torch.tensor(rotation, dtype=torch.float64, device="cpu"))
-    poses = cameras.cam_from_world
-    return replace(cameras, cam_from_world=(poses.double() @ turn.T.to(poses.device)).to(poses.dtype))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -40,6 +41,11 @@ _OURS = (
 """First words of comments that say what others say now, if a file is written that was read."""
 GEO_OFFSET = "geo offset, to be added to positions:"
 """How a comment begins that says so; what moves the positions drops it."""
+
+
+def geo_comment(offset: Sequence[float]) -> str:
+    """Return what the header of a file says of an offset (3,)."""
+    return f"{GEO_OFFSET} " + " ".join(f"{x:.10g}" for x in offset)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from dyngs.camera import Cameras
-from dyngs.config import DefaultStrategy, StaticModel
+from dyngs.config import DefaultStrategy, SceneInit, StaticModel
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.model import GaussianModel, SceneTraining
+from dyngs.gaussians.optimizer import Still
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
@@ -21,7 +22,9 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
+from dyngs.state import Role, State, StateTensor
 from dyngs.static.scene import StaticScene
+from dyngs.tensor_checks import require_tensor
 
 SURVEYED = 200  # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
 
@@ -37,13 +40,13 @@ class SmallRemoval:
     pixels: float = 0.0
     cameras: Sequence[Cameras] = ()
 
-    def edit(self, scene: StaticScene) -> EditResult | None:
-        """Return the removal; None where all Gaussians, or none, amount to that much."""
+    def edit(self, scene: StaticScene, stays: Tensor | None = None) -> EditResult | None:
+        """Return the removal; None where all Gaussians, or none, amount to that much; ``stays`` (N,) bool: these do."""
         drawn, most = scene.time_step(None).gaussians, torch.zeros(len(scene), device=scene.device)
         for cameras in self.cameras:
             found = contributions(drawn, cameras.to(device=scene.device), scene.options)
             most = torch.maximum(most, found.amax(0))
-        kept = most >= self.pixels
+        kept = most >= self.pixels if stays is None else (most >= self.pixels) | stays
         if bool(kept.all()) or not bool(kept.any()):
             return None
         text = (
@@ -64,10 +67,26 @@ def small_removal(run: RunStart) -> SmallRemoval:
 
 
 class StaticTraining(SceneTraining[StaticScene]):
-    """See ``SceneTraining``; nothing is learned next to the Gaussians and their colours."""
+    """See ``SceneTraining``; nothing is learned next to the Gaussians and their colours.
 
-    def __init__(self, update: FilterUpdate, removal: SmallRemoval = SmallRemoval()) -> None:
-        self._update, self._removal = update, removal
+    ``still``: what stays as it is.
+    """
+
+    def __init__(
+        self, update: FilterUpdate, removal: SmallRemoval = SmallRemoval(), still: Still | None = None
+    ) -> None:
+        self._update, self._removal, self._still = update, removal, still
+
+    def still(self) -> Still | None:
+        return self._still
+
+    def follow(self, edit: TopologyEdit) -> None:
+        if self._still is not None and self._still.rows is not None:
+            self._still = replace(self._still, rows=edit.apply(self._still.rows))
+
+    def state(self) -> State:
+        rows = None if self._still is None else self._still.rows
+        return {} if rows is None else {"frozen": StateTensor(rows, Role.TRAINING)}
 
     def first_scene(self, gaussians: Gaussians) -> StaticScene:
         return StaticScene(gaussians=gaussians, filter_std=self._update.of(gaussians))
@@ -78,20 +97,30 @@ class StaticTraining(SceneTraining[StaticScene]):
         return scene
 
     def revised(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
-        result = self._removal.edit(scene) if step == self._removal.step else None
+        rows = None if self._still is None else self._still.rows
+        result = self._removal.edit(scene, rows) if step == self._removal.step else None
         if result is None or result.edit is None:
             return None
         return scene.edited(result.edit), result
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
+        if self._still is not None and "frozen" in tensors:
+            frozen = require_tensor("frozen", tensors["frozen"], (len(gaussians),), torch.bool)
+            self._still = replace(self._still, rows=frozen.to(gaussians.means.device))
         return StaticScene.restored(gaussians, tensors)
+
+
+def _still(run: RunStart) -> Still | None:
+    init = run.config.init
+    rows = None if run.first is None else run.first.frozen
+    return Still(rows, init.trains == "colour") if isinstance(init, SceneInit) else None
 
 
 def start(run: RunStart) -> GaussianModel:
     """Return the model of a static scene before its first step."""
     gaussians = first_gaussians(run)
     colours = colours_of(run, gaussians, sees_time=False)
-    training = StaticTraining(filter_update(run), small_removal(run))
+    training = StaticTraining(filter_update(run), small_removal(run), _still(run))
     return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
 
 

@@ -12,6 +12,7 @@ from dyngs.errors import counted
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import has_timeline, views_of
+from dyngs.view.edit_controls import EditControls, can_be_edited
 from dyngs.view.frusta import Frusta
 from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion
@@ -43,6 +44,7 @@ class Controls:
         self._browsing, self._source, self._serving = browsing, source, serving
         self._frusta = Frusta(browsing)
         self._of_scene: list[Any] = []
+        self.edits: EditControls | None = None
         gui = browsing.client.gui
         if len(source.names) > 1:
             chosen = next((name for name in source.names if name == browsing.loaded.name), source.names[0])
@@ -56,6 +58,9 @@ class Controls:
         for handle in self._of_scene:
             handle.remove()
         self._frusta.remove()
+        if self.edits is not None:
+            self.edits.remove()
+            self.edits = None
         gui, browsing = self._browsing.client.gui, self._browsing
         browsing.time_slider = None
         network, parts = self._source.network, dict[str, Callable[[], None]]()
@@ -68,12 +73,17 @@ class Controls:
             parts["Person"] = lambda: add_person_controls(browsing, self._serving.motions)
         if network is not None:
             parts["Predict from"] = lambda: add_image_controls(browsing, network)
+        if can_be_edited(opened):
+            parts["Edit"] = lambda: self._add_edits(opened)
         parts |= {"Camera path": lambda: add_path_controls(browsing), "Help": lambda: _add_help(gui, opened)}
         self._of_scene = []
         for name, add in parts.items():
-            self._of_scene.append(gui.add_folder(name, expand_by_default=name not in ("Camera path", "Help")))
+            self._of_scene.append(gui.add_folder(name, expand_by_default=name not in ("Edit", "Camera path", "Help")))
             with self._of_scene[-1]:
                 add()
+
+    def _add_edits(self, opened: Opened) -> None:
+        self.edits = EditControls(self._browsing, opened)
 
     def _add_display(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
@@ -259,7 +269,7 @@ def add_path_controls(browsing: Browsing) -> None:
             return
         opened, first = session.opened, recorded[0].keyframes[0].camera
         width, height = (2 * (side // 2) for side in (first.width, first.height))  # as videos need it
-        text = recorded[0].turned_back(opened.turned).document((width, height), FPS, opened.world_offset)
+        text = recorded[0].moved(opened.frame).document((width, height), FPS, opened.world_offset)
         browsing.client.send_file_download(FILE_NAME, text.encode(), save_immediately=True)
 
     gui.add_button("Add keyframe", hint="this camera, at this time").on_click(add)

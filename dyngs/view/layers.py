@@ -107,9 +107,7 @@ def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> n
             alpha = to_uint8(_rendering(opened, shot.part, camera, time).alpha[0].clamp(0, 1).numpy())
             return np.repeat(alpha[..., None], 3, axis=2)
         case "depth":
-            made = _rendering(opened, shot.part, camera, time, with_depth=True)
-            depth = np.zeros(0) if made.depth is None else made.depth[0].numpy()
-            return depth_to_rgb(depth, made.alpha[0].numpy())
+            return depth_to_rgb(*depth_of(opened, shot.part, camera, time))
         case "motion":
             return _motion(opened, shot.part, camera, time)
 
@@ -122,6 +120,13 @@ def _rendering(opened: Opened, part: Part, camera: Cameras, time: float | None, 
         kept[part] = time, scene.time_step(time)
     options = replace(scene.options, depth="expected") if with_depth else None
     return scene.render(camera, kept[part][1], options=options).to(device="cpu")
+
+
+def depth_of(opened: Opened, part: Part, camera: Cameras, time: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the expected depth (H, W), world units along the axis of the camera, and the opacity (H, W) there."""
+    with torch.no_grad():
+        made = _rendering(opened, part, camera, time, with_depth=True)
+    return np.zeros(0) if made.depth is None else made.depth[0].numpy(), made.alpha[0].numpy()
 
 
 def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
-from dyngs.splats.rotation import with_scene
+from dyngs.splats.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,9 @@ class Recording:
         """Seconds of the path; those after the last keyframe count only in a loop."""
         return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
 
-    def turned_back(self, rotation: tuple[float, float, float, float]) -> Recording:
-        """Return the path as it is seen before a scene was rotated by ``rotation``, wxyz."""
-        w, x, y, z = rotation
-        keys = (replace(key, camera=with_scene(key.camera, (w, -x, -y, -z))) for key in self.keyframes)
+    def moved(self, how: Similarity) -> Recording:
+        """Return the path that sees a scene that was moved as this one sees it before."""
+        keys = (replace(key, camera=how.cameras(key.camera)) for key in self.keyframes)
         return replace(self, keyframes=tuple(keys))
 
     def starts(self) -> list[float]:
@@ -48,7 +47,7 @@ class Recording:
         return np.concatenate([[0.0], np.cumsum([key.seconds for key in self.keyframes[:-1]])]).tolist()
 
     def document(self, size: tuple[int, int], fps: float, world_offset: np.ndarray) -> str:
-        """Return the path as JSON, in the coordinates of the capture's files; focal lengths follow the height, px."""
+        """Return the path as JSON, less ``world_offset``; focal lengths follow the height, px."""
         width, height = size
         keys: list[dict[str, Any]] = []
         for key, start in zip(self.keyframes, self.starts(), strict=True):

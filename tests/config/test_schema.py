@@ -99,7 +99,7 @@ def test_a_section_is_found_by_its_kind() -> None:
     assert section_class(strategy, "mcmc") is McmcStrategy
     assert section_class(strategy, "none such") is DefaultStrategy
     assert section_class(init, "points") is section_class(init, "auto") is section_class(init, None)
-    assert kinds_of(init) == ["auto", "points", "random"]
+    assert kinds_of(init) == ["auto", "points", "random", "scene"]
     assert kinds_of(Config.model_fields["train"]) == []
 
 

@@ -12,6 +12,7 @@ from moving_scene import moving_scene, sliding_nodes, still_scene
 
 from dyngs.edit.crop import Box, Sphere, held_by, mesh_path, region_of
 from dyngs.errors import DyngsError
+from dyngs.splats.similarity import Similarity
 
 POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (3000, 3))
 
@@ -91,5 +92,5 @@ def test_what_moves_is_held_if_it_ever_is() -> None:
         at = [scene.at(t).means for t in (0.0, 0.25, 0.5, 0.75, 1.0)]
         region = Sphere(tuple(at[2][1].tolist()), 1e-3)  # type: ignore[arg-type]
         inside = torch.stack([(x - at[2][1]).norm(dim=1) < 1e-3 for x in at]).any(0)
-        assert torch.equal(held_by(region, scene, np.zeros(3)), inside)
-        assert not held_by(region, scene, np.array([9.0, 0, 0])).any()
+        assert torch.equal(held_by(region, scene, Similarity()), inside)
+        assert not held_by(region, scene, Similarity(shift=(9.0, 0.0, 0.0))).any()

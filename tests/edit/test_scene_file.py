@@ -127,7 +127,7 @@ def test_nothing_is_written_where_nothing_is_left(plain: Path, tmp_path: Path) -
         edit_scene(plain, tmp_path / "a.ply", far, tell=silent)
     edit_scene(plain, tmp_path / "a.ply", replace(far, outside=True), tell=silent)
     assert len(read_splats(tmp_path / "a.ply").gaussians) == 300
-    for name, said in (("a.4dgs", "holds a scene that moves"), ("a.html", "edits end in a file of Gaussians")):
+    for name, said in (("a.4dgs", "holds a scene that moves"), ("a.html", "edits end in a file of Gaussians or a run")):
         with pytest.raises(DyngsError, match=said):
             edit_scene(plain, tmp_path / name, HALF, tell=silent)
     with pytest.raises(DyngsError, match="--up auto needs the cameras"):

@@ -237,7 +237,7 @@ def test_the_whole_scene_may_move_or_stand() -> None:
 def test_far_scenes_keep_their_precision() -> None:
     """Of map coordinates, float32 would keep half a metre."""
     offset = (500_000.25, 5_400_000.125, 0.0)
-    tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, offset)
+    tracks = tracks_of(moving_scene(Sliding()), TRAIN_TIMES, Similarity(shift=offset))
     assert tracks.positions.dtype == np.float64
     np.testing.assert_allclose(tracks.positions - np.array(offset), expected(TRAIN_TIMES), atol=1e-6)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -27,7 +27,9 @@ from dyngs.ops.quaternions import rotation_matrices
 from dyngs.runs import avatar
 from dyngs.runs.avatar import read_avatar, write_avatar
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
+from dyngs.runs.frame import RunFrame
 from dyngs.runs.opened import open_run, open_scene
+from dyngs.splats.similarity import Similarity
 
 
 @pytest.fixture(scope="module")
@@ -201,3 +203,20 @@ def test_a_person_of_a_file_becomes_a_page(
     assert main(["export", str(file), "--format", "html"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "Give --out FILE.html" in line
+
+
+def test_a_person_of_an_edited_run_is_in_its_frame(capture: Path, run_dir: Path, motion: Path, tmp_path: Path) -> None:
+    """Files that hold nothing but the person have them where all other exports do."""
+    how = Similarity((0.6, 0.0, 0.0, 0.8), 2.5, (1.0, -2.0, 0.5))
+    opened = open_run(run_dir)
+    for one in (opened.in_motion(motion), opened.at_rest()):
+        moved = replace(one, edited=RunFrame(how, up="z")).in_own_frame()
+        assert moved.edited is None
+        for time in (0.0, 0.7):
+            wanted, found = how.gaussians(one.scene.at(time)), moved.scene.at(time)
+            torch.testing.assert_close(found.means, wanted.means, rtol=0, atol=2e-5)
+            torch.testing.assert_close(found.scales, wanted.scales, rtol=1e-4, atol=0)
+    edited = replace(opened, edited=RunFrame(how, up="z")).in_own_frame()
+    read = open_scene(write_avatar(edited, tmp_path / "there.safetensors"))
+    sizes = [x.scene.at(None).means.std(0).norm() for x in (read, opened.at_rest())]
+    assert float(sizes[0] / sizes[1]) == pytest.approx(2.5, rel=1e-4)

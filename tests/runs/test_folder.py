@@ -26,6 +26,7 @@ from dyngs.runs.checkpoint import KEEP_CHECKPOINTS, checkpoint_paths, latest_che
 from dyngs.runs.folder import default_folder, require_empty, tidy
 from dyngs.runs.lock import LOCK_NAME, InUseError, writing
 from dyngs.runs.log import RunLog
+from dyngs.runs.opened import open_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -78,7 +79,7 @@ COMMANDS: dict[str, Command] = {
     "export": lambda capture, run, out: write_scene_file(run, out),
     "resume": lambda capture, run, out: train(config_of(capture, out), resume_from=out),
     "synth": lambda capture, run, out: require_new_folder(out),
-    "sequence": lambda capture, run, out: write_run_sequence(load_run(run), out, (0.0, 1.0)),
+    "sequence": lambda capture, run, out: write_run_sequence(open_run(run), out, (0.0, 1.0)),
     "demo": lambda capture, run, out: _require(is_unused(out)),
 }
 

@@ -7,7 +7,7 @@ from moving_scene import camera
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.path import read_path
-from dyngs.splats.rotation import with_scene
+from dyngs.splats.similarity import Similarity
 from dyngs.view.recording import Keyframe, Recording
 
 
@@ -37,12 +37,12 @@ def test_dyngs_render_reads_what_was_recorded_and_sees_what_was_previewed(tmp_pa
         assert path.cameras.intrinsics[frame, 1, 1] == pytest.approx(float(shown.intrinsics[0, 1, 1]) / 2)
 
 
-def test_a_path_through_a_turned_file_is_in_the_axes_of_the_capture(tmp_path: Path) -> None:
-    turn, offset = (0.5, 0.5, -0.5, 0.5), np.array([1.0, 2, 3])
+def test_a_path_through_a_moved_scene_is_in_the_axes_of_the_capture(tmp_path: Path) -> None:
+    turned, offset = Similarity((0.5, 0.5, -0.5, 0.5), 2.0), np.array([1.0, 2, 3])
     file = tmp_path / "path.json"
     one = Recording((Keyframe(at_depth(4), None),))
-    file.write_text(one.turned_back(turn).document((40, 28), 30.0, offset))
-    seen = with_scene(read_path(file, offset).cameras, turn)
+    file.write_text(one.moved(turned.inverse()).document((40, 28), 30.0, offset))
+    seen = turned.cameras(read_path(file, offset).cameras)
     assert torch.allclose(seen.cam_from_world, at_depth(4).cam_from_world, atol=1e-6)
 
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from dyngs.config.keys.colour import AutoColour, NetworkColour, ShColour
 from dyngs.config.keys.data import DataConfig
-from dyngs.config.keys.start import PointsInit, RandomInit
+from dyngs.config.keys.start import PointsInit, RandomInit, SceneInit
 from dyngs.config.keys.strategy import DefaultStrategy, OptimConfig, Strategy
 from dyngs.config.keys.train import TrainConfig
 from dyngs.models.kind import KINDS
@@ -87,7 +87,8 @@ class Config(Section):
     camera: CameraConfig = CameraConfig()
     model: Annotated[AnyModel, Field(discriminator="kind", description="what is trained")] = StaticModel()
     init: Annotated[
-        PointsInit | RandomInit, Field(discriminator="kind", description="where the first Gaussians come from")
+        PointsInit | RandomInit | SceneInit,
+        Field(discriminator="kind", description="where the first Gaussians come from"),
     ] = PointsInit()
     colour: Annotated[
         ShColour | NetworkColour | AutoColour, Field(discriminator="kind", description="what colours are made of")

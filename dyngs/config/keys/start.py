@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from pathlib import Path
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -42,4 +43,21 @@ class RandomInit(Section):
     )
     half_extent: Positive = Field(
         default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
+    )
+
+
+class SceneInit(Section):
+    """Go on from a scene that was trained before; a model of a still scene."""
+
+    num_random: ClassVar[int] = 1
+    half_extent: ClassVar[float] = 1.0
+    """Of a placeholder, where a checkpoint is read instead."""
+
+    kind: Literal["scene"] = Field(default="scene", description="the Gaussians of a scene (`dyngs train --from`)")
+    scene: Path = Field(description="run or file of Gaussians, in the world of the capture")
+    trains: Literal["all", "colour"] = Field(
+        default="all", description="what is trained; colour: positions, shapes and opacities stay, none are added"
+    )
+    box: tuple[float, float, float, float, float, float] | None = Field(
+        default=None, description="low and high corner [x,y,z,x,y,z]: what is outside stays as it is; null: nothing"
     )

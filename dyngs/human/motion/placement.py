@@ -25,14 +25,19 @@ def place_like(clip: MotionClip, like: MotionClip, joints: Tensor, parents: tupl
     up = up_direction(like)
     unit = like.scale.mean()
     rotation = _least_rotation(joints.new_tensor([0.0, 1.0, 0.0]), up)
-    roots = rotation @ axis_angle_to_matrix(clip.poses[:, 0])
-    poses = torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1)
-    pelvis = clip.scale[:, None] * joints[0]
-    moved = MotionClip(clip.times, poses, unit * ((clip.trans + pelvis) @ rotation.T - pelvis), unit * clip.scale)
-    ours, theirs = (_joints_of(x, joints, parents) for x in (moved, like))
+    there = moved(clip, rotation, unit, torch.zeros_like(joints[0]), joints[0])
+    ours, theirs = (_joints_of(x, joints, parents) for x in (there, like))
     shift = theirs[:, 0].mean(0) - ours[:, 0].mean(0)
     rise = (theirs @ up).amin() - (ours @ up).amin()
-    return replace(moved, trans=moved.trans + shift + (rise - shift @ up) * up)
+    return replace(there, trans=there.trans + shift + (rise - shift @ up) * up)
+
+
+def moved(clip: MotionClip, rotation: Tensor, unit: float | Tensor, shift: Tensor, pelvis: Tensor) -> MotionClip:
+    """Return a clip as it is in the world x -> unit * rotation x + shift; ``pelvis``: (3,) of the person at rest, m."""
+    roots = rotation @ axis_angle_to_matrix(clip.poses[:, 0])
+    poses = torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1)
+    root = clip.scale[:, None] * pelvis
+    return MotionClip(clip.times, poses, unit * ((clip.trans + root) @ rotation.T - root) + shift, unit * clip.scale)
 
 
 def upright(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
@@ -41,13 +46,7 @@ def upright(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
     ``like`` is the clip of training, whose ``up_direction`` becomes y; ``joints`` (J, 3) are at rest, m.
     """
     rotation = _least_rotation(up_direction(like), joints.new_tensor([0.0, 1.0, 0.0]))
-    roots = rotation @ axis_angle_to_matrix(clip.poses[:, 0])
-    pelvis = clip.scale[:, None] * joints[0]
-    return replace(
-        clip,
-        poses=torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1),
-        trans=(clip.trans + pelvis) @ rotation.T - pelvis,
-    )
+    return moved(clip, rotation, 1.0, torch.zeros_like(joints[0]), joints[0])
 
 
 def rest_clip(like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> MotionClip:

@@ -1,0 +1,128 @@
+"""Picking, measuring and deleting, without a browser."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import moved_x, row_of_balls, write_moving_run
+
+from dyngs.edit.frame import Frame
+from dyngs.edit.scene_file import Edits, edit_scene
+from dyngs.errors import DyngsError
+from dyngs.export.splat_files import write_run_splats
+from dyngs.gaussians import Gaussians
+from dyngs.runs.opened import Opened, open_run, open_scene, opened_scene
+from dyngs.splats.formats import read_splats
+from dyngs.static.scene import StaticScene
+from dyngs.view.editing import Editing, looking_along, picked
+from dyngs.view.layers import Shot
+
+
+def editing(opened: Opened, centre: tuple[float, float, float] = (0.5, 0.0, 0.0), size: float = 1.2) -> Editing:
+    return Editing(opened, np.array(centre), np.full(3, size))
+
+
+@pytest.fixture
+def wall() -> Opened:
+    """An opaque wall at z = 2 of small Gaussians, with nothing at x < 0."""
+    y, x = torch.meshgrid(torch.linspace(-1, 1, 81), torch.linspace(0, 2, 81), indexing="ij")
+    means = torch.stack([x.flatten(), y.flatten(), torch.full((81 * 81,), 2.0)], dim=1)
+    n = len(means)
+    scales = torch.log(torch.tensor([0.03, 0.03, 1e-3])).repeat(n, 1)
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
+    return opened_scene(StaticScene(gaussians=Gaussians(means, quats, scales, torch.full((n,), 6.0), means[:, None])))
+
+
+@pytest.mark.parametrize(
+    ("aim", "error"), [((0.3, 0.2, 2.0), 0.003), ((0.8, 0.1, 2.0), 0.03), ((1.5, -0.6, 2.0), 0.03)]
+)
+def test_a_ray_meets_the_wall_where_geometry_says(wall: Opened, aim: tuple[float, float, float], error: float) -> None:
+    """From the side to the size of its Gaussians, 0.03, of which the nearer ones cover the others."""
+    origin = np.array([0.3, 0.2, -1.0])
+    found = picked(wall, origin, 5 * (np.array(aim) - origin), 0.002)
+    assert found is not None
+    np.testing.assert_allclose(found, aim, atol=error)
+
+
+def test_rays_that_meet_nothing(wall: Opened) -> None:
+    for direction in ((-1.0, 0.0, 0.5), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), (np.nan, 0.0, 1.0)):
+        assert picked(wall, np.array([-0.5, 0.0, 0.0]), np.array(direction), 0.002) is None
+    assert picked(wall, np.zeros(3), np.array([0.0, 0, 1]), 0.0) is None
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0, 0), (0, -2.0, 0), (0.1, 0.2, -0.9)])
+def test_the_camera_of_a_ray_looks_along_it(direction: tuple[float, float, float]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_quat(looking_along(np.array(direction))[[1, 2, 3, 0]])
+    np.testing.assert_allclose(turn.apply([0, 0, 1]), np.array(direction) / np.linalg.norm(direction), atol=1e-12)
+
+
+def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
+    opened = open_run(write_moving_run(tmp_path))
+    for time in (0.0, 1.0):
+        x = float(moved_x((3,), time))
+        there = Shot(None, time)  # type: ignore[arg-type]
+        found = picked(opened, np.array([x, 0.0, -4.0]), np.array([0.0, 0, 1]), 0.01, there)
+        assert found is not None
+        np.testing.assert_allclose(found, [x, 0, 0], atol=0.02)
+
+
+def test_distances_are_in_metres_where_the_scene_has_a_scale(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path, moves=False)
+    edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.5)), tell=str)
+    for folder, said in ((run, "distance: **2 units**"), (tmp_path / "scaled", "distance: **5 m**")):
+        work = editing(open_run(folder))
+        for x in (-1.0, 1.0):
+            work.pick(np.array([x, 0.0, 0.0]))
+        assert said in work.said
+    assert '`--scale "-2.5,0,0 2.5,0,0 LENGTHm"`' in work.said
+    work.pick(np.zeros(3))
+    assert len(work.points) == 1
+
+
+def test_deletions_in_the_coordinates_of_the_frame_and_back(tmp_path: Path) -> None:
+    run = write_moving_run(tmp_path, moves=False)
+    edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.0)), tell=str)
+    work = editing(open_run(tmp_path / "scaled"), (1.0, 0.0, 0.0), 2.2)  # x from -0.05 to 1.05 in the scene
+    assert "box: `--crop -0.1,-1.1,-1.1 2.1,1.1,1.1`" in work.said
+    assert work.delete(inside=True) == 3
+    assert work.left.scene.gaussians.means[:, 0].tolist() == [-1.0, -0.5]
+    assert "2 of 5 Gaussians left" in work.said
+    assert work.delete(inside=True) == 0
+    with pytest.raises(DyngsError, match="the box holds nothing"):
+        work.delete(inside=False)
+    assert work.undo()
+    assert work.left is work.whole
+    assert not work.undo()
+    assert work.delete(inside=False) == 2
+    work.size = np.full(3, 99.0)
+    with pytest.raises(DyngsError, match="the box holds all"):
+        work.delete(inside=True)
+
+
+def test_what_is_saved(tmp_path: Path) -> None:
+    """Of a run in its frame, at the time that is shown; of a file all that its header says; both stay as they are."""
+    run = write_moving_run(tmp_path)
+    work = editing(open_run(run), (1.0, 0.0, 0.0), 0.4)
+    work.delete(inside=True)
+    (tmp_path / "a.ply").write_bytes(work.file(0.75))
+    saved = read_splats(tmp_path / "a.ply").gaussians.means
+    torch.testing.assert_close(saved[:, 0], moved_x((0, 1, 2), 0.75), rtol=0, atol=1e-5)  # the fourth goes through it
+    assert len(open_run(run).scene) == 5
+    still = write_moving_run(tmp_path / "still", moves=False)
+    edit_scene(still, tmp_path / "up", Edits(frame=Frame(scale=2.0)), tell=str)
+    file = write_run_splats(open_run(tmp_path / "up"), tmp_path / "b.ply").path
+    work = editing(open_scene(file), (2.0, 0.0, 0.0), 0.4)
+    assert work.whole.scaled
+    work.delete(inside=True)
+    (tmp_path / "c.ply").write_bytes(work.file(None))
+    back = read_splats(tmp_path / "c.ply")
+    assert back.edited == read_splats(file).edited
+    torch.testing.assert_close(back.gaussians.means, 2 * row_of_balls().means[:4])
+    with pytest.raises(DyngsError, match="no file or run of its own"):
+        replace(work, whole=replace(work.whole, path=None)).file(None)
