@@ -14,12 +14,14 @@ from dyngs.errors import DyngsError
 from dyngs.files.outputs import new_folder
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.kinds import assemble
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import KINDS, kind_of
 from dyngs.models.prediction import Predictor, named_views
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import require_empty
+from dyngs.runs.network_file import read_network
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Prediction:
 
 
 def predict(
-    network_run: Path,
+    network: Path,
     capture: Path,
     out: Path,
     views: int | tuple[str, ...] | None = None,
@@ -47,7 +49,8 @@ def predict(
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train --resume`` refines it.
 
     Args:
-        network_run: run folder of a network that predicts people, see ``dyngs.models.prediction``.
+        network: run folder of a network that predicts people, see ``dyngs.models.prediction``, or a file of its
+            weights, see ``dyngs.runs.network_file``.
         capture: of a person, in any format that has silhouettes.
         out: a new run folder.
         views: how many of the training views to predict from; or their names; None: as many as the network is for.
@@ -60,10 +63,10 @@ def predict(
     """
     if steps is not None and steps < 0:
         raise DyngsError(f"cannot train for {steps} steps; give 0 or more")
-    config = network_config(network_run)
+    config, checkpoint = trained_network(network)
     require_empty(out)  # before the work
     data = config.data.model_copy(update={"root": capture.absolute()})
-    predictor = kind_of(config.model).predictor(config, latest_checkpoint(network_run), data, say=say, report=report)
+    predictor = kind_of(config.model).predictor(config, checkpoint, data, say=say, report=report)
     chosen = _chosen(predictor, config.model.source_views if views is None else views)
     began = time.perf_counter()
     done = predictor.adapt(chosen, steps, report)
@@ -74,6 +77,14 @@ def predict(
     names = tuple(predictor.views[i].name for i in chosen)
     count = len(scene) if isinstance(scene, GaussianScene) else 0
     return Prediction(out, names, count, done, start - began, end - start)
+
+
+def trained_network(network: Path) -> tuple[Config, Checkpoint]:
+    """Return configuration and weights of a network, from its run or a file of weights. Raises DyngsError."""
+    if network.is_file():
+        return read_network(network)
+    config = network_config(network)
+    return config, latest_checkpoint(network)
 
 
 def network_config(run_dir: Path) -> Config:

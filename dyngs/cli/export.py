@@ -38,6 +38,7 @@ _UNFIT: dict[str, dict[str, str]] = {
     "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface at its time") | _FOR_DYNGS,
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
+    "network": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), "") | _FOR_DYNGS,
     "tracks": _FOR_SPLATS,
     "bodies": dict.fromkeys(("times", "motion", "joints", *_PARTS), "the file has the whole clip")
     | {"sh_degree": "the file has the colours of the run"}
@@ -62,6 +63,7 @@ examples:
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
   dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
+  dyngs export runs/stereo --format network --out net.safetensors   the weights of a network, for `dyngs predict`
   dyngs export runs/dance --out dance.html                        a page that plays in any browser, offline
 """
 
@@ -77,7 +79,7 @@ def add_parser(commands: args.Commands) -> None:
         _EPILOG,
     )
     parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder, or an avatar (.safetensors)")
-    formats = (*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras")
+    formats = (*SPLAT_FORMATS, MOVING, "tracks", "dyngs", "avatar", "mesh", "html", "cameras", "network")
     about = "file format (default: what the suffix of --out names, else ply)"
     parser.add_argument("--format", choices=formats, help=about)
     about = "file, or folder of a sequence (default: splats... in RUN)"
@@ -118,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
     kind = "surface" if kind == "mesh" and _has_surface(arguments) else kind
     _require_fitting(arguments, kind)
     writers = {"html": _export_page, "cameras": _export_cameras, "avatar": _export_avatar, "dyngs": _export_dyngs}
-    writers["surface"] = _export_surface
+    writers |= {"surface": _export_surface, "network": _export_network}
     if arguments.bodies:
         return _export_bodies(arguments)
     if kind != "surface":
@@ -176,6 +178,8 @@ def _kind(arguments: argparse.Namespace) -> str:
         return stated or "ply"
     found = known_format(out)
     named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
+    if (stated, named) == ("network", "avatar"):
+        return "network"
     if stated == "mesh" and (named in ("glb", "ply") or out.suffix.lower() == ".obj"):
         return stated
     if stated is None and named is None:
@@ -334,6 +338,17 @@ def _export_avatar(arguments: argparse.Namespace) -> int:
 
     path = arguments.out or arguments.run_dir / "avatar.safetensors"
     args.print_written(write_avatar(open_run(arguments.run_dir).in_own_frame(), path))
+    return 0
+
+
+def _export_network(arguments: argparse.Namespace) -> int:
+    from dyngs.api.predict import network_config
+    from dyngs.runs.checkpoint import latest_checkpoint
+    from dyngs.runs.network_file import SUFFIX, write_network
+
+    run: Path = arguments.run_dir
+    config = network_config(run)
+    args.print_written(write_network(run, config, latest_checkpoint(run), arguments.out or run / f"network{SUFFIX}"))
     return 0
 
 

@@ -14,7 +14,8 @@ examples:
   dyngs predict runs/net captures/ann --out runs/ann
   dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
   dyngs train gps data.root=PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
-  dyngs predict runs/stereo captures/ann --out runs/two --views f000_c00.png,f000_c01.png
+  dyngs export runs/stereo --format network --out stereo.safetensors   the weights as one file
+  dyngs predict stereo.safetensors captures/ann --out runs/two --views f000_c00.png,f000_c01.png
   dyngs eval runs/ann
   dyngs train --resume runs/ann                                     continues from the prediction
 """
@@ -32,7 +33,8 @@ def add_parser(commands: Commands) -> None:
         "commands.",
         _EPILOG,
     )
-    parser.add_argument("network", type=input_path, metavar="NET_RUN", help="run folder of a network")
+    about = "run folder of a network, or a file of its weights"
+    parser.add_argument("network", type=input_path, metavar="NET", help=about)
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument("--out", type=output_path, required=True, metavar="RUN", help="new run folder")
     views = "number or names of the views to predict from (default: model.source_views of the network; gps: 2)"

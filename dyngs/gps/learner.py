@@ -34,7 +34,7 @@ from dyngs.static.training import StaticTraining
 
 DECAY = 0.9
 """Weight of the error of an iteration relative to the next."""
-DEPTH_WEIGHT = 0.05  # Of the error of offsets, px, next to that of images
+DEPTH_WEIGHT = 0.02  # Of the error of offsets, px, next to that of images
 _AROUND = 8  # px of background around the person in the images that are compared
 _FAINT = 0.02  # Opacity below which a predicted Gaussian is left out
 _OPEN = 64  # People whose captures are kept open

@@ -22,11 +22,11 @@ from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 
-FACTOR = 8
+FACTOR = 16
 """Windows are multiples of so many pixels."""
 SOLID = 0.5  # Alpha from which a pixel belongs to the person
 _REACHED = 0.1  # Alpha from which a point may be part of the person: outlines are not cut off
-_MARGIN = 6  # px around the person
+_MARGIN = 8  # px around the person
 _FEWEST = 16  # Pixels of a person that can be rectified
 _SAME_HEIGHT = 0.08  # Largest difference of the rows where the person begins or ends, relative to the person's height
 _EDGE = 0.01  # Difference of depth, relative, from which neighbouring pixels belong to different surfaces

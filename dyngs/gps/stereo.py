@@ -1,7 +1,11 @@
-"""The depth of every pixel of two rectified views: correlation along rows, refined step by step (RAFT-Stereo, Lipson et
-al. 2021, in the form of GPS-Gaussian, Zheng et al. 2024).
+"""The depth of every pixel of two rectified views: a sweep over offsets, of which a network finds the right one.
 
-Local letters: two views, left and right; H x W pixels of the windows, h x w of a quarter of them, C channels.
+GPS-Gaussian (Zheng et al. 2024) correlates learned features and refines a match step by step. Here what speaks for an
+offset is computed: how much colours would differ (plane sweep, Collins 1996), and whether the other view shows the
+person there at all (visual hull). The network corrects that, and is as good as block matching before it is trained.
+
+Local letters: two views, left and right; H x W pixels of the windows, h x w of a quarter of them; C
+channels, D offsets.
 """
 
 from __future__ import annotations
@@ -10,23 +14,24 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool1d, max_pool2d, normalize, silu, unfold
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad, unfold
 
 from dyngs.models.convolution import ResidualBlock, upsampled
 
 QUARTER = 4
-"""Pixels of the windows per pixel of the correlation."""
-_LEVELS, _RADIUS = (
-    3,
-    4,
-)  # Of the correlation: resolutions, each half as fine, and entries on either side in each
-_HIDDEN = 32  # Channels of the state that is refined
-_NEVER = -1e4  # Logit of what cannot be
-_SIDES = (1.0, -1.0)  # A larger offset lies further left in the right view, further right in the left one
+"""Pixels of the windows per pixel of the sweep."""
+NUM_OFFSETS = 48
+"""Offsets that are looked at, evenly between those of ``RANGE``."""
+RANGE = (-0.22, 0.28)
+"""Least and largest offset, relative to the disparity of the middle: 0.56 m behind to 0.44 m before it at 2 m."""
+_COLOUR, _BESIDE = 300.0, 5.0  # What the logit of an offset loses by the difference of colours, and beside the person
+_SHARPNESS, _NEVER = 2.0, -1e4  # Logits of upsampling: by squared distance, and of what cannot be
+SIDES = (1.0, -1.0)
+"""A larger offset lies further left in the right view, further right in the left one."""
 
 
 class Encoder(nn.Module):
-    """Features (B, C, ...) of images at 1/2, 1/4 and 1/8 of the resolution."""
+    """Features (B, C, ...) of images at 1/2, 1/4 and 1/8 of their resolution."""
 
     def __init__(self, channels: int, widths: Sequence[int]) -> None:
         super().__init__()
@@ -43,113 +48,87 @@ class Encoder(nn.Module):
 
 
 class StereoNetwork(nn.Module):
-    """Offsets of two views, see ``dyngs.gps.rectification``, from their features."""
+    """Offsets of two views, see ``dyngs.gps.rectification``, from a sweep and the features of the images: a UNet."""
 
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
-        middle = widths[1]
-        self.fuse = nn.Sequential(nn.Conv2d(middle + widths[2], middle, 3, padding=1), ResidualBlock(middle))
-        self.match = nn.Conv2d(middle, middle, 3, padding=1)
-        self.context = nn.Conv2d(middle, 2 * _HIDDEN, 3, padding=1)
-        self.motion = nn.Sequential(
-            *(nn.Conv2d(_LEVELS * (2 * _RADIUS + 1) + 1, _HIDDEN, 1), nn.SiLU()),
-            *(nn.Conv2d(_HIDDEN, _HIDDEN - 1, 3, padding=1), nn.SiLU()),
-        )
-        self.gates = nn.Conv2d(3 * _HIDDEN, 2 * _HIDDEN, 3, padding=1)
-        self.candidate = nn.Conv2d(3 * _HIDDEN, _HIDDEN, 3, padding=1)
-        self.change = nn.Sequential(
-            nn.Conv2d(_HIDDEN, _HIDDEN, 3, padding=1), nn.SiLU(), nn.Conv2d(_HIDDEN, 1, 3, padding=1)
-        )
-        self.weights = nn.Sequential(
-            nn.Conv2d(_HIDDEN, _HIDDEN, 3, padding=1), nn.SiLU(), nn.Conv2d(_HIDDEN, 9 * QUARTER**2, 1)
-        )
+        fine, middle, coarse = widths
+        self.enter = _block(2 * NUM_OFFSETS + fine, fine)
+        self.down = nn.ModuleList([_block(fine + middle, middle, 2), _block(middle + coarse, coarse, 2)])
+        self.deep = ResidualBlock(coarse)
+        self.up = nn.ModuleList([_block(coarse + middle, middle), _block(middle + fine, fine)])
+        self.change = nn.Conv2d(fine, NUM_OFFSETS + 1, 3, padding=1)
+        self.weights = nn.Conv2d(fine, 9 * QUARTER**2, 3, padding=1)
 
-    def forward(self, levels: Sequence[Tensor], inside: Tensor, iterations: int) -> tuple[list[Tensor], Tensor]:
-        """Return offsets (2, 1, H, W), px, and the fused features (2, C, h, w).
+    def forward(
+        self, levels: Sequence[Tensor], swept: Tensor, offsets: Sequence[int], inside: Tensor
+    ) -> tuple[list[Tensor], Tensor]:
+        """Return offsets (2, 1, H, W), px, and features (2, C, h / 2, w / 2).
 
-        The offsets are those by correlation alone, then those after each iteration. ``inside`` (2, 1, H, W) is 1 where
-        the person is.
+        The offsets are those of a quarter of the resolution, then fine ones. ``levels`` are features of the images at
+        1/4, 1/8 and 1/16, ``swept`` is what ``sweep`` says of ``offsets`` (D), ``inside`` (2, 1, H, W) is 1 where the
+        person is.
         """
-        fused = self.fuse(torch.cat([levels[1], upsampled(levels[2])], dim=1))
-        pyramid = correlation_pyramid(self.match(fused))
-        offsets = best_matches(pyramid[0], max_pool2d(inside, QUARTER))
-        found = [upsampled(upsampled(QUARTER * offsets))]
-        hidden, given = self.context(fused).split(_HIDDEN, dim=1)
-        hidden, given = hidden.tanh(), silu(given)
-        for _ in range(iterations):
-            offsets = offsets.detach()  # each iteration learns from its own error (Teed and Deng 2020)
-            motion = self.motion(torch.cat([looked_up(pyramid, offsets), offsets], dim=1))
-            hidden = self._stepped(hidden, torch.cat([given, motion, offsets], dim=1))
-            offsets = offsets + self.change(hidden)
-            found.append(refined(QUARTER * offsets, 0.25 * self.weights(hidden)))
-        return found, fused
-
-    def _stepped(self, hidden: Tensor, news: Tensor) -> Tensor:
-        """Return the state after a gated recurrent unit (Cho et al. 2014)."""
-        update, reset = self.gates(torch.cat([hidden, news], dim=1)).sigmoid().split(_HIDDEN, dim=1)
-        candidate = self.candidate(torch.cat([reset * hidden, news], dim=1)).tanh()
-        return (1 - update) * hidden + update * candidate
+        fine = self.enter(torch.cat([levels[0], 5 * swept], dim=1))
+        middle = self.down[0](torch.cat([fine, upsampled(levels[1])], dim=1))
+        coarse = self.deep(self.down[1](torch.cat([middle, upsampled(levels[2])], dim=1)))
+        middle = self.up[0](torch.cat([middle, upsampled(coarse)], dim=1))
+        fine = self.up[1](torch.cat([fine, upsampled(middle)], dim=1))
+        change = self.change(fine)
+        colours, beside = swept.split(NUM_OFFSETS, dim=1)
+        shares = (change[:, 1:] - _COLOUR * colours - _BESIDE * beside).softmax(dim=1)
+        found = (shares * shares.new_tensor(offsets)[:, None, None]).sum(1, keepdim=True) + change[:, :1]
+        enlarged = interpolate(found, scale_factor=QUARTER, mode="bilinear")
+        return [enlarged, refined(found, self.weights(fine), max_pool2d(inside, QUARTER))], middle
 
 
-def correlation_pyramid(features: Tensor) -> list[Tensor]:
-    """Return the scalar products of ``features`` (2, C, h, w) along rows: (2, h, w, w') each.
+def _block(before: int, width: int, stride: int = 1) -> nn.Module:
+    return nn.Sequential(nn.Conv2d(before, width, 3, stride, padding=1), ResidualBlock(width))
 
-    Entry (v, y, x, x') is the root of C times the cosine between the features of pixel x of view v and pixel x' of the
-    other one; x' is pooled by two from one to the next.
+
+def offsets_of(shift: Tensor) -> list[int]:
+    """Return the offsets (D) that are looked at for the disparity ``shift`` of the middle of the person, even px."""
+    return [2 * round(float(x)) for x in (shift / 2) * torch.linspace(*RANGE, NUM_OFFSETS, device=shift.device)]
+
+
+def sweep(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Tensor:
+    """Return (2, 2 D, h, w): per offset the difference of colours, and how much of the other view there is background.
+
+    Of ``rgb`` (2, 3, H, W) and ``alpha`` (2, 1, H, W) at half the resolution, means over 3 x 3 and 2 x 2 of its pixels.
     """
-    features = normalize(features, dim=1) * features.shape[1] ** 0.25
-    volume = torch.einsum("chx,chy->hxy", features[0], features[1])
-    levels = [torch.stack([volume, volume.transpose(1, 2)])]
-    for _ in range(_LEVELS - 1):
-        pooled = avg_pool1d(levels[-1].flatten(0, 1), 2, ceil_mode=True, count_include_pad=False)
-        levels.append(pooled.unflatten(0, levels[-1].shape[:2]))
-    return levels
+    layers = avg_pool2d(torch.cat([rgb * alpha, alpha], dim=1), 2)
+    width = layers.shape[3]
+    room = min(max(abs(x) // 2 for x in offsets), width)
+    around = pad(layers.flip(0), (room, room))
+    colours, beside = [], []
+    for offset in offsets:
+        starts = (room - int(side) * max(-room, min(room, offset // 2)) for side in SIDES)
+        other = torch.stack([view[..., at : at + width] for view, at in zip(around, starts, strict=True)])
+        colours.append((other[:, :3] - layers[:, :3]).abs().mean(1))
+        beside.append(1 - other[:, 3])
+    volume = torch.stack([*colours, *beside], dim=1)
+    return avg_pool2d(avg_pool2d(volume, 3, 1, 1, count_include_pad=False), 2)
 
 
-def best_matches(volume: Tensor, inside: Tensor) -> Tensor:
-    """Return the offsets (2, 1, h, w) to the mean place in the other view, weighted by the softmax of ``volume``.
-
-    Places outside of the person, where ``inside`` (2, 1, h, w) is 0, do not count (Xu et al. 2022, GMFlow).
-    """
-    outside = inside.flip(0)[:, 0, :, None] == 0
-    shares = volume.masked_fill(outside, _NEVER).softmax(dim=3)
-    column = torch.arange(volume.shape[3], dtype=volume.dtype, device=volume.device)
-    place = (shares * column).sum(3)
-    return (volume.new_tensor(_SIDES)[:, None, None] * (column - place))[:, None]
-
-
-def looked_up(pyramid: Sequence[Tensor], offsets: Tensor) -> Tensor:
-    """Return the correlations (2, K, h, w) around ``offsets`` (2, 1, h, w), linear between pixels, 0 outside.
-
-    The entries of each level go from smaller offsets to larger ones, in both views.
-    """
-    sides = offsets.new_tensor(_SIDES)[:, None, None, None]
-    column = torch.arange(offsets.shape[3], dtype=offsets.dtype, device=offsets.device)[:, None]
-    around = torch.arange(-_RADIUS, _RADIUS + 1, dtype=offsets.dtype, device=offsets.device)
-    found = []
-    for level, volume in enumerate(pyramid):
-        size = 2.0**level
-        place = column - sides * (offsets[:, 0, :, :, None] + size * around)
-        place = (place + 0.5) / size - 0.5
-        first, last = place.floor(), volume.shape[3] - 1
-        part = place - first
-        entries = (
-            torch.gather(volume, 3, at.clamp(0, last).long()) * ((at >= 0) & (at <= last)) for at in (first, first + 1)
-        )
-        low, high = entries
-        found.append((1 - part) * low + part * high)
-    return torch.cat(found, dim=3).permute(0, 3, 1, 2)
-
-
-def refined(coarse: Tensor, weights: Tensor) -> Tensor:
+def refined(coarse: Tensor, weights: Tensor, inside: Tensor) -> Tensor:
     """Return (B, 1, 4 h, 4 w) means of 3x3 values of ``coarse`` (B, 1, h, w), weighted by the softmax of ``weights``.
 
     ``weights`` (B, 9 * 16, h, w) are logits of the nine, for each of the 16 pixels (convex upsampling, Teed and Deng
-    2020).
+    2020), next to those of a Gaussian around the pixel. Values where ``inside`` (B, 1, h, w) is 0 do not count.
     """
     batch, _, height, width = coarse.shape
-    padded = nn.functional.pad(coarse, (1, 1, 1, 1), mode="replicate")
-    nine = unfold(padded, 3).view(batch, 9, 1, 1, height, width)
-    shares = weights.view(batch, 9, QUARTER, QUARTER, height, width).softmax(dim=1)
-    fine = (shares * nine).sum(1)
+    values, known = (
+        unfold(pad(x, (1, 1, 1, 1), mode=mode), 3).view(batch, 9, 1, 1, height, width)
+        for x, mode in ((coarse, "replicate"), (inside, "constant"))
+    )
+    logits = weights.view(batch, 9, QUARTER, QUARTER, height, width) + _near_first(coarse)
+    shares = torch.where(known > 0, logits, _NEVER).softmax(dim=1)
+    fine = (shares * values).sum(1)
     return fine.permute(0, 3, 1, 4, 2).reshape(batch, 1, QUARTER * height, QUARTER * width)
+
+
+def _near_first(like: Tensor) -> Tensor:
+    """Return logits (9, 4, 4, 1, 1) of 3x3 values for each of 4x4 pixels in the middle: of their squared distance."""
+    pixel = (torch.arange(QUARTER, dtype=like.dtype, device=like.device) + 0.5) / QUARTER - 0.5
+    square = (torch.arange(-1.0, 2.0, dtype=like.dtype, device=like.device)[:, None] - pixel).square()
+    return -_SHARPNESS * (square[:, None, :, None] + square[None, :, None, :]).reshape(9, QUARTER, QUARTER, 1, 1)

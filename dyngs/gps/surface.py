@@ -10,23 +10,24 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.gps.keys import GpsModel
 from dyngs.gps.rectification import RectifiedPair
-from dyngs.gps.stereo import Encoder, StereoNetwork
+from dyngs.gps.stereo import Encoder, StereoNetwork, offsets_of, sweep
 from dyngs.models.convolution import ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
 
 HEADS = {"rotation": 4, "scale": 3, "opacity": 1}
 """Outputs per pixel and their number of channels."""
-LARGEST = 2.2
+LARGEST = 4.0
 """Largest standard deviation, in pixels of the window at the depth of the pixel: 2 cm for a person of 256 px images."""
-_SCALE_LOGIT, _OPACITY_LOGIT = -1.2, 2.0  # Of an untrained network: half a pixel, nearly opaque
+_SCALE_LOGIT, _OPACITY_LOGIT = -1.95, 4.0  # Of an untrained network: half a pixel, nearly opaque
 _DEPTH_WIDTHS = (16, 24, 32)  # Channels of the features of depth
-_FULL = 24  # Channels at full resolution
-_RANGE = 32.0  # px; offsets are divided by it before they enter a network
+_LAST = 32  # Channels of the features that Gaussians are made from
+_RANGE = 64.0  # px; offsets are divided by it before they enter a network
 _LEAST = 0.2  # Smallest disparity, relative to that of the middle of the person
 
 
@@ -34,55 +35,58 @@ _LEAST = 0.2  # Smallest disparity, relative to that of the middle of the person
 class Surface:
     """What the network says of two views."""
 
-    offsets: list[Tensor]  # (2, 1, H, W) by correlation alone, then after each iteration, px
+    offsets: list[Tensor]  # (2, 1, H, W), of which the last are the finest, px
     raw: Tensor | None  # (2, 8, H, W) in the order of ``HEADS``; None: only depth was asked for
 
 
 class GpsNetwork(nn.Module):
-    """Depth and Gaussians of two rectified views; features of the images are shared by both tasks."""
+    """Depth and Gaussians of two rectified views; features of the images are shared by both tasks.
+
+    It works at half the resolution of the windows, of which it is given four pixels as one, and returns four as one.
+    """
 
     def __init__(self, model: GpsModel, generator: torch.Generator) -> None:
         """Weights are drawn from ``generator`` on the CPU."""
         super().__init__()
-        self.iterations = model.iterations
         half, quarter, _ = model.widths
         with torch.device("cpu"):
-            self.encoder = Encoder(4, model.widths)
+            self.encoder = Encoder(16, model.widths)
             self.stereo = StereoNetwork(model.widths)
-            self.depth_encoder = Encoder(2, _DEPTH_WIDTHS)
+            self.depth_encoder = Encoder(8, _DEPTH_WIDTHS)
             below = quarter + _DEPTH_WIDTHS[1] + _DEPTH_WIDTHS[2]
             self.up = nn.ModuleList(
                 nn.Sequential(nn.Conv2d(before, half, 3, padding=1), ResidualBlock(half))
                 for before in (below, 2 * half + _DEPTH_WIDTHS[0])
             )
-            self.last = nn.Sequential(nn.Conv2d(half + 5, _FULL, 3, padding=1), nn.SiLU())
-            self.heads = nn.Conv2d(_FULL, sum(HEADS.values()), 1)
+            self.last = nn.Sequential(nn.Conv2d(half + 20, _LAST, 3, padding=1), nn.SiLU())
+            self.heads = nn.Conv2d(_LAST, 4 * sum(HEADS.values()), 1)
         begin_weights(self, generator)
-        for layer in (self.heads, self.stereo.change[-1]):
-            assert isinstance(layer, nn.Conv2d)
+        for layer in (self.heads, self.stereo.change, self.stereo.weights):
             nn.init.zeros_(layer.weight)
 
     def forward(self, pair: RectifiedPair, *, with_gaussians: bool = True) -> Surface:
         """Return the offsets of ``pair``, and what makes Gaussians of its pixels."""
         inside = pair.solid.float()
-        images = torch.cat([(2 * pair.rgb - 1) * inside, inside], dim=1)
+        images = pixel_unshuffle(torch.cat([(2 * pair.rgb - 1) * inside, pair.alpha], dim=1), 2)
         levels = self.encoder(images)
-        offsets, fused = self.stereo(levels, inside, self.iterations)
+        around = offsets_of(pair.shift)
+        offsets, fused = self.stereo(levels, sweep(pair.rgb, pair.alpha, around), around, inside)
         if not with_gaussians:
             return Surface(offsets, None)
-        depth = torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1)
+        depth = pixel_unshuffle(torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1), 2)
         halves, quarters, eighths = self.depth_encoder(depth)
         features = self.up[0](torch.cat([fused, quarters, upsampled(eighths)], dim=1))
         features = self.up[1](torch.cat([upsampled(features), levels[0], halves], dim=1))
-        features = self.last(torch.cat([upsampled(features), images, depth[:, :1]], dim=1))
-        return Surface(offsets, self.heads(features))
+        features = self.last(torch.cat([upsampled(features), images, depth[:, :4]], dim=1))
+        return Surface(offsets, pixel_shuffle(self.heads(features), 2))
 
 
 def gaussians_of(pair: RectifiedPair, surface: Surface) -> Gaussians:
     """Return the Gaussians of the pixels of the person in both views, differentiable in ``surface``.
 
     Means lie on the rays through the pixels, rotations are relative to the axes of the windows, colours are those of
-    the images. What the other view would show beside the person is transparent (visual hull).
+    the images. Outlines are as transparent as in the images; what the other view would show beside the person, wholly
+    (visual hull).
     """
     assert surface.raw is not None
     least = (_LEAST - 1) * pair.shift
@@ -93,7 +97,8 @@ def gaussians_of(pair: RectifiedPair, surface: Surface) -> Gaussians:
     part = dict(zip(HEADS, parts, strict=True))
     pixel = (depth[:, 0][solid] / pair.focal)[:, None]
     scales = LARGEST * pixel * (part["scale"] + _SCALE_LOGIT).sigmoid()
-    opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * pair.seen_by_other(offsets)[solid[:, None]]
+    within = (pair.alpha * pair.seen_by_other(offsets))[solid[:, None]]
+    opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * within
     opacities = opacities.clamp(1e-4, 1 - 1e-4)
     one = part["rotation"].new_tensor([1.0, 0.0, 0.0, 0.0])
     world_from_rect = quats_of(pair.rect_from_world.T[None])
@@ -113,9 +118,9 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def offset_loss(pair: RectifiedPair, offsets: Sequence[Tensor], decay: float) -> Tensor:
-    """Return the weighted sum over iterations of the mean error of offsets, px, where the truth is known.
+    """Return the weighted sum of the mean errors of ``offsets``, px, where the truth is known.
 
-    The last iteration counts 1, each before ``decay`` times the next (Teed and Deng 2020).
+    The last ones count 1, each before ``decay`` times the next (Teed and Deng 2020).
     """
     assert pair.offsets is not None
     known = pair.solid & pair.offsets.isfinite()

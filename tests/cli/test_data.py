@@ -15,6 +15,7 @@ from tiny_captures import write_colmap
 
 from dyngs.cli import data, main
 from dyngs.config import DataConfig
+from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.human.avatar import pose_fit
 from dyngs.human.motion.amass import write_amass
@@ -143,6 +144,21 @@ def test_a_person_is_synthesised_and_inspected(tmp_path: Path, capsys: PrintedOu
     assert {(view.width, view.height) for view in capture.splits["train"]} == {(12, 12)}
     assert main(["data", "inspect", str(out), "--format", "body_json"]) == 0
     assert "body_json" in capsys.readouterr().out
+
+
+def test_people_are_synthesised(tmp_path: Path, capsys: PrintedOutput) -> None:
+    """Again with more of them: those are added. Options of one person, and other options than before, are refused."""
+    out = tmp_path / "people"
+    words = ["data", "synth", "people", str(out), "--size", "12", "--cameras", "3", "--people"]
+    for count in (1, 2):
+        assert main([*words, str(count)]) == 0
+        assert f"dyngs train gps data.root={out}" in capsys.readouterr().out
+        people = captures_in(DataConfig(root=out))
+        captures = [read_capture(person) for person in people]
+        assert [sum(map(len, capture.splits.values())) for capture in captures] == [3] * count
+    assert "leave them out" in error_line(capsys, *words, "2", "--varied")
+    assert "other options" in error_line(capsys, *words, "2", "--seed", "5")
+    assert "--people" in error_line(capsys, "data", "synth", "human", str(tmp_path / "x"), "--people", "2")
 
 
 @pytest.mark.parametrize(

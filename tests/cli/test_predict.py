@@ -18,7 +18,7 @@ from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.cli.predict import parse_views
 from dyngs.config import Config
-from dyngs.runs.checkpoint import checkpoint_paths
+from dyngs.runs.checkpoint import checkpoint_paths, load_run
 
 
 def test_views_are_a_number_or_names() -> None:
@@ -146,3 +146,27 @@ def test_weights_that_do_not_suit_are_one_line(
         assert str(file) in error
         assert ("is not of this network" in error) == (name == "mixed")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_network_is_exported_as_one_file(
+    stereo: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which predicts like its run, but for float16; what is no network has no such file."""
+    run, person = stereo
+    file = tmp_path / "net.safetensors"
+    assert main(["export", str(run), "--format", "network", "--out", str(file)]) == 0
+    pair = ["--views", "2", "--out"]
+    for network, out in ((run, "a"), (file, "b")):
+        assert main(["predict", str(network), str(person), *pair, str(tmp_path / out)]) == 0
+    counts = [len(load_run(tmp_path / out).scene) for out in ("a", "b")]
+    assert counts[1] == pytest.approx(counts[0], rel=0.02)
+    capsys.readouterr()
+    other = shutil.copy(checkpoint_paths(run)[-1], tmp_path / "other.safetensors")
+    for words in (
+        ["export", str(tmp_path / "a"), "--format", "network"],
+        ["export", str(run), "--format", "network", "--time", "0"],
+        ["predict", str(other), str(person), *pair, str(tmp_path / "c")],
+    ):
+        assert main(words) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "c").exists()

@@ -1,73 +1,98 @@
-"""Correlation along rows against known shifts, look-ups, upsampling, gradients."""
+"""A sweep against known shifts, upsampling, what the untrained network finds, gradients."""
 
 from __future__ import annotations
 
+import pytest
 import torch
+from torch import Tensor
 
-from dyngs.gps.stereo import QUARTER, Encoder, StereoNetwork, best_matches, correlation_pyramid, looked_up, refined
+from dyngs.gps.stereo import NUM_OFFSETS, QUARTER, RANGE, Encoder, StereoNetwork, offsets_of, refined, sweep
 from dyngs.models.convolution import begin_weights
 
 WIDTHS = (8, 16, 16)
+SHIFT = torch.tensor(200.0)
 
 
-def shifted(offset: int) -> torch.Tensor:
-    """Features (2, C, h, w) of two views of a plane at ``offset`` pixels, each pixel unlike all others."""
-    features = torch.nn.functional.normalize(torch.randn(64, 6, 40, generator=torch.Generator().manual_seed(0)), dim=0)
-    left, right = features[:, :, 8:24], features[:, :, 8 + offset : 24 + offset]
-    return torch.stack([left, right])
+def plane(offset: int) -> tuple[Tensor, Tensor]:
+    """Colours and alpha (2, ..., 64, 128) of two views of a plane at ``offset`` pixels; between columns 16 and 112."""
+    noise = torch.rand(3, 32, 160, generator=torch.Generator().manual_seed(0))
+    pattern = torch.nn.functional.interpolate(noise[None], scale_factor=2)[0]
+    left = pattern[:, :, 96:224]
+    right = pattern[:, :, 96 + offset : 224 + offset]
+    alpha = torch.zeros(2, 1, 64, 128)
+    alpha[..., 16:112] = 1
+    return torch.stack([left, right]), alpha
 
 
-def test_the_correlation_is_highest_at_the_true_offset_in_both_views() -> None:
-    """Entry 4 + d of the first level is that of the offset d around the one that is looked at."""
-    for offset in (-3, 0, 2):
-        pyramid = correlation_pyramid(shifted(offset))
-        for around in (0.0, 1.0):
-            found = looked_up(pyramid, torch.full((2, 1, 6, 16), around))[:, :9].argmax(1)
-            inner = found[:, :, 5:11]
-            assert (inner == 4 + offset - around).all(), "of the left and the right view"
+def test_offsets_are_even_and_cover_the_range() -> None:
+    found = offsets_of(SHIFT)
+    assert len(found) == NUM_OFFSETS
+    assert all(x % 2 == 0 for x in found)
+    assert found == sorted(set(found))
+    assert (found[0], found[-1]) == (pytest.approx(RANGE[0] * 200, abs=1), pytest.approx(RANGE[1] * 200, abs=1))
 
 
-def test_the_best_match_is_the_true_offset_within_the_person() -> None:
-    """Where one pixel is alike, and no other inside; what lies outside of the person is never matched."""
-    for offset in (-3, 0, 2):
-        volume = 10 * correlation_pyramid(shifted(offset))[0]
-        found = best_matches(volume, torch.ones(2, 1, 6, 16))
-        torch.testing.assert_close(found[..., 5:11], torch.full((2, 1, 6, 6), float(offset)), atol=0.01, rtol=0)
-    only = torch.zeros(2, 1, 6, 16)
-    only[..., 7] = 1
-    found = best_matches(volume, only)
-    column = torch.arange(16.0).expand(6, 16)
-    torch.testing.assert_close(found[:, 0], torch.stack([column - 7, 7 - column]))
+@pytest.mark.parametrize("index", [4, 20, 40])
+def test_colours_agree_at_the_true_offset_in_both_views(index: int) -> None:
+    offsets = offsets_of(SHIFT)
+    rgb, alpha = plane(offsets[index])
+    colours, beside = sweep(rgb, alpha, offsets).split(NUM_OFFSETS, dim=1)
+    both = (alpha[:, :, ::4, ::4] > 0) & (beside[:, index : index + 1] == 0)
+    inner = both[:, 0] & (torch.arange(32) > 5) & (torch.arange(32) < 27)
+    assert inner.float().mean() > 0.2
+    assert (colours.argmin(1) == index)[inner].all()
+    assert colours.amin(1)[inner].max() < 1e-6
 
 
-def test_look_ups_are_linear_and_0_outside() -> None:
-    pyramid = correlation_pyramid(shifted(0))
-    low, high, between = (looked_up(pyramid, torch.full((2, 1, 6, 16), x))[:, :9] for x in (0.0, 1.0, 0.25))
-    torch.testing.assert_close(between, 0.75 * low + 0.25 * high)
-    assert (looked_up(pyramid, torch.full((2, 1, 6, 16), 1e3)) == 0).all()
-    assert [x.shape[3] for x in pyramid] == [16, 8, 4]
-    torch.testing.assert_close(pyramid[1], pyramid[0].unflatten(3, (8, 2)).mean(4))
+def test_what_the_other_view_shows_beside_the_person_is_known() -> None:
+    """At the left edge of the left view a nearer surface would be seen beside the person in the right one."""
+    offsets = offsets_of(SHIFT)
+    rgb, alpha = plane(0)
+    beside = sweep(rgb, alpha, offsets)[:, NUM_OFFSETS:, 8, 5]  # of columns 20 to 23 of 128, and two on either side
+    for side, found in zip((1, -1), beside, strict=True):
+        shown = [{16 <= column - side * x < 112 for column in range(18, 26)} for x in offsets]
+        assert {bool(y < 0.01) for y, known in zip(found, shown, strict=True) if known == {True}} == {True}
+        assert {bool(y > 0.99) for y, known in zip(found, shown, strict=True) if known == {False}} == {True}
 
 
-def test_upsampled_planes_stay_planes() -> None:
-    """Equal weights give means of nine; one weight of the middle gives the value itself."""
-    coarse = torch.arange(12.0).view(1, 1, 3, 4)
+def test_the_untrained_network_finds_what_is_plain() -> None:
+    torch.manual_seed(0)
+    encoder, stereo, offsets = Encoder(4, WIDTHS), StereoNetwork(WIDTHS), offsets_of(SHIFT)
+    for layer in (stereo.change, stereo.weights):
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.zeros_(layer.bias)
+    rgb, alpha = plane(offsets[25])
+    with torch.no_grad():
+        found, _ = stereo(encoder(torch.rand(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha)
+    for x in found:
+        assert (x[..., 48:80] - offsets[25]).abs().max() < 1
+
+
+def test_upsampled_values_are_means_of_those_inside() -> None:
+    """Of nine; one weight of the middle gives the value itself; untrained, what is next to a pixel counts most."""
+    coarse, everywhere = torch.arange(12.0).view(1, 1, 3, 4), torch.ones(1, 1, 3, 4)
     weights = torch.zeros(1, 9 * QUARTER**2, 3, 4)
+    soft = refined(coarse, weights, everywhere)
+    assert soft.shape == (1, 1, 12, 16)
+    assert (soft[0, 0, :, 6:10].diff(dim=1) > 0).all()
     weights.view(1, 9, QUARTER, QUARTER, 3, 4)[:, 4] = 50.0
-    fine = refined(coarse, weights)
-    assert fine.shape == (1, 1, 12, 16)
+    fine = refined(coarse, weights, everywhere)
     torch.testing.assert_close(fine, coarse.repeat_interleave(4, 2).repeat_interleave(4, 3))
-    assert (refined(torch.full_like(coarse, 3.0), torch.randn(1, 144, 3, 4)) - 3).abs().max() < 1e-5
+    assert (refined(torch.full_like(coarse, 3.0), torch.randn(1, 144, 3, 4), everywhere) - 3).abs().max() < 1e-5
+    inside = (torch.arange(4) < 2).float().expand(1, 1, 3, 4)
+    wild = torch.where(inside > 0, 3.0, 1e3)
+    assert (refined(wild, torch.randn(1, 144, 3, 4), inside)[..., :8] - 3).abs().max() < 1e-4
 
 
 def test_every_weight_gets_a_gradient() -> None:
     torch.manual_seed(0)
-    encoder, stereo = Encoder(4, WIDTHS), StereoNetwork(WIDTHS)
+    encoder, stereo, offsets = Encoder(4, WIDTHS), StereoNetwork(WIDTHS), offsets_of(SHIFT)
     begin_weights(stereo, torch.Generator().manual_seed(0))
-    found, fused = stereo(encoder(torch.randn(2, 4, 32, 24)), torch.ones(2, 1, 32, 24), 3)
-    assert [x.shape for x in found] == [(2, 1, 32, 24)] * 4
-    assert fused.shape == (2, 16, 8, 6)
-    sum(x.square().mean() for x in found).backward()
+    rgb, alpha = plane(0)
+    found, features = stereo(encoder(torch.randn(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha)
+    assert [x.shape for x in found] == [(2, 1, 64, 128)] * 2
+    assert features.shape == (2, 16, 8, 16)
+    (sum(x.square().mean() for x in found) + features.square().mean()).backward()
     for name, x in [*encoder.named_parameters(), *stereo.named_parameters()]:
         assert x.grad is not None, name
         assert x.grad.abs().sum() > 0, name

@@ -10,7 +10,7 @@ from dyngs.config import GpsModel
 from dyngs.gps.rectification import RectifiedPair, rectified
 from dyngs.gps.surface import LARGEST, GpsNetwork, Surface, gaussians_of, joined, offset_loss
 
-MODEL = GpsModel(person_px=40, widths=(8, 16, 16), iterations=2)
+MODEL = GpsModel(person_px=40, widths=(8, 16, 16))
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
     """Of the depth from its error, and of everything from what the Gaussians are."""
     network = GpsNetwork(MODEL, torch.Generator().manual_seed(0))
     torch.nn.init.normal_(network.heads.weight, generator=torch.Generator().manual_seed(1))
-    torch.nn.init.normal_(network.stereo.change[-1].weight, std=0.1, generator=torch.Generator().manual_seed(2))
+    torch.nn.init.normal_(network.stereo.change.weight, std=0.1, generator=torch.Generator().manual_seed(2))
     surface = network(pair, with_gaussians=False)
     assert surface.raw is None
     offset_loss(pair, surface.offsets, 0.9).backward()
