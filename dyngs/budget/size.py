@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,8 +13,9 @@ from torch import Tensor
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.kinds import GaussianTrainer, restored_scene
+from dyngs.kinds import restored_model
 from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU
 from dyngs.prune.stage import highest, probe_images, quality_of, scores_of
 from dyngs.runs.checkpoint import SCENE_FILE
@@ -22,6 +24,8 @@ from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.storage.file import decoded, encoded, write_scene
 from dyngs.storage.measure import storage_plan
 from dyngs.storage.tensors import drawable, step_below
+from dyngs.training.trainer import Trainer
+from dyngs.triangles.scene import TriangleScene
 
 KEPT = 0.7
 """Fraction of the Gaussians that each trial keeps of those of the trial before."""
@@ -77,27 +81,28 @@ def has_file(run_dir: Path) -> bool:
 
 
 @torch.no_grad()
-def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> SizeReport:
+def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> SizeReport:
     """Write ``scene.dyngs``, of at most so many 1e6 bytes, into a folder of ``run_dir``, and return a report.
 
     Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians, as long as the latter
-    makes training images better than the former alone. The ``trainer`` is at the end of its run and left as it is.
+    makes training images better than the former alone; triangles, which would leave holes, all stay. The ``trainer`` is
+    at the end of its run and left as it is.
     """
     full, config = trainer.checkpoint(), trainer.config
     scene, images = trainer.model.scene.to(CPU), probe_images(trainer)  # files are made on the CPU
     before = quality_of(trainer, scene, images)
     plan = storage_plan(config, full, scene, None)
 
-    def stored(kept: GaussianScene, coarseness: Tensor | None) -> _File | None:
+    def stored(kept: GaussianScene | TriangleScene, coarseness: Tensor | None) -> _File | None:
         found = _fitted(full.info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
         if found is None:
             return None
         data, coarser = found
-        read = restored_scene(decoded(data), config.model)
+        read = restored_model(decoded(data), config.model)
         return _File(data, quality_of(trainer, read, images), len(kept), coarser)
 
     chosen = stored(scene, plan.coarseness)
-    if chosen is None or chosen.coarser > 1:
+    if isinstance(scene, GaussianScene) and (chosen is None or chosen.coarser > 1):
         scores, fraction = scores_of(trainer).cpu(), KEPT
         while fraction * len(scene) >= 1:
             kept = highest(scores, 1 - fraction)
@@ -114,7 +119,7 @@ def write_within(trainer: GaussianTrainer, run_dir: Path, megabytes: float) -> S
 
 
 def _fitted(
-    info: CheckpointInfo, scene: GaussianScene, coarseness: Tensor | None, steps: Mapping[str, float], most: int
+    info: CheckpointInfo, scene: Renderable, coarseness: Tensor | None, steps: Mapping[str, float], most: int
 ) -> tuple[bytes, float] | None:
     """Return the bytes of a file of at most ``most``, and the factor on ``steps`` that this took; None: none fits."""
     num_values = sum(x.numel() for x in drawable(scene).values())

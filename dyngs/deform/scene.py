@@ -15,7 +15,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, matched
-from dyngs.models.renderable import clamped_time
+from dyngs.models.renderable import Renderable, clamped_time
 from dyngs.state import Role, State, StateTensor, part_of, prefixed
 from dyngs.tensor_checks import require_ascending, require_indices
 
@@ -136,7 +136,7 @@ class DynamicScene(GaussianScene):
         return _Part(gaussians.picked(active), std, means, asked, rows)
 
 
-def field_scene_of(scene: GaussianScene) -> DynamicScene | None:
+def field_scene_of(scene: Renderable) -> DynamicScene | None:
     """Return ``scene`` if a deformation field moves it, None for any other scene."""
     return scene if isinstance(scene, DynamicScene) and not scene.is_static else None
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.kinds import restored_scene
+from dyngs.kinds import restored_model
+from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import folder_of_export
@@ -51,13 +51,13 @@ def write_scene_file(
     inputs_of(run_dir).require_output(out)
     with folder_of_export(out, run_dir, config) as folder:
         checkpoint = latest_checkpoint(run_dir)
-        scene = restored_scene(checkpoint, config.model)
+        scene = restored_model(checkpoint, config.model)
         plan = storage_plan(config, checkpoint, scene, max_change)
         precision = plan.precision
         steps = {name: step * (field_step if name.startswith(FIELD) else 1) for name, step in precision.steps.items()}
         data = encoded(checkpoint.info, scene, steps, plan.coarseness)
         if plan.images is not None and precision.allowed is not None and field_step == 1:
-            stored = restored_scene(decoded(data), config.model)
+            stored = restored_model(decoded(data), config.model)
             precision = _checked(run_dir, precision, plan.images(scene), plan.images(stored))
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
@@ -82,6 +82,6 @@ def _checked(run_dir: Path, precision: Precision, before: Sequence[Tensor], afte
     return replace(precision, change=change)
 
 
-def num_bytes_exact(scene: GaussianScene) -> int:
+def num_bytes_exact(scene: Renderable) -> int:
     """Return the bytes of what drawing needs, as it is in memory."""
     return sum(x.numel() * x.itemsize for x in drawable(scene).values())

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from statistics import fmean
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,10 +30,12 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.kinds import GaussianTrainer
 from dyngs.metrics import psnr
+from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
 from dyngs.training.events import Event, Message, Started, StepDone, TopologyChanged
 from dyngs.training.loop import Loop
+from dyngs.training.trainer import Trainer
 
 STEEPNESS = 4.0  # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 VOLUME_POWER = 0.1
@@ -226,15 +229,15 @@ def scoring_views(
     return ScoringViews(scene, cameras, times, trainer.model.options, background)
 
 
-def probe_images(trainer: GaussianTrainer) -> list[Image]:
+def probe_images(trainer: Trainer[Any]) -> list[Image]:
     """Return at most 16 training images, evenly chosen."""
     return [trainer.images[i] for i in evenly_spaced(len(trainer.images), PROBED_VIEWS)]
 
 
 @torch.no_grad()
 def quality_of(
-    trainer: GaussianTrainer,
-    scene: GaussianScene,
+    trainer: Trainer[Any],
+    scene: Renderable,
     images: Sequence[Image] | None = None,
     alpha_min: float | None = None,
 ) -> float:

@@ -29,6 +29,7 @@ from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.write import atomic_file
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.renderable import Renderable
 from dyngs.storage.tensors import (
     COARSENESS,
     Coding,
@@ -207,21 +208,15 @@ def read_scene(path: Path) -> Checkpoint:
 
 
 def encoded(
-    info: CheckpointInfo, scene: GaussianScene, steps: Mapping[str, float], coarseness: Tensor | None = None
+    info: CheckpointInfo, scene: Renderable, steps: Mapping[str, float], coarseness: Tensor | None = None
 ) -> bytes:
     """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is not finite.
 
     ``steps`` are of groups of tensors, see ``dyngs.storage.precision``; others are stored in half precision.
     ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are stored alike.
     """
-    means = scene.gaussians.means.detach()
-    if not bool(means.isfinite().all()):
-        raise DyngsError("means is not finite; it cannot be stored")
-    edit = stored_edit(scene, restored(means, coding_of("gaussians.means", means, steps)).numpy())
-    kept, scale = drawable(scene.edited(edit)), None
-    if coarseness is not None:
-        kept[COARSENESS] = edit.apply(coarseness)
-        scale = checked_coarseness(kept[COARSENESS], len(means))
+    kept = _ordered(scene, steps, coarseness) if isinstance(scene, GaussianScene) else drawable(scene)
+    scale = None if coarseness is None else checked_coarseness(kept[COARSENESS], len(coarseness))
     entries, blocks = [], []
     for name in sorted(kept):
         coding = coding_of(name, kept[name], steps, by_coarseness=scale is not None)
@@ -235,6 +230,16 @@ def encoded(
     num_values = sum(math.prod(entry.shape) for entry in entries)
     body += bytes(max(0, (num_values - FREE_VALUES) // VALUES_PER_BYTE + 1 - len(body)))
     return body + hashlib.sha256(body).digest()
+
+
+def _ordered(scene: GaussianScene, steps: Mapping[str, float], coarseness: Tensor | None) -> dict[str, Tensor]:
+    """Return the tensors of ``drawable``, and ``coarseness``, in the order in which Gaussians are stored."""
+    means = scene.gaussians.means.detach()
+    if not bool(means.isfinite().all()):
+        raise DyngsError("means is not finite; it cannot be stored")
+    edit = stored_edit(scene, restored(means, coding_of("gaussians.means", means, steps)).numpy())
+    more = {} if coarseness is None else {COARSENESS: edit.apply(coarseness)}
+    return drawable(scene.edited(edit)) | more
 
 
 def decoded(data: bytes) -> Checkpoint:

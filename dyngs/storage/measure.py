@@ -18,8 +18,9 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import GaussianScene, render_options
-from dyngs.kinds import restored_scene
+from dyngs.kinds import restored_model, restored_scene
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.storage.file import decoded, encoded
 from dyngs.storage.precision import (
@@ -30,17 +31,18 @@ from dyngs.storage.precision import (
     measured_precision,
     rounded,
 )
-from dyngs.storage.tensors import COARSENESS, completed, drawable, step_below
+from dyngs.storage.tensors import COARSENESS, TRIANGLES, completed, drawable, step_below
 
 LOSS_DB = 0.025
 """Allowed loss of PSNR on training images, dB. On others it is up to twice as much."""
+_ASSUMED = Precision({TRIANGLES: 0.0})  # of triangles: places as they are, all else in half precision
 COMPARED = 6  # number of training views in which the change is measured
 SMALLEST_CHANGE = 0.01  # smallest change to allow, in grey levels of 255
 LOOKED_AT = 50  # number of training views in which the visibility of each Gaussian is measured
 
 FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))  # factors on the usual steps that are tried, by bisection
 
-Images = Callable[[GaussianScene], list[Tensor]]
+Images = Callable[[Renderable], list[Tensor]]
 """Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
 
 
@@ -61,7 +63,7 @@ class _Shot:
     time: float | None
 
 
-def storage_plan(config: Config, checkpoint: Checkpoint, scene: GaussianScene, max_change: float | None) -> StoragePlan:
+def storage_plan(config: Config, checkpoint: Checkpoint, scene: Renderable, max_change: float | None) -> StoragePlan:
     """Return how exactly ``scene`` must be stored: measured where the run's capture can be read.
 
     ``checkpoint``: of ``scene``. ``max_change``: root mean square over all values of some training images, grey levels
@@ -70,17 +72,20 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: GaussianScene, m
     try:
         capture = read_capture(config.data)
     except DyngsError:
-        return StoragePlan(assumed_precision(scene.gaussians))
-    coarseness = coarseness_of(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
+        return StoragePlan(assumed_precision(scene.gaussians) if isinstance(scene, GaussianScene) else _ASSUMED)
+    coarseness = None
+    if isinstance(scene, GaussianScene):
+        coarseness = coarseness_of(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
     _, background = evaluation_background(config.data.background, capture.has_alpha)
-    shots, options = _shots(config, capture, scene, COMPARED), render_options(config.model)
+    shots = _shots(config, capture, scene, COMPARED)
+    options = render_options(config.model) if isinstance(scene, GaussianScene) else scene.options
 
     @torch.no_grad()
-    def images(drawn: GaussianScene) -> list[Tensor]:
+    def images(drawn: Renderable) -> list[Tensor]:
         return [drawn.render(shot.cameras, shot.time, options=options, background=background).rgb[0] for shot in shots]
 
     def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
-        return images(restored_scene(replace(checkpoint, tensors=dict(tensors)), config.model))
+        return images(restored_model(replace(checkpoint, tensors=dict(tensors)), config.model))
 
     wanted = images(scene)
     if max_change is None:
@@ -88,7 +93,7 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: GaussianScene, m
         truth = (loader[i].composite(background) for i in range(len(loader)))
         errors = [float((x.clamp(0, 1) - y).square().mean()) for x, y in zip(wanted, truth, strict=True)]
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
-    exact = drawable(scene) | {COARSENESS: coarseness}
+    exact = drawable(scene) | ({} if coarseness is None else {COARSENESS: coarseness})
     return StoragePlan(measured_precision(exact, wanted, redrawn, max(max_change, SMALLEST_CHANGE)), coarseness, images)
 
 
@@ -137,7 +142,7 @@ def coarsest_file(
     return None
 
 
-def _shots(config: Config, capture: Capture, scene: GaussianScene, count: int) -> list[_Shot]:
+def _shots(config: Config, capture: Capture, scene: Renderable, count: int) -> list[_Shot]:
     """Return at most ``count`` training views, evenly chosen; where they have no times, those of the scene."""
     chosen = _chosen(capture, count)
     times: Sequence[float | None] = [view.time for view in chosen]

@@ -18,7 +18,8 @@ from torch import Tensor
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.order import storage_order
-from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.scene import GaussianScene, require_gaussians
+from dyngs.models.renderable import Renderable
 from dyngs.ops.quaternions import quat_product
 from dyngs.state import tensors_of
 
@@ -154,6 +155,7 @@ class TensorKind(str, Enum):
 
 
 FIELD = "model.field.learned."  # prefix of the learned tensors of a deformation field
+TRIANGLES = "triangles.points"  # what a scene of triangles has in place of Gaussians
 GAUSSIANS = tuple(field.name for field in fields(Gaussians))
 MAX_COARSENESS = 6  # most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
 COARSENESS = "gaussians.coarseness"
@@ -162,6 +164,7 @@ _KINDS = {
     "gaussians.quats": TensorKind.ROTATION,
     "gaussians.logit_opacities": TensorKind.OPACITY,
     "gaussians.sh_rest": TensorKind.SPARSE,
+    "triangles.harmonics": TensorKind.SPARSE,
 }
 _LIMITS = {TensorKind.ROTATION: (SMALLEST_STEP, ROTATION_STEP), TensorKind.OPACITY: OPACITY_STEPS}
 FEW = 64  # number of values up to which tensors are stored as they are
@@ -213,15 +216,19 @@ class Whole:
     far: np.ndarray
 
 
-def drawable(scene: GaussianScene) -> dict[str, Tensor]:
+def drawable(scene: Renderable) -> dict[str, Tensor]:
     """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by length.
 
-    Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not finite.
+    Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not finite, or there are
+    neither Gaussians nor triangles.
     """
     kept = tensors_of(scene.drawing_state())
     for name, x in kept.items():
         if x.is_floating_point() and not bool(torch.isfinite(x).all()):
             raise DyngsError(f"{name.partition('.')[2]} is not finite; it cannot be stored")
+    if TRIANGLES in kept:
+        return kept
+    scene = require_gaussians(scene, "this scene")
     sh = kept.pop("gaussians.sh")
     kept |= {"gaussians.sh_base": sh[:, 0], "gaussians.sh_rest": sh[:, 1:]}
     sorts = torch.ones(len(sh), dtype=torch.bool, device=sh.device)
@@ -236,9 +243,12 @@ def drawable(scene: GaussianScene) -> dict[str, Tensor]:
 def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors of a checkpoint that can be drawn, but not trained on, from stored ones.
 
-    Raises KeyError: one is missing that every scene has. ValueError: the Gaussians' tensors do not fit together.
+    Raises KeyError: one is missing that every scene of Gaussians has. ValueError: the tensors of these do not fit
+    together. Those of triangles are looked at where they are restored.
     """
     full = dict(tensors)
+    if TRIANGLES in full:
+        return full
     base, rest = full.pop("gaussians.sh_base"), full.pop("gaussians.sh_rest")
     full["gaussians.sh"] = torch.cat([base[:, None], rest], dim=1)
     Gaussians(**{name: full[f"gaussians.{name}"] for name in GAUSSIANS})  # they must fit together

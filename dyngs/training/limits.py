@@ -14,6 +14,7 @@ from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import new_field
 from dyngs.errors import DyngsError
 from dyngs.training.processes import Processes
+from dyngs.triangles.keys import BgTriangleModel
 
 RANDOM_FRACTION = 0.1  # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
@@ -30,9 +31,11 @@ def require_possible(config: Config) -> None:
     _require_batch(config)
     budget = config.budget
     given = [name for name, value in budget.model_dump().items() if value is not None]
+    is_triangles = isinstance(config.model, BgTriangleModel)
+    given = [name for name in given if not (is_triangles and name == "max_mb")]
     if given and not config.model.made_of_gaussians:
-        kind = config.model.kind
-        raise DyngsError(f"budget.{given[0]}: model.kind={kind} has no Gaussians that could be limited; leave it out")
+        kind, instead = config.model.kind, "give model.max_triangles" if is_triangles else "leave it out"
+        raise DyngsError(f"budget.{given[0]}: model.kind={kind} has no Gaussians that could be limited; {instead}")
     if config.train.minutes is not None and config.model.is_network:
         raise DyngsError(f"train.minutes: model.kind={config.model.kind} is trained for train.steps; leave it out")
     if config.train.minutes is not None and config.prune.is_wanted:
@@ -98,7 +101,7 @@ def within_cap(config: Config, num_times: int) -> Config:
 def most_gaussians(config: Config, num_times: int) -> int | None:
     """Return the largest number of Gaussians at the end by the limits of the run; None without one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
-    if config.budget.max_mb is not None and not config.model.is_posed:
+    if config.budget.max_mb is not None and config.model.made_of_gaussians and not config.model.is_posed:
         limits.append(room(config, num_times, config.budget.max_mb))
     return min(limits, default=None)
 

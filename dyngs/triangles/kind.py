@@ -10,12 +10,15 @@ from dyngs.gaussians.init import StartValues, initial_gaussians, surroundings
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.views import evaluation_background
+from dyngs.ops.patches import NUM_POINTS, lattice_size
 from dyngs.triangles.first import first_surface
 from dyngs.triangles.keys import BgTriangleModel
 from dyngs.triangles.patches import Patches, flat_triangles
 from dyngs.triangles.scene import TriangleScene, scene_options, stored_triangles
 from dyngs.triangles.training import TriangleTraining
 
+VALUE_BYTES = 1.3  # In a file, per value of a triangle
+FEWEST = 100  # Fewest triangles that a limit on the file must have room for
 RADIUS = 1.5  # Of the first triangles, in mean distances of their points' three nearest neighbours
 INNER = 0.02  # Fraction of the points on either side that does not count for the scene's size
 
@@ -23,11 +26,25 @@ INNER = 0.02  # Fraction of the points on either side that does not count for th
 def start(run: RunStart) -> TriangleTraining:
     """Return triangles turned at random at the first points of a capture, in whose place those of a surface come.
 
-    Raises DyngsError: the points are no scene.
+    Raises DyngsError: the points are no scene, or ``budget.max_mb`` has no room.
     """
     model = run.config.model
     assert isinstance(model, BgTriangleModel)
+    megabytes = run.config.budget.max_mb
+    model = model if megabytes is None else _within(model, megabytes)
     return TriangleTraining(run, *_at_points(run, model), model, first=_on_surface if model.gaussian_steps else None)
+
+
+def _within(model: BgTriangleModel, megabytes: float) -> BgTriangleModel:
+    """Return ``model`` with as many triangles as a file of so many 1e6 bytes holds at the usual precision."""
+    values = 3 * (NUM_POINTS + lattice_size(model.texture) + num_sh_terms(model.sh_degree) - 1)
+    most = int(1e6 * megabytes / (VALUE_BYTES * values))
+    if most < FEWEST:
+        raise DyngsError(
+            f"budget.max_mb={megabytes:g}: has no room for {FEWEST} triangles; "
+            f"{1e-6 * FEWEST * VALUE_BYTES * values * 1.05:.2g} would do"
+        )
+    return model.model_copy(update={"max_triangles": min(most, model.max_triangles)})
 
 
 def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:

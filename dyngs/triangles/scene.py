@@ -60,6 +60,9 @@ class TriangleScene(Renderable):
     options: TriangleOptions = dataclasses.field(default_factory=TriangleOptions)
     background: Tensor | None = None
 
+    def __len__(self) -> int:
+        return len(self.patches)
+
     @property
     def times(self) -> tuple[float, ...]:
         return ()

@@ -20,7 +20,7 @@ from dyngs.state import State, prefixed
 from dyngs.triangles.densify import change
 from dyngs.triangles.keys import BgTriangleModel
 from dyngs.triangles.patches import Patches
-from dyngs.triangles.scene import TriangleScene, rendering_of, scene_options, stored_triangles
+from dyngs.triangles.scene import TriangleOptions, TriangleScene, rendering_of, scene_options, stored_triangles
 from dyngs.triangles.tallies import Tallies, slopes_of
 
 EVERY, LEAST_EVERY, UNTIL = 300, 50, 14_000
@@ -57,6 +57,11 @@ class TriangleTraining(Model[TriangleScene]):
     @property
     def scene(self) -> TriangleScene:
         return replace(self._like, patches=self._patches)
+
+    @property
+    def options(self) -> TriangleOptions:
+        """How it is drawn."""
+        return self._like.options
 
     @property
     def leaves(self) -> Sequence[Tensor]:

@@ -13,8 +13,12 @@ from small_triangles import config_of
 
 import dyngs
 from dyngs.cli import main
+from dyngs.config.io import load_resolved
+from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.kinds import build
+from dyngs.metrics import psnr
+from dyngs.models.views import training_cameras
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
 from dyngs.triangles.scene import TriangleScene
@@ -52,6 +56,27 @@ def test_it_is_drawn(run: Path, tmp_path: Path) -> None:
     assert len(list((tmp_path / "images").rglob("*.png"))) > 1
 
 
+def test_a_file_of_it_is_as_small_as_asked(capture: Path, tmp_path: Path) -> None:
+    """Half of what its 72 values a triangle take at the usual precision: it begins with fewer, and is no larger."""
+    run = tmp_path / "run"
+    keys = ["train.steps=60", "model.gaussian_steps=100", "model.max_triangles=1000"]
+    dyngs.train(config_of(capture, *keys, "budget.max_mb=0.0125", f"run.dir={run}"))
+    file = run / "export" / "scene.dyngs"
+    assert file.stat().st_size <= 12500
+    whole, stored = (open_run(folder).renderable for folder in (run, file.parent))
+    assert isinstance(whole, TriangleScene)
+    assert isinstance(stored, TriangleScene)
+    assert 100 <= len(stored.patches) == len(whole.patches) <= 12500 / (72 * 1.3)
+    view = training_cameras(open_run(run).capture.splits["train"][:1], load_resolved(run).data)[0]
+    assert psnr(stored.render(view).rgb, whole.render(view).rgb) > 30
+
+
+def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match=r"budget.max_mb=0.005: has no room for 100 triangles; 0.0098 would do"):
+        dyngs.train(config_of(capture, "budget.max_mb=0.005", f"run.dir={tmp_path / 'run'}"))
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
 def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"mesh{suffix}"
@@ -72,12 +97,15 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
         (["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"], "1 to 64"),
         (["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"], "radiance field"),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
+        (["tradeoff", "RUN", "--out", "OUT/tradeoff"], "Gaussians"),
+        (["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.min_fps=5"], "model.max_triangles"),
     ],
 )
 def test_what_does_not_go_is_refused(
-    run: Path, tmp_path: Path, command: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    run: Path, capture: Path, tmp_path: Path, command: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [word.replace("RUN", str(run)).replace("OUT", str(tmp_path)) for word in command]
+    words = [word.replace("CAPTURE", str(capture)) for word in words]
     assert main(words) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1

@@ -22,7 +22,7 @@ class OrbitCamera {
     const { views, target } = this.scene;
     this.index = ((index % views.length) + views.length) % views.length;
     const { camFromWorld: m, intrinsics, width, height } = views[this.index];
-    const eye = [0, 1, 2].map((k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]));
+    const eye = eyeOf(m);
     const forward = [m[8], m[9], m[10]];
     this.distance = Math.max(dot(plus(target, eye, -1), forward), 0.05 * Math.hypot(...plus(target, eye, -1)), 1e-6);
     this.target = plus(eye, forward, this.distance);

@@ -8,7 +8,8 @@ class App {
   constructor(scene) {
     this.scene = scene;
     this.canvas = document.getElementById("canvas");
-    this.renderer = new Renderer(this.canvas, scene, new Motion(scene));
+    this.renderer = scene.segments
+      ? new TriangleRenderer(this.canvas, scene) : new Renderer(this.canvas, scene, new Motion(scene));
     this.camera = new OrbitCamera(scene);
     this.player = new Player(scene, () => this.changed());
     this.coarse = 1; // fraction of the pixels' sides that are drawn

@@ -1,4 +1,4 @@
-"""The numbers that a page draws: Gaussians, what moves them, and what colours them; ``data.js`` reads them.
+"""The numbers that a page draws: Gaussians, what moves them, what colours them, or triangles; ``data.js`` reads them.
 
 Local letters: N Gaussians, M of them moving, J joints, F frames of a clip; R rows and D columns of a list.
 """
@@ -24,6 +24,8 @@ from dyngs.gaussians.order import storage_order
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.triangles.patches import CORNERS
+from dyngs.triangles.scene import TriangleScene
 
 BONES = 8  # bones that a Gaussian follows on the page
 FINE = ("means", "quats")  # splines of nodes that are stored in 16 bits
@@ -105,6 +107,19 @@ def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str,
     if scene.colour is not None:
         told["network"] = _add_network(scene.colour, lists)
     return told | {"count": len(scene), "frames": len(scene.times), "moves": not scene.is_static}
+
+
+def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
+    """Add the numbers of curved triangles to ``lists`` and return what the page needs to know about them."""
+    patches = scene.patches
+    middles = _numpy(patches.points[:, CORNERS].mean(1))
+    order = torch.from_numpy(storage_order(middles, np.zeros(0, dtype=np.int64)))
+    lists.quantised("points", _numpy(patches.points[order].flatten(1)), 16)
+    lists.quantised("colours", _numpy(patches.colours[order].flatten(1)), 8)
+    if patches.sh_degree:
+        lists.quantised("rest", _numpy(patches.harmonics[order].flatten(1)), 8)
+    told = {"degree": patches.sh_degree, "texture": patches.texture, "segments": scene.options.segments}
+    return told | {"bounds": scene.bounds.tolist(), "count": len(scene), "frames": 0, "moves": False}
 
 
 def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:

@@ -17,19 +17,23 @@ from dyngs.data.capture import Capture, View
 from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.errors import counted
-from dyngs.export.chosen_path import front_of, orbit_around, view_to_show
-from dyngs.export.html.numbers import Lists, add_scene
+from dyngs.export.chosen_path import front_of, orbit_around, points_at, view_to_show
+from dyngs.export.html.numbers import Lists, add_scene, add_triangles
 from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.files.write import write_text
+from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.rotation import AXES
+from dyngs.triangles.scene import TriangleScene
 
 HERE = Path(__file__).parent
-SCRIPTS = ("data.js", "motion.js", "sort.js", "renderer.js", "camera.js", "player.js", "main.js")
+SCRIPTS = ("data.js", "motion.js", "sort.js", "drawing.js", "renderer.js", "triangles.js", "camera.js", "player.js")
+SCRIPTS += ("main.js",)
 SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
+SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 TOLERANCE = 0.25  # pixels of the first view that a place at its target may be off where motion is fitted
 
 
@@ -77,7 +81,7 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     if curves.get("error"):
         fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {curves['error']:.2g}"
         notes.append(f"splines are fitted to the motion ({fit} world units)")
-    moved = field_scene_of(opened.scene)
+    moved = field_scene_of(opened.renderable)
     if moved is not None and bodies_of(moved.field) is not None:
         notes.append("shadows of bodies that turn are left out")
     return tuple(notes)
@@ -86,15 +90,14 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
 def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists) -> dict[str, Any]:
     views, target = (views, _middle(opened)) if views else _views(opened)
     upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
-    first, options = views[0], opened.scene.options
-    apart = float((first.centers[0] - first.centers.new_tensor(target)).norm())
-    pixel = max(apart, 1e-6) / float(first.intrinsics[0, 1, 1])
-    told = add_scene(opened.scene, lists, TOLERANCE * pixel)
+    if isinstance(opened.renderable, TriangleScene):
+        told = add_triangles(opened.renderable, lists)
+    else:
+        apart = float((views[0].centers[0] - views[0].centers.new_tensor(target)).norm())
+        pixel = max(apart, 1e-6) / float(views[0].intrinsics[0, 1, 1])
+        told = add_scene(opened.scene, lists, TOLERANCE * pixel) | _drawn(opened.scene.options)
     shown = {
-        "eps2d": options.eps2d,
-        "near": options.near,
-        "alphaMin": options.alpha_min,
-        "antialiased": options.mode == RasterizeMode.ANTIALIASED,
+        "near": opened.renderable.options.near,
         "background": opened.background.tolist(),
         "target": target,
         "up": upward.tolist(),
@@ -103,6 +106,14 @@ def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists)
         "views": [_view(camera) for camera in views],
     }
     return told | shown
+
+
+def _drawn(options: RenderOptions) -> dict[str, Any]:
+    return {
+        "eps2d": options.eps2d,
+        "alphaMin": options.alpha_min,
+        "antialiased": options.mode == RasterizeMode.ANTIALIASED,
+    }
 
 
 def _views(opened: Opened) -> tuple[list[Cameras], list[float]]:
@@ -121,7 +132,7 @@ def _views(opened: Opened) -> tuple[list[Cameras], list[float]]:
 
 
 def _middle(opened: Opened) -> list[float]:
-    return np.median(opened.scene.at(None).means.numpy(), axis=0).tolist()
+    return np.median(points_at(opened.renderable).cpu().numpy(), axis=0).tolist()
 
 
 def _some(capture: Capture) -> list[View]:
@@ -156,7 +167,8 @@ def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
     fixed |= {"style_hash": source_hash(style), "script_hash": source_hash(script), "title": html.escape(title)}
     fixed |= {"header": script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
-    fixed["about"] = f"{counted(header['count'], 'Gaussian')}, {size / 1e6:.1f} MB"
+    kind = "triangle" if "texture" in header else "Gaussian"
+    fixed["about"] = f"{counted(header['count'], kind)}, {size / 1e6:.1f} MB"
     return filled(page, fixed)
 
 

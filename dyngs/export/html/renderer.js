@@ -1,38 +1,31 @@
 // Drawing with WebGL 2: project.glsl computes every Gaussian once, splat.*.glsl blends their squares far to near.
 
-const ROW = 2048; // texels of a texture that holds a list
 const BATCH = 16384; // squares of one call: their corners are numbered by 16 bits
 const CORNERS = [0, 1, 2, 3].flatMap((k) => [`vCorner${k}`, `vColor${k}`]);
 const CORNER_BYTES = 32;
 
-class Renderer {
+class Renderer extends Drawing {
   constructor(canvas, scene, motion) {
-    const gl = canvas.getContext("webgl2", {
-      antialias: false, depth: false, alpha: false, powerPreference: "high-performance",
-    });
-    if (!gl) throw new Error("it needs WebGL 2, which this browser does not offer (is hardware acceleration off?)");
-    Object.assign(this, { canvas, gl, scene, motion });
+    super(canvas, scene);
+    const { gl } = this;
+    this.motion = motion;
     // Eight bits are few for hundreds of layers: blended in half floats where they can be drawn to.
     this.deep = Boolean(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     this.order = new DepthOrder(scene.count);
-    this.limit = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    this.textures = [];
     this.prepareLists();
     this.project = this.program("project.glsl", null, CORNERS, this.definitions());
     this.splat = this.program("splat.vert.glsl", "splat.frag.glsl");
     this.copy = this.program("copy.vert.glsl", "copy.frag.glsl");
     this.prepareBuffers();
     this.view = null;
-    this.size = [0, 0];
   }
 
   definitions() {
     const { scene, motion } = this, network = scene.network;
-    const terms = (scene.degree + 1) ** 2 - 1;
     return {
       ROW,
       DEGREE: scene.degree,
-      HARMONIC_TEXELS: Math.ceil((3 * terms) / 4),
+      HARMONIC_TEXELS: this.harmonicTexels,
       MOVING: motion.moving,
       WINDOWED: motion.windows ? 1 : 0,
       EDGE: motion.windows ? scene.curves.edge.toFixed(6) : 1,
@@ -45,59 +38,6 @@ class Renderer {
       SEES_NORMALS: network && network.normals ? 1 : 0,
       SEES_TIME: network && network.time ? 1 : 0,
     };
-  }
-
-  // A program of the shaders in the page; `captured`: what transform feedback takes, with nothing drawn.
-  program(vertex, fragment, captured, definitions = {}) {
-    const { gl } = this, program = gl.createProgram();
-    const lines = Object.entries(definitions).map(([name, value]) => `#define ${name} ${value}\n`).join("");
-    const nothing = "#version 300 es\nprecision lowp float;\nout vec4 color;\nvoid main() { color = vec4(0.0); }";
-    const texts = [textOf(vertex).trim(), fragment ? textOf(fragment).trim() : nothing];
-    [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((kind, i) => {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, texts[i].replace("#version 300 es\n", "#version 300 es\n" + (i ? "" : lines)));
-      gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS))
-        throw new Error(`${i ? fragment : vertex}: ${gl.getShaderInfoLog(shader)}`);
-      gl.attachShader(program, shader);
-    });
-    if (captured) gl.transformFeedbackVaryings(program, captured, gl.INTERLEAVED_ATTRIBS);
-    gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
-      throw new Error(`${vertex}: ${gl.getProgramInfoLog(program)}`);
-    const places = {};
-    return { program, at: (name) => (places[name] ??= gl.getUniformLocation(program, name)) };
-  }
-
-  // A list of four numbers each as a texture: "32F", "16F", or whole numbers, "16UI" and "32UI".
-  list(name, values, kind) {
-    const { gl } = this, texels = Math.max(Math.ceil(values.length / 4), 1), height = Math.ceil(texels / ROW);
-    if (height > this.limit) throw new Error(`this scene is too large for this device: ${this.scene.count} Gaussians`);
-    const padded = new values.constructor(4 * ROW * height);
-    padded.set(values);
-    const texture = gl.createTexture(), whole = kind.endsWith("UI");
-    const entry = { name, texture, unit: this.textures.length, kind, padded, height, texels };
-    this.textures.push(entry);
-    gl.activeTexture(gl.TEXTURE0 + entry.unit);
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    this.unfiltered();
-    const format = whole ? gl.RGBA_INTEGER : gl.RGBA;
-    const type = { "16UI": gl.UNSIGNED_SHORT, "32UI": gl.UNSIGNED_INT }[kind] || gl.FLOAT;
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl["RGBA" + kind], ROW, height, 0, format, type, padded);
-    return entry;
-  }
-
-  unfiltered() {
-    const { gl } = this;
-    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
-      gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
-  }
-
-  refill(entry, values) {
-    const { gl } = this;
-    entry.padded.set(values);
-    gl.activeTexture(gl.TEXTURE0 + entry.unit);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, entry.height, gl.RGBA, gl.FLOAT, entry.padded);
   }
 
   prepareLists() {
@@ -115,13 +55,7 @@ class Renderer {
       for (let k = 0; k < 4; ++k) packed[at + 4 + k] = lists.quats[4 * i + k];
     }
     this.list("uGaussians", packed, "32F");
-    if (scene.degree) {
-      const columns = 3 * ((scene.degree + 1) ** 2 - 1), width = 4 * Math.ceil(columns / 4);
-      const rest = new Float32Array(width * count);
-      for (let i = 0; i < count; ++i)
-        for (let k = 0; k < columns; ++k) rest[width * i + k] = lists.rest[columns * i + k];
-      this.list("uHarmonics", rest, "16F");
-    }
+    this.prepareHarmonics();
     if (motion.drivers) this.prepareDrivers();
     if (motion.bones) {
       this.bones = this.list("uBones", motion.bones.values, "32F");
@@ -225,8 +159,7 @@ class Renderer {
     gl.uniformMatrix4fv(at("uCamFromWorld"), true, new Float32Array(pose));
     gl.uniform4fv(at("uIntrinsics"), intrinsics);
     gl.uniform2fv(at("uSize"), this.size);
-    const eye = [0, 1, 2].map((k) => -(pose[k] * pose[3] + pose[4 + k] * pose[7] + pose[8 + k] * pose[11]));
-    gl.uniform3fv(at("uEye"), eye);
+    gl.uniform3fv(at("uEye"), eyeOf(pose));
     gl.uniform4f(at("uLimits"), scene.eps2d, scene.near, scene.alphaMin, scene.antialiased ? 1 : 0);
     gl.uniform1f(at("uTime"), time);
     if (motion.bones) {

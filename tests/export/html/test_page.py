@@ -19,6 +19,8 @@ from moving_scene import camera, moving_scene, sliding_nodes, still_scene, write
 from numpy.typing import NDArray
 from PIL import Image
 from scene_kinds import KINDS, onlooker, scene_of_kind
+from small_triangles import bent
+from small_triangles import camera as before_triangles
 
 from dyngs.camera import Cameras
 from dyngs.conventions import RasterizeMode
@@ -29,6 +31,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr, ssim
 from dyngs.runs.opened import Opened, open_run, opened_scene
 from dyngs.static.scene import StaticScene
+from dyngs.triangles.scene import TriangleOptions, TriangleScene
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +88,30 @@ def test_a_page_shows_what_dyngs_draws(kind: str, browser: Browser, tmp_path: Pa
     assert page.errors == []
     assert page.requests == [(tmp_path / "page.html").as_uri()]
     page.close()
+
+
+@needs_browser
+@pytest.mark.parametrize(("texture", "degree"), [(0, 0), (1, 1), (3, 4)])
+def test_triangles(texture: int, degree: int, browser: Browser, tmp_path: Path) -> None:
+    patches = bent(12, seed=1, degree=degree)
+    patches = patches.textured(texture) if texture else patches
+    varied = patches.colours + 0.2 * torch.randn(patches.colours.shape, generator=torch.Generator().manual_seed(2))
+    options = TriangleOptions(near=0.1, segments=16, supersampling=4)
+    scene = TriangleScene(replace(patches, colours=varied), 1.0, options, torch.tensor([1.0, 0.9, 0.8]))
+    view = before_triangles(192, distance=5.0)
+    write_page(opened_triangles(scene), tmp_path / "page.html", title="triangles", views=(view,))
+    page = opened(browser, tmp_path / "page.html")
+    truth = scene.render(view).rgb[0].detach().clamp(0, 1)
+    found = shown(page, view, 0.0)
+    # outlines differ by rounding: 16 or more samples of a pixel here, their places there
+    assert psnr(found, truth) > 44
+    assert float((found - truth).abs().median()) < 0.003
+    assert page.errors == []
+    page.close()
+
+
+def opened_triangles(scene: TriangleScene) -> Opened:
+    return replace(opened_scene(scene_of_kind("static")), renderable=scene, stated_up="-y")
 
 
 @needs_browser

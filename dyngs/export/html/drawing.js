@@ -1,0 +1,83 @@
+// What all drawing with WebGL 2 needs: a context, programs, and lists of numbers in textures.
+
+const ROW = 2048; // texels of a texture that holds a list
+
+class Drawing {
+  constructor(canvas, scene) {
+    const gl = canvas.getContext("webgl2", {
+      antialias: false, depth: false, alpha: false, powerPreference: "high-performance",
+    });
+    if (!gl) throw new Error("it needs WebGL 2, which this browser does not offer (is hardware acceleration off?)");
+    Object.assign(this, { canvas, gl, scene, textures: [], size: [0, 0] });
+    this.limit = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    this.harmonicTexels = Math.ceil((3 * ((scene.degree + 1) ** 2 - 1)) / 4);
+  }
+
+  // A program of the shaders in the page; `captured`: what transform feedback takes, with nothing drawn.
+  program(vertex, fragment, captured, definitions = {}) {
+    const { gl } = this, program = gl.createProgram();
+    const lines = Object.entries(definitions).map(([name, value]) => `#define ${name} ${value}\n`).join("");
+    const nothing = "#version 300 es\nprecision lowp float;\nout vec4 color;\nvoid main() { color = vec4(0.0); }";
+    const texts = [textOf(vertex).trim(), fragment ? textOf(fragment).trim() : nothing];
+    [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((kind, i) => {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, texts[i].replace("#version 300 es\n", "#version 300 es\n" + lines)
+        .replace('#include "harmonics.glsl"', () => textOf("harmonics.glsl").trim()));
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS))
+        throw new Error(`${i ? fragment : vertex}: ${gl.getShaderInfoLog(shader)}`);
+      gl.attachShader(program, shader);
+    });
+    if (captured) gl.transformFeedbackVaryings(program, captured, gl.INTERLEAVED_ATTRIBS);
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
+      throw new Error(`${vertex}: ${gl.getProgramInfoLog(program)}`);
+    const places = {};
+    return { program, at: (name) => (places[name] ??= gl.getUniformLocation(program, name)) };
+  }
+
+  // A list of four numbers each as a texture: "32F", "16F", or whole numbers, "16UI" and "32UI".
+  list(name, values, kind) {
+    const { gl } = this, texels = Math.max(Math.ceil(values.length / 4), 1), height = Math.ceil(texels / ROW);
+    if (height > this.limit) throw new Error(`this scene is too large for this device: ${this.scene.count} Gaussians`);
+    const padded = new values.constructor(4 * ROW * height);
+    padded.set(values);
+    const texture = gl.createTexture(), whole = kind.endsWith("UI");
+    const entry = { name, texture, unit: this.textures.length, kind, padded, height, texels };
+    this.textures.push(entry);
+    gl.activeTexture(gl.TEXTURE0 + entry.unit);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    this.unfiltered();
+    const format = whole ? gl.RGBA_INTEGER : gl.RGBA;
+    const type = { "16UI": gl.UNSIGNED_SHORT, "32UI": gl.UNSIGNED_INT }[kind] || gl.FLOAT;
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl["RGBA" + kind], ROW, height, 0, format, type, padded);
+    return entry;
+  }
+
+  unfiltered() {
+    const { gl } = this;
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+      gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+  }
+
+  refill(entry, values) {
+    const { gl } = this;
+    entry.padded.set(values);
+    gl.activeTexture(gl.TEXTURE0 + entry.unit);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, entry.height, gl.RGBA, gl.FLOAT, entry.padded);
+  }
+
+  prepareHarmonics() {
+    const { lists, count, degree } = this.scene, columns = 3 * ((degree + 1) ** 2 - 1), width = 4 * this.harmonicTexels;
+    if (!degree) return;
+    const rest = new Float32Array(width * count);
+    for (let i = 0; i < count; ++i)
+      for (let k = 0; k < columns; ++k) rest[width * i + k] = lists.rest[columns * i + k];
+    this.list("uHarmonics", rest, "16F");
+  }
+}
+
+// Where a camera of camFromWorld stands.
+function eyeOf(m) {
+  return [0, 1, 2].map((k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]));
+}
