@@ -15,6 +15,7 @@ examples:
   dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
   dyngs train gps data.root=PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
   dyngs predict runs/stereo captures/ann --out runs/two --views f000_c00.png,f000_c01.png
+  dyngs predict runs/keypoint_nerf captures/ann --out runs/field --views 4
   dyngs eval runs/ann
   dyngs train --resume runs/ann                                     continues from the prediction
 """
@@ -28,8 +29,8 @@ def add_parser(commands: Commands) -> None:
         "predict a person from a few images, without training",
         "Predict a person from one or a few training views of a capture with silhouettes. A network of "
         "model.kind=human_predictor makes an avatar; where there is no body one is fitted first, as by `dyngs data "
-        "fit`; one of gps the surface that pairs of neighbouring views show. Writes a run folder for all other "
-        "commands.",
+        "fit`; one of gps the surface that pairs of neighbouring views show; one of keypoint_nerf a field. Writes a "
+        "run folder for all other commands.",
         _EPILOG,
     )
     parser.add_argument("network", type=input_path, metavar="NET_RUN", help="run folder of a network")
@@ -58,9 +59,12 @@ def run(arguments: argparse.Namespace) -> int:
     trained = f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
     what = counted(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
     word = as_word(out)
+    refine = (
+        f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""
+    )  # fields are not trained
     print(
         f"predicted: {what} from {', '.join(made.views)}\n"
         f"time:      {made.seconds:.2f} s{trained}\n"
-        f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it"
+        f"written:   {out}\nnext:      dyngs eval {word}{refine}"
     )
     return 0
