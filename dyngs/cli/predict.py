@@ -16,6 +16,7 @@ examples:
   dyngs train gps data.root=PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
   dyngs export runs/stereo --format network --out stereo.safetensors   the weights as one file
   dyngs predict stereo.safetensors captures/ann --out runs/two --views f000_c00.png,f000_c01.png
+  dyngs predict runs/keypoint_nerf captures/ann --out runs/field --views 4
   dyngs eval runs/ann
   dyngs train --resume runs/ann                                     continues from the prediction
 """
@@ -29,8 +30,8 @@ def add_parser(commands: Commands) -> None:
         "predict a person from a few images, without training",
         "Predict a person from one or a few training views of a capture with silhouettes. A network of "
         "model.kind=human_predictor makes an avatar; where there is no body one is fitted first, as by `dyngs data "
-        "fit`; one of gps the surface that pairs of neighbouring views show. Writes a run folder for all other "
-        "commands.",
+        "fit`; one of gps the surface that pairs of neighbouring views show; one of keypoint_nerf a field. Writes a "
+        "run folder for all other commands.",
         _EPILOG,
     )
     about = "run folder of a network, or a file of its weights"
@@ -60,9 +61,12 @@ def run(arguments: argparse.Namespace) -> int:
     trained = f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
     what = counted(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
     word = as_word(out)
+    refine = (
+        f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""
+    )  # fields are not trained
     print(
         f"predicted: {what} from {', '.join(made.views)}\n"
         f"time:      {made.seconds:.2f} s{trained}\n"
-        f"written:   {out}\nnext:      dyngs eval {word}\n           dyngs train --resume {word}   refines it"
+        f"written:   {out}\nnext:      dyngs eval {word}{refine}"
     )
     return 0

@@ -37,10 +37,15 @@ def thinned_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tupl
     light = weights < LIGHT
     chosen = through & (~light | (place % EVERY == 0))
     more = light.to(densities) * ((EVERY - 1) / 2) * (samples.ends - samples.starts)
-    counts = torch.zeros(samples.num_rays, dtype=torch.int64, device=densities.device)
+    return kept_samples(replace(samples, starts=samples.starts - more, ends=samples.ends + more), chosen)
+
+
+@torch.no_grad()
+def kept_samples(samples: Samples, chosen: Tensor) -> tuple[Samples, Tensor]:
+    """Return the samples (K) that are ``chosen`` (M,) bool, and their indices (K,) among all."""
+    counts = torch.zeros(samples.num_rays, dtype=torch.int64, device=chosen.device)
     counts.index_add_(0, samples.rays.long(), chosen.long())
-    longer = replace(samples, starts=samples.starts - more, ends=samples.ends + more)
-    return _chosen(longer, chosen, offsets_of(counts))
+    return _chosen(samples, chosen, offsets_of(counts))
 
 
 def _chosen(samples: Samples, chosen: Tensor, offsets: Tensor) -> tuple[Samples, Tensor]:

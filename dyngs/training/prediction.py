@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import Config
+from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError, reading
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
 from dyngs.models.kind import kind_of
@@ -65,7 +66,7 @@ class NetworkTrainer:
         tensors["rng"] = self.generator.get_state()
         tensors |= {f"sampler.{name}": x for name, x in self.sampler.state().items()}
         tensors |= {f"optimizer.{name}": x for name, x in optimizer_state(self.optimizer, network).items()}
-        mode = self.config.model.rasterize_mode.value
+        mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value  # fields have none
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.learner.background, mode)
         return Checkpoint(info, {name: x.detach().cpu() for name, x in tensors.items()})
 

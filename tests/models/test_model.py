@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from moving_scene import camera
+from tiny_field_people import field_config, field_people
 from tiny_people import NET, people, person
 from tiny_stereo import stereo_config, stereo_people
 from toy_kind import registered
@@ -49,7 +50,13 @@ TRAINED = {
     "toy": ("still", []),
 }
 """Fixture with a capture for each kind that is trained on one, and other keys of a small run."""
-NETWORKS = {"human_predictor": people_config, "gps": stereo_config_of}
+NETWORKS: dict[str, Callable[[Path], Config]] = {
+    "human_predictor": people_config,
+    "gps": stereo_config_of,
+    "keypoint_nerf": lambda folder: field_config("keypoint_nerf", field_people(folder / "set"), folder / "run"),
+}
+PREDICTED = {"predicted_field"}
+"""Kinds that are not trained: tests/human_fields/test_scene.py."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -81,7 +88,8 @@ def same(one: Checkpoint, other: Checkpoint) -> bool:
 
 
 def test_every_kind_is_here() -> None:
-    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == TRAINED.keys() | NETWORKS.keys()
+    known = TRAINED.keys() | NETWORKS.keys() | PREDICTED
+    assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == known
     for kind in KINDS:
         assert kind_of(kind.section()) is kind
         assert issubclass(kind.section, ModelSection)

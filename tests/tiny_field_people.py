@@ -1,0 +1,35 @@
+"""Small synthetic people, and small networks that predict fields of them, for tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dyngs.config import Config, DataConfig
+from dyngs.data.people_set import captures_in
+from dyngs.human.synthetic.people import PeopleOptions, write_people
+from dyngs.human.template.body_reader import default_template
+from dyngs.human_fields.people import Person, person_of
+
+NETWORKS: dict[str, dict[str, object]] = {"keypoint_nerf": {"step": 0.04}}
+"""Keys of small networks, by kind."""
+SIZES = {"features": 8, "width": 8, "patch": 16, "source_views": 3}
+
+
+def field_people(folder: Path, people: int = 2) -> Path:
+    return write_people(folder, PeopleOptions(people, size=40, cameras=8, seed=3))
+
+
+def field_config(kind: str, folder: Path, run: Path, **train: object) -> Config:
+    """Of four steps with a checkpoint after every second one; ``train`` changes that."""
+    return Config.model_validate(
+        {
+            "data": {"root": folder},
+            "model": {"kind": kind} | SIZES | NETWORKS[kind],
+            "train": {"steps": 4, "save_every": 2, "alpha_weight": 0.1} | train,
+            "run": {"dir": run, "threads": 1},
+        }
+    )
+
+
+def first_person(folder: Path) -> Person:
+    return person_of(captures_in(DataConfig(root=folder))[0], default_template())
