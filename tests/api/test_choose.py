@@ -260,5 +260,5 @@ def test_never_worse_than_static(moves: bool, steps: int, tmp_path: Path) -> Non
     moving = config.model_copy(update={"model": config.model.model_copy(update={"choose": False})})
     settings, base = [OpenSetting("model.kind=dynamic", lambda _: moving)], module._at_rest(config)
     best, (choice,) = module._decided(base, settings, plan, with_points(capture, base))
-    print(choice); assert choice.taken is moves, choice
+    assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
