@@ -110,11 +110,14 @@ def test_help_is_instant_because_torch_is_not_imported() -> None:
     )
     seconds = []
     for _ in range(3):  # the best counts: a busy machine only ever makes it slower
-        start = time.perf_counter()
+        start = os.times()
         done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
-        seconds.append(time.perf_counter() - start)
+        end = os.times()
+        seconds.append(end.children_user + end.children_system - start.children_user - start.children_system)
         assert done.stdout.splitlines()[-1] == "[]"
-    assert min(seconds) < 0.5  # 0.1 s on an idle machine; the promise is 0.3 s
+        if seconds[-1] < 0.5:
+            return
+    pytest.fail(f"takes {min(seconds)} s of the processor")  # 0.1 s on an idle machine; the promise is 0.3 s
 
 
 def test_module_and_command_are_the_same() -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,22 +21,40 @@ ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="its limits are those of Linux")
 
 
-def fuzz(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """``python -m fuzz`` in a process of its own, which is forked: threads of these tests would not survive that."""
-    environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
-    command = [sys.executable, "-m", "fuzz", *arguments, "--no-keep"]
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
+FUZZ = """
+import sys
+from fuzz.__main__ import main
+
+report = sys.argv[1]
+sys.argv[1:] = ["all", "--no-keep", "--inputs", "40", "--seed", "0", "--json", report]
+main()
+print("the corpus", flush=True)
+sys.argv[1:] = ["all", "--no-keep", "--replay"]
+sys.exit(main())
+"""
+
+
+@dataclass(frozen=True)
+class Fuzzed:
+    """40 changed inputs for each reader, and the corpus."""
+
+    tried: dict[str, Any]  # counts, and failures with what is known of them, of each reader
+    replayed: str  # what was printed of the corpus
+    code: int
 
 
 @pytest.fixture(scope="module")
-def tried(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """40 changed inputs for each reader: counts, and failures with what is known of them."""
+def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Fuzzed:
+    """By one process, which imports everything and is forked: threads of these tests would not survive that."""
     report = tmp_path_factory.mktemp("fuzz") / "report.json"
-    fuzz("all", "--inputs", "40", "--seed", "0", "--json", str(report))
-    return json.loads(report.read_text())
+    environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
+    command = [sys.executable, "-c", FUZZ, str(report)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900, check=False)
+    return Fuzzed(json.loads(report.read_text()), done.stdout.partition("the corpus")[2], done.returncode)
 
 
-def test_changed_inputs_are_read_or_refused(tried: dict[str, Any]) -> None:
+def test_changed_inputs_are_read_or_refused(fuzzed: Fuzzed) -> None:
+    tried = fuzzed.tried
     assert {name: own["failures"] for name, own in tried.items() if own["failures"]} == {}
     # Few inputs cannot be made; none of these counts.
     assert {name: own["inputs"] for name, own in tried.items() if own["inputs"] <= 38} == {}
@@ -43,17 +62,16 @@ def test_changed_inputs_are_read_or_refused(tried: dict[str, Any]) -> None:
     assert [name for name, own in tried.items() if not own["refused"]] in ([], ["logs"])
 
 
-def test_every_capture_format_is_fuzzed(tried: dict[str, Any]) -> None:
+def test_every_capture_format_is_fuzzed(fuzzed: Fuzzed) -> None:
     """If this fails, give ``fuzz.readers.CAPTURES`` seeds of the format."""
     optional = {"people_snapshot"} if find_spec("h5py") is None else set()
-    assert {format.name for format in FORMATS} - tried.keys() == optional
+    assert {format.name for format in FORMATS} - fuzzed.tried.keys() == optional
 
 
-def test_what_was_found_stays_mended() -> None:
+def test_what_was_found_stays_mended(fuzzed: Fuzzed) -> None:
     """The corpus: one small input for each kind of failure that was ever seen."""
-    done = fuzz("all", "--replay")
-    tried = [int(words[1]) for words in map(str.split, done.stdout.splitlines()) if words[2:3] == ["inputs"]]
-    assert done.returncode == 0, done.stdout
+    tried = [int(words[1]) for words in map(str.split, fuzzed.replayed.splitlines()) if words[2:3] == ["inputs"]]
+    assert fuzzed.code == 0, fuzzed.replayed
     assert sum(tried) >= 70
 
 

@@ -128,9 +128,9 @@ def test_a_path_that_is_not_utf8_is_kept(tmp_path: Path) -> None:
 def test_files_are_read_or_refused_with_their_line(tmp_path: Path, data: bytes, said: str) -> None:
     file = tmp_path / "file.yaml"
     file.write_bytes(data)
-    start = time.perf_counter()
+    start = time.process_time()
     assert said in refused(file, ROOT)
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
 
 
 def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
