@@ -30,7 +30,7 @@ def add_parser(commands: Commands) -> None:
         "predict a person from a few images, without training",
         "Predict a person from one or a few training views of a capture with silhouettes. A network of "
         "model.kind=human_predictor makes an avatar; where there is no body one is fitted first, as by `dyngs data "
-        "fit`; one of gps the surface that pairs of neighbouring views show; one of keypoint_nerf a field. Writes a "
+        "fit`; one of gps the surface that pairs of neighbouring views show; others a field. Writes a "
         "run folder for all other commands.",
         _EPILOG,
     )

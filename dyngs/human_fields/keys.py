@@ -40,6 +40,24 @@ class KeypointNerfModel(FieldPredictorModel):
     step: float = Field(default=0.015, gt=0, le=1, description="length of a sample of a ray, m of the body")
 
 
+class EgHumanNerfModel(FieldPredictorModel):
+    """EG-HumanNeRF (Wang, Kanamori and Endo 2024)."""
+
+    kind: Literal["eg_human_nerf"] = Field(
+        default="eg_human_nerf",
+        description="a network that predicts a field of a person from few samples around a body (EG-HumanNeRF; "
+        "docs/people_network.md)",
+    )
+    samples: int = Field(default=16, ge=4, le=256, description="samples of a ray that say where the surface is")
+    boundaries: bool = Field(
+        default=True, description="look between a dilated and an eroded body alone; false: 50 cm around the person"
+    )
+    visibility: bool = Field(default=True, description="images from which the body hides a sample do not count")
+    srdf_weight: float = Field(
+        default=0.2, ge=0, description="weight of the error of signed ray distances, by depth maps, over 5 cm"
+    )
+
+
 class PredictedFieldModel(ModelSection):
     """What such a network has predicted: not trained, but drawn like any other scene."""
 
@@ -48,4 +66,6 @@ class PredictedFieldModel(ModelSection):
     kind: Literal["predicted_field"] = Field(
         default="predicted_field", description="a field of a person, as `dyngs predict` writes it; it is not trained"
     )
-    network: Literal["keypoint_nerf"] = Field(default="keypoint_nerf", description="what has predicted it")
+    network: Literal["keypoint_nerf", "eg_human_nerf"] = Field(
+        default="keypoint_nerf", description="what has predicted it"
+    )

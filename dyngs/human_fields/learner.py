@@ -152,6 +152,11 @@ class FieldLearner(Learner[FieldNetwork]):
             found = person_of(self._people[person], self._template)
             if all(len(ring) <= FEWEST_VIEWS for ring in moments(found.views).values()):
                 raise DyngsError(f"{self._people[person].root}: shows no moment in three views or more to learn from")
+            if self.network.needs_depth and any(view.depth_path is None for view in found.views):
+                raise DyngsError(
+                    f"{self._people[person].root}: has no depth maps, from which {self.model.kind} learns where the "
+                    "surface is; `dyngs data synth people` writes them, or give model.srdf_weight=0"
+                )
             self._open[person] = found
         return self._open[person]
 

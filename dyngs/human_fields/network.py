@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ class Picture:
     colour: Tensor  # (H, W, 3)
     transmittance: Tensor  # (H, W)
     depth: Tensor  # (H, W) sum of weight times the distance along the ray, m
+    samples: Sequence[Any] = ()  # what ``penalty`` needs
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,11 @@ class FieldNetwork(nn.Module, ABC):
     def __init__(self, features: int) -> None:
         super().__init__()
         self.encoder = ImageEncoder(features)
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether it is trained on depth maps."""
+        return False
 
     def look(self, sources: Sources, body: Body) -> Known:
         """Return what is known of a person; differentiable."""

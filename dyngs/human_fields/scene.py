@@ -14,8 +14,9 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
+from dyngs.human_fields.eg_human_nerf import EgHumanNerf
 from dyngs.human_fields.keypoint_nerf import AROUND, KeypointNerf
-from dyngs.human_fields.keys import FieldPredictorModel, KeypointNerfModel, PredictedFieldModel
+from dyngs.human_fields.keys import EgHumanNerfModel, FieldPredictorModel, KeypointNerfModel, PredictedFieldModel
 from dyngs.human_fields.network import FieldNetwork, Known
 from dyngs.human_fields.people import MULTIPLE, Body, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
@@ -26,13 +27,15 @@ from dyngs.models.views import evaluation_background
 from dyngs.state import Role, State, prefixed, with_role
 from dyngs.tensor_checks import require_indices, require_positive, require_tensor
 
-SECTIONS: dict[str, type[FieldPredictorModel]] = {"keypoint_nerf": KeypointNerfModel}
+SECTIONS: dict[str, type[FieldPredictorModel]] = {"keypoint_nerf": KeypointNerfModel, "eg_human_nerf": EgHumanNerfModel}
 _TINY = 1e-9
 _MOST_VIEWS, _MOST_PIXELS = 1024, 1 << 26  # Of stored images
 
 
 def network_of(model: FieldPredictorModel, generator: torch.Generator) -> FieldNetwork:
     """Return the untrained network of a section."""
+    if isinstance(model, EgHumanNerfModel):
+        return EgHumanNerf(model, generator)
     assert isinstance(model, KeypointNerfModel)
     return KeypointNerf(model, generator)
 

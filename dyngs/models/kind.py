@@ -11,7 +11,7 @@ from dyngs.errors import DyngsError
 from dyngs.fields.keys import NerfModel, NgpModel
 from dyngs.gps.keys import GpsModel
 from dyngs.human.keys import HumanModel, HumanPredictorModel
-from dyngs.human_fields.keys import KeypointNerfModel, PredictedFieldModel
+from dyngs.human_fields.keys import EgHumanNerfModel, KeypointNerfModel, PredictedFieldModel
 from dyngs.section import ModelSection
 from dyngs.static.keys import StaticModel
 from dyngs.triangles.keys import BgTriangleModel
@@ -85,6 +85,7 @@ KINDS: tuple[Kind, ...] = (
     Kind(HumanPredictorModel, "dyngs.human.prediction.learner"),
     Kind(GpsModel, "dyngs.gps.learner"),
     Kind(KeypointNerfModel, "dyngs.human_fields.learner"),
+    Kind(EgHumanNerfModel, "dyngs.human_fields.learner"),
     Kind(PredictedFieldModel, "dyngs.human_fields.scene"),
     Kind(NgpModel, "dyngs.fields.kind"),
     Kind(NerfModel, "dyngs.fields.kind"),

@@ -54,6 +54,7 @@ NETWORKS: dict[str, Callable[[Path], Config]] = {
     "human_predictor": people_config,
     "gps": stereo_config_of,
     "keypoint_nerf": lambda folder: field_config("keypoint_nerf", field_people(folder / "set"), folder / "run"),
+    "eg_human_nerf": lambda folder: field_config("eg_human_nerf", field_people(folder / "set"), folder / "run"),
 }
 PREDICTED = {"predicted_field"}
 """Kinds that are not trained: tests/human_fields/test_scene.py."""
