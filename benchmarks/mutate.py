@@ -111,7 +111,7 @@ MUTATIONS = (
     ("storage/precision.py", "MOST_VISIBLE = 0.9", "MOST_VISIBLE = 0.1", "storage/test_precision.py"),
     ("storage/precision.py", "octaves = -0.5 *", "octaves = -1.0 *", "storage/test_precision.py"),
     ("storage/file.py", "whole << 1 ^ whole >> 63", "whole << 1", "storage/test_file.py"),
-    ("export/splat_files.py", "positions += np.asarray(world_offset)", "positions -= np.asarray(world_offset)", "export/test_splat_files.py"),
+    ("export/splat_files.py", "positions = frame.points(positions)", "positions = frame.inverse().points(positions)", "export/test_splat_files.py"),
     ("export/html/numbers.py", "np.where(step > 0, step, 1)", "np.where(step > 0, 2 * step, 1)", "export/html/test_numbers.py"),
     ("export/html/numbers.py", "np.roll(quats, 1, axis=1)", "np.roll(quats, 2, axis=1)", "export/html/test_numbers.py export/html/test_page.py"),
     ("runs/checkpoint.py", "[:-KEEP_CHECKPOINTS]", "[KEEP_CHECKPOINTS:]", "runs/test_checkpoint.py"),

@@ -101,7 +101,7 @@ class _Source:
     def kept(self, rows: torch.Tensor) -> _Source:
         """Return the Gaussians where ``rows`` (N,) is true."""
         scene: GaussianScene = self.opened.scene
-        before = torch.arange(len(scene)) if self.rows is None else self.rows
+        before = torch.arange(len(scene), device="cpu") if self.rows is None else self.rows
         return replace(self, opened=self.opened.showing(scene.select(rows.to(scene.device))), rows=before[rows.cpu()])
 
     def at(self, time: float) -> SplatFile:

@@ -252,7 +252,7 @@ class Opened(LoadedRun):
 
         like = person.clip.trans
         pelvis = person.learned_skeleton.joints[0] * math.exp(person.fit.log_scale)
-        rotation, shift = torch.from_numpy(how.rotation).to(like), torch.tensor(how.shift).to(like)
+        rotation, shift = torch.from_numpy(how.rotation).to(like), like.new_tensor(how.shift)
 
         def there(clip: MotionClip) -> MotionClip:
             return moved(clip, rotation, how.scale, shift, pelvis)

@@ -78,7 +78,7 @@ class Editing:
     @property
     def rows(self) -> Tensor:
         """(K,) indices of the Gaussians that are left."""
-        return self.steps[-1] if self.steps else torch.arange(len(self.whole.scene))
+        return self.steps[-1] if self.steps else torch.arange(len(self.whole.scene), device="cpu")
 
     @property
     def left(self) -> Opened:

@@ -78,6 +78,7 @@ def test_meshes_that_are_not_closed(tmp_path: Path) -> None:
         (["1,2,3", "nan"], "is no number"),
         (["box.xyz"], "a closed mesh is one of .obj"),
         (["none.obj"], "no such file"),
+        ([""], "a closed mesh is one of"),
     ],
 )
 def test_regions_that_are_none(words: list[str], said: str) -> None:

@@ -43,7 +43,6 @@ from dyngs.export.splat_files import (
     writing_of,
 )
 from dyngs.gaussians.rendering import render
-from dyngs.runs.checkpoint import load_run
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
 from dyngs.splats.formats import read_splats
 from dyngs.splats.rotation import AXES, turn_between
@@ -277,7 +276,7 @@ def test_fields_are_the_arrays_of_the_file() -> None:
 
 def test_every_moment_is_where_it_should_be(tmp_path: Path) -> None:
     pytest.importorskip("fourdgs")
-    run = load_run(write_moving_run(tmp_path / "run"))
+    run = open_run(write_moving_run(tmp_path / "run"))
     times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
     written = write_moving(run, tmp_path / "a.4dgs", times)
     for i in (0, 3, 8, 9):
@@ -302,7 +301,7 @@ def test_without_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def missing(name: str) -> None:
         raise ImportError(name)
 
-    run = load_run(write_moving_run(tmp_path / "run"))
+    run = open_run(write_moving_run(tmp_path / "run"))
     monkeypatch.setattr(splat_files, "import_module", missing)
     with pytest.raises(DyngsError, match=r"pip install 'dyngs\[4dgs\]'"):
         write_moving(run, tmp_path / "a.4dgs", [0.0])
