@@ -23,6 +23,7 @@ INPUTS, OUTPUT = (input_path, input_word), output_path
 WORDS = {
     "eval": {"overrides"},
     "data fit": {"overrides"},
+    "data people": {"overrides"},
     "data inspect": {"overrides", "format"},
     "data motion": {"clip"},
     "data sfm": {"overrides", "start"},
