@@ -12,7 +12,7 @@ from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import viewpoint_of
-from dyngs.view.editing import Editing, picked
+from dyngs.view.editing import Editing, picked, world_of
 
 if TYPE_CHECKING:
     from dyngs.view.server import Browsing
@@ -34,7 +34,7 @@ class EditControls:
     """Controls and marks of one browser for one scene; ``remove`` takes the marks away."""
 
     def __init__(self, browsing: Browsing, opened: Opened) -> None:
-        begin, world = viewpoint_of(opened), opened.world
+        begin, world = viewpoint_of(opened), world_of(opened)
         size = np.full(3, float(f"{_SHARE * begin.extent * world.scale:.2g}"))
         self.editing = Editing(opened, world.points(begin.center), size)
         self._browsing, self._extent, self._marks = browsing, begin.extent, dict[str, Any]()
@@ -105,7 +105,7 @@ class EditControls:
 
     def _show_box(self) -> None:
         """Show the box and its gizmo, along the axes of the frame."""
-        scene, back = self._browsing.client.scene, self.editing.whole.world.inverse()
+        scene, back = self._browsing.client.scene, world_of(self.editing.whole).inverse()
         place = back.points(self.editing.centre)
         self._drop("gizmo")
         gizmo = scene.add_transform_controls(
@@ -117,7 +117,7 @@ class EditControls:
 
     def _show_edges(self) -> None:
         self._drop("box")
-        back = self.editing.whole.world.inverse()
+        back = world_of(self.editing.whole).inverse()
         edges = (_EDGES * back.scale * self.editing.size).astype(np.float32)
         self._marks["box"] = self._browsing.client.scene.add_line_segments(
             "/edit/box",
@@ -132,7 +132,7 @@ class EditControls:
     def _move(self, place: np.ndarray) -> None:
         if not np.isfinite(place).all():
             return
-        self.editing.centre = self.editing.whole.world.points(place)
+        self.editing.centre = world_of(self.editing.whole).points(place)
         self._marks["box"].position = place
         self._text.content = self.editing.said
 

@@ -16,6 +16,7 @@ from dyngs.edit.scene_file import write_part
 from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
+from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.view.cameras import camera_at
 from dyngs.view.layers import Shot, depth_of
 
@@ -32,6 +33,11 @@ def looking_along(direction: np.ndarray) -> np.ndarray:
     across /= np.linalg.norm(across)
     matrix = np.stack([across, np.cross(forward, across), forward], axis=1)
     return Rotation.from_matrix(matrix).as_quat()[[3, 0, 1, 2]]
+
+
+def world_of(opened: Opened) -> Similarity:
+    """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of the file itself."""
+    return UNMOVED if opened.captured is None else opened.world
 
 
 def picked(
@@ -61,7 +67,7 @@ class Editing:
 
     Attributes:
         points: at most two, (3,) each, in the coordinates of the scene.
-        centre, size: (3,) each, of the box, in the coordinates that people mean (``Opened.world``).
+        centre, size: (3,) each, of the box, in the coordinates that people mean (``world_of``).
         steps: (K,) indices into ``whole`` of the Gaussians that were left after each deletion.
     """
 
@@ -93,7 +99,7 @@ class Editing:
     def delete(self, *, inside: bool) -> int:
         """Delete what the box holds, or all else; return how many Gaussians go. Raises DyngsError: all would."""
         scene: GaussianScene = self.left.scene
-        kept = held_by(self.box, scene, self.whole.world) ^ inside
+        kept = held_by(self.box, scene, world_of(self.whole)) ^ inside
         if not bool(kept.any()):
             raise DyngsError("nothing would be left: the box holds " + ("all of the scene" if inside else "nothing"))
         gone = len(kept) - int(kept.sum())
@@ -114,7 +120,7 @@ class Editing:
     @property
     def said(self) -> str:
         """Lines of markdown about the picks, the box and what is left; options of `dyngs edit` that say the same."""
-        world, lines = self.whole.world, list[str]()
+        world, lines = world_of(self.whole), list[str]()
         points = [world.points(point) for point in self.points]
         for name, point in zip("AB", points, strict=False):
             lines.append(f"{name}: `{_told(point)}`")

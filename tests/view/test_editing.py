@@ -13,10 +13,11 @@ from moving_scene import moved_x, row_of_balls, write_moving_run
 from dyngs.edit.frame import Frame
 from dyngs.edit.scene_file import Edits, edit_scene
 from dyngs.errors import DyngsError
-from dyngs.export.splat_files import write_run_splats
+from dyngs.export.splat_files import Writing, write_run_splats
 from dyngs.gaussians import Gaussians
 from dyngs.runs.opened import Opened, open_run, open_scene, opened_scene
 from dyngs.splats.formats import read_splats
+from dyngs.splats.similarity import Similarity
 from dyngs.static.scene import StaticScene
 from dyngs.view.editing import Editing, looking_along, picked
 from dyngs.view.layers import Shot
@@ -74,7 +75,7 @@ def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
 
 def test_distances_are_in_metres_where_the_scene_has_a_scale(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, moves=False)
-    edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.5)), tell=str)
+    edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.5)), tell=lambda _: None)
     for folder, said in ((run, "distance: **2 units**"), (tmp_path / "scaled", "distance: **5 m**")):
         work = editing(open_run(folder))
         for x in (-1.0, 1.0):
@@ -87,7 +88,7 @@ def test_distances_are_in_metres_where_the_scene_has_a_scale(tmp_path: Path) -> 
 
 def test_deletions_in_the_coordinates_of_the_frame_and_back(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, moves=False)
-    edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.0)), tell=str)
+    edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.0)), tell=lambda _: None)
     work = editing(open_run(tmp_path / "scaled"), (1.0, 0.0, 0.0), 2.2)  # x from -0.05 to 1.05 in the scene
     assert "box: `--crop -0.1,-1.1,-1.1 2.1,1.1,1.1`" in work.said
     assert work.delete(inside=True) == 3
@@ -115,7 +116,7 @@ def test_what_is_saved(tmp_path: Path) -> None:
     torch.testing.assert_close(saved[:, 0], moved_x((0, 1, 2), 0.75), rtol=0, atol=1e-5)  # the fourth goes through it
     assert len(open_run(run).scene) == 5
     still = write_moving_run(tmp_path / "still", moves=False)
-    edit_scene(still, tmp_path / "up", Edits(frame=Frame(scale=2.0)), tell=str)
+    edit_scene(still, tmp_path / "up", Edits(frame=Frame(scale=2.0)), tell=lambda _: None)
     file = write_run_splats(open_run(tmp_path / "up"), tmp_path / "b.ply").path
     work = editing(open_scene(file), (2.0, 0.0, 0.0), 0.4)
     assert work.whole.scaled
@@ -126,3 +127,14 @@ def test_what_is_saved(tmp_path: Path) -> None:
     torch.testing.assert_close(back.gaussians.means, 2 * row_of_balls().means[:4])
     with pytest.raises(DyngsError, match="no file or run of its own"):
         replace(work, whole=replace(work.whole, path=None)).file(None)
+
+
+def test_points_of_a_file_are_in_its_own_coordinates(tmp_path: Path) -> None:
+    """Also where the file says how it was turned, as `dyngs edit` takes them."""
+    opened = open_run(write_moving_run(tmp_path, moves=False, offset=(100.0, 0.0, 0.0)))
+    file = write_run_splats(opened, tmp_path / "a.ply", how=Writing((0.5, 0.5, -0.5, 0.5), "-y")).path
+    work = editing(open_scene(file), (0.0, 0.0, 0.0), 0.2)
+    assert work.whole.world != Similarity()
+    assert "`--crop -0.1,-0.1,-0.1 0.1,0.1,0.1`" in work.said
+    assert work.delete(inside=True) == 1
+    assert editing(opened, (100.0, 0.0, 0.0), 0.2).delete(inside=True) == 1
