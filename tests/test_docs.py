@@ -307,6 +307,8 @@ def shortened(command: Command) -> list[str]:
     words, extra = list(command.words), SHORTER.get(command.verb, ())
     if "--resume" in words:
         words, extra = [re.sub(r"^train\.steps=\d+", "train.steps=6", word) for word in words], ("run.threads=1",)
+    elif "--from" in words:
+        extra = tuple(word for word in extra if not word.startswith("init."))
     elif words[2:3] in (["room"], ["human"]):
         extra = (*extra, "--cameras", "3")
     if "--times" in words:
