@@ -51,7 +51,7 @@ def viewer(run: Path) -> Iterator[Viewer]:
         yield viewer
 
 
-def until(is_so: Callable[[], bool], page: Page | None = None, seconds: float = 30) -> None:
+def until(is_so: Callable[[], bool], page: Page | None = None, seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not is_so():
         assert time.monotonic() < end, "waited in vain"
