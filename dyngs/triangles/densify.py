@@ -19,6 +19,7 @@ SMALLEST, SMALLEST_SPLIT = 1e-4, 2e-4  # areas
 LONGEST = 20.0  # longest over middle side of the box around the corners
 RARELY = 0.05  # fraction of the views below which a triangle is seen too rarely
 HIDDEN = 8 / 36  # fraction of the cells below which it is mostly hidden
+SLIVER = 0.5  # px in the mean of the views that show a triangle, below which it is hidden but for a sliver
 ENLARGED = 1.1  # children, about their middles
 CELLS_OF_TRIANGLE = CELLS * (CELLS + 1) // 2  # of the square's cells those that a triangle has
 
@@ -40,7 +41,7 @@ class Change:
 
 
 def useless(patches: Patches, tallies: Tallies, unit: float) -> Tensor:
-    """Return (P,) bool: rarely seen, tiny, needles, or mostly hidden."""
+    """Return (P,) bool: rarely seen, tiny, needles, mostly hidden, or seen only as slivers between others."""
     views = tallies.views.clamp_min(1)
     cells = (tallies.cells > 0).sum(1)
     return (
@@ -48,6 +49,7 @@ def useless(patches: Patches, tallies: Tallies, unit: float) -> Tensor:
         | (patches.areas < SMALLEST * unit**2)
         | (patches.elongations > LONGEST)
         | (cells < HIDDEN * CELLS_OF_TRIANGLE)
+        | (tallies.cells.sum(1) < SLIVER * tallies.seen)
         | ~patches.points.detach().isfinite().flatten(1).all(1)
     )
 

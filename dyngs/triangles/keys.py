@@ -33,7 +33,7 @@ class BgTriangleModel(ModelSection):
         default=3, ge=1, le=16, description="segments of an edge of a triangle's texture, which is linear between them"
     )
     texture_from: Fraction = Field(
-        default=0.5, description="fraction of the run after which textures are learned in place of colours"
+        default=0.7, description="fraction of the run after which textures are learned in place of colours"
     )
     moves_on: bool = Field(
         default=True, description="control points are learned to the end; false: until textures begin, as published"

@@ -24,7 +24,7 @@ class Tallies:
         seen: (P,) views that show the triangle.
         edges: (P,) sum of the slopes of the images inside it.
         gradients: (P,) sum of the lengths of the gradients by its control points, over steps.
-        cells: (P, 36) how many drawn pixels showed each cell.
+        cells: (P, 36) pixels of the images that showed each cell.
     """
 
     def __init__(self, count: int) -> None:
@@ -53,7 +53,7 @@ class Tallies:
         self.edges += torch.bincount(ids, weights=inside.double(), minlength=size).to(self.edges)
         u, v = (places.uv * (CELLS - 1)).long().clamp(0, CELLS - 1).unbind(1)
         cell = (ids * CELLS + u) * CELLS + v
-        self.cells += torch.bincount(cell, minlength=self.cells.numel()).view_as(self.cells)
+        self.cells += torch.bincount(cell, minlength=self.cells.numel()).view_as(self.cells) / scale**2
 
     def state(self) -> State:
         return with_role(self.tensors(), Role.TRAINING)

@@ -23,7 +23,7 @@ from dyngs.triangles.patches import Patches
 from dyngs.triangles.scene import TriangleOptions, TriangleScene, rendering_of, scene_options, stored_triangles
 from dyngs.triangles.tallies import Tallies, slopes_of
 
-EVERY, LEAST_EVERY, UNTIL = 300, 50, 14_000
+EVERY, LEAST_EVERY, UNTIL = 300, 50, 18_000
 """Steps between changes of a 30,000-step run, the fewest in any run, and after how many of 30,000 none is changed."""
 HARMONICS_SLOWER = 20.0  # than colours
 LAST_COLOUR = 0.1  # Of their learning rate, at the end of each stage
@@ -109,6 +109,8 @@ class TriangleTraining(Model[TriangleScene]):
         for x in self.leaves:
             x.grad = None
         if not self.is_textured and self._last_step_of_places <= step < steps:
+            if self._tallies.views >= LEAST_EVERY:
+                self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
             return Updated(bad, f"textures are learned from now on, on {len(patches):,} triangles", True)
         return self._changed(step, bad) if self._is_due(step) else Updated(bad)
@@ -147,14 +149,18 @@ class TriangleTraining(Model[TriangleScene]):
     def _changed(self, step: int, bad: Tensor | int) -> Updated:
         until = min(scaled(UNTIL, self._run.config.train.steps), self._last_step_of_places)
         rounds = 1 + (until - step) // self._interval
-        found = change(self._patches, self._tallies, self._unit, self._model.max_triangles, rounds)
+        self._change(self._model.max_triangles, rounds)
+        return Updated(bad, is_rearranged=True)
+
+    def _change(self, most: int, rounds: int) -> None:
+        """Remove and split; see ``change``."""
+        found = change(self._patches, self._tallies, self._unit, most, rounds)
         adam = AdamState(
             {name: found.of_moments(name, x) for name, x in self._adam.exp_avg.items()},
             {name: found.of_moments(name, x) for name, x in self._adam.exp_avg_sq.items()},
         )
         self._take(self._patches.of({name: found.of(name, x) for name, x in self._patches.tensors.items()}))
         self._adam = adam
-        return Updated(bad, is_rearranged=True)
 
     def state(self) -> State:
         kept = prefixed("adam", self._adam.state()) | prefixed("tallies", self._tallies.state())

@@ -35,6 +35,10 @@ def test_a_good_triangle_is_useful_and_others_are_not() -> None:
     hidden = seen(1)
     hidden.cells[0, 3:] = 0
     assert useless(replace(patches, points=good), hidden, 1.0).tolist() == [True]
+    for shown, goes in ((0.4, True), (0.6, False)):
+        sliver = seen(1)
+        sliver.cells *= shown * 10 / 36  # px of each of the 10 views
+        assert useless(replace(patches, points=good), sliver, 1.0).tolist() == [goes]
 
 
 def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
@@ -52,6 +56,14 @@ def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
 
 def test_it_leads_evenly_to_the_limit() -> None:
     assert len(change(bent(6), seen(6), 1.0, 36, 5).of("points", bent(6).points)) == 6 + 2 * 3
+
+
+def test_what_is_useless_goes_without_a_split_where_none_may_come() -> None:
+    tallies = seen(6)
+    tallies.seen[2] = 0
+    found = change(bent(6), tallies, 1.0, 0, 1)
+    assert found.kept.tolist() == [0, 1, 3, 4, 5]
+    assert len(found.added["points"]) == 0
 
 
 def test_something_stays() -> None:

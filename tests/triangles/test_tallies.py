@@ -33,7 +33,7 @@ def test_what_is_seen_is_counted() -> None:
     assert tallies.views == 2
     assert tallies.seen.tolist() == [2, 0]
     assert tallies.cells[1].sum() == 0
-    assert tallies.cells[0].sum() == 2 * len(places.ids)
+    assert tallies.cells[0].sum() == 2 * len(places.ids) / 4, "four drawn pixels a pixel"
     expected = float((~outlines(places)).sum()) / 4  # drawn pixels are quarters of the image's
     torch.testing.assert_close(tallies.edges, torch.tensor([expected, 0.0]))
 
