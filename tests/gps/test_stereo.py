@@ -58,9 +58,8 @@ def test_what_the_other_view_shows_beside_the_person_is_known() -> None:
 def test_the_untrained_network_finds_what_is_plain() -> None:
     torch.manual_seed(0)
     encoder, stereo, offsets = Encoder(4, WIDTHS), StereoNetwork(WIDTHS), offsets_of(SHIFT)
-    for layer in (stereo.change, stereo.weights):
-        torch.nn.init.zeros_(layer.weight)
-        torch.nn.init.zeros_(layer.bias)
+    for x in (*stereo.change.parameters(), *stereo.weights.parameters()):
+        torch.nn.init.zeros_(x)
     rgb, alpha = plane(offsets[25])
     with torch.no_grad():
         found, _ = stereo(encoder(torch.rand(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha)
