@@ -175,7 +175,7 @@ def test_home_is_expanded() -> None:
         ("strategy.kind=mcm", ["strategy.kind must be one of default, mcmc, fixed", "did you mean 'mcmc'"]),
         ("strategy.noise=1", ["strategy.noise belongs to strategy.kind=mcmc, not to default"]),
         ("model.deform.width=64", ["model.deform belongs to model.kind=dynamic, not to static"]),
-        ("model.width=64", ["model.width belongs to model.kind=nerf, not to static"]),
+        ("model.width=64", ["model.width belongs to model.kind=keypoint_nerf or", "nerf, not to static"]),
         ("deform.width=64", ["unknown key 'deform'", "did you mean 'model.deform.width'"]),
         ("train=5", ["train is a section", "steps"]),
         ("model=5", ["model is a section", "sh_degree", "deform"]),
