@@ -52,9 +52,11 @@ class Boundaries:
         """Return where the rays of one camera may meet the person."""
         faces, body, outer, inner = self._meshes
         begin, out = depths(outer, faces, camera), depths(outer, faces, camera, last=True)
-        # what is thinner than the copy is eroded is turned inside out: its back faces lie before its front
-        surely = depths(inner, faces, camera, front_faces=True)
-        return Interval(begin, torch.maximum(torch.minimum(surely, out), begin), depths(body, faces, camera))
+        # what is thinner than the copy is eroded is turned inside out: its back faces lie before its front, and where
+        # there are cavities (mouth, eyes) and between fingers even front faces do; nobody is inside before the body
+        surely, met = depths(inner, faces, camera, front_faces=True), depths(body, faces, camera)
+        end = torch.where(met.isfinite(), torch.minimum(torch.maximum(surely, met + INWARDS / 2), out), out)
+        return Interval(begin, torch.maximum(end, begin), met)
 
 
 def depths(

@@ -61,7 +61,7 @@ def test_the_command_for_a_path(path: str, command: str | None) -> None:
         ("train static data.root=run", "dyngs eval"),
         ("train static data.root=rig", "dyngs train dynamic data.root="),
         ("train static data.root=single", "data.root="),
-        ("train human data.root=photos", "body parameters"),
+        ("train human data.root=photos", "install MediaPipe"),
         ("train mcmc data.root=photos", "'static_mcmc'"),
         ("train statc data.root=photos", "'static'"),
         ("train 4dgs data.root=photos", "'dynamic'"),

@@ -93,4 +93,6 @@ def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None
     truth = (image.depth / scale)[solid]
     inside = (found.begin[solid] <= truth) & (truth <= found.end[solid])
     assert float(inside.float().mean()) > 0.9
+    met = found.body.isfinite() & found.begin.isfinite()
+    assert bool((found.end > found.body)[met].all()), "also of mouth, eyes and fingers"
     assert float(found.begin.isfinite().float().mean()) < 0.6
