@@ -14,7 +14,7 @@ import torch
 from scipy import ndimage
 
 from dyngs.capture.multi_video.films import STANDS, displaced_by
-from dyngs.data.capture import Capture, Silhouette, View, all_views, each_view
+from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.readers.colmap import find_masks, mask_of
 from dyngs.data.times import evenly_spaced
@@ -261,11 +261,8 @@ def with_background_masks(
 
 def _fixed_cameras(capture: Capture) -> list[_Camera]:
     """Return the cameras of a capture, all of which stand."""
-    groups: dict[int, list[View]] = {}
-    for view in all_views(capture.splits):
-        groups.setdefault(view.camera_id, []).append(view)
     cameras = []
-    for number, views in sorted(groups.items()):
+    for number, views in by_camera(capture.splits).items():
         where = f"{capture.root}, camera {number}"
         first = views[0]
         poses = np.stack([view.cam_from_world for view in views])
@@ -273,7 +270,6 @@ def _fixed_cameras(capture: Capture) -> list[_Camera]:
             raise DyngsError(f"{where} {_MOVES}")
         if len(views) < LEAST:
             raise DyngsError(f"{where}: has {len(views)} images, too few for a background; {_ADVICE}")
-        views.sort(key=lambda view: (view.time or 0.0, view.name))
         cameras.append(_Camera(where, tuple(views), target_size(first.width, first.height, 1.0, SIDE)))
     return cameras
 

@@ -24,7 +24,7 @@ from dyngs.gps.pairs import MAX_ANGLE, Pair, lessons, neighbours, well_spread
 from dyngs.gps.rectification import RectifiedPair, cropped, is_inside, rectified
 from dyngs.gps.surface import GpsNetwork, gaussians_of, joined, offset_loss
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights
+from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, of_moment, random_index
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
@@ -94,11 +94,8 @@ class GpsPredictor:
         preset = load_config(packaged_preset("static"), ["data.root=."])
         same = ("near", "eps2d", "rasterize_mode", "sh_degree")
         model = preset.model.model_copy(update={name: getattr(self.model, name) for name in same})
-        data, time = self.data, self.views[views[0]].time
-        moments = sorted(distinct_times(all_views({k: x for k, x in self.capture.splits.items() if k != "pose"})))
-        if time is not None and len(moments) > 1:
-            row = min(range(len(moments)), key=lambda i: abs(moments[i] - time))
-            data = data.model_copy(update={"frames": f"{row}:{row + 1}"})
+        times = distinct_times(all_views({k: x for k, x in self.capture.splits.items() if k != "pose"}))
+        data = of_moment(self.data, self.views[views[0]].time, times.values())
         return preset.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
@@ -121,8 +118,8 @@ class GpsLearner(Learner[GpsNetwork]):
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         lesson = self._open_person(person)
-        pair, between = lesson.pairs[_draw(len(lesson.pairs), generator)]
-        target = between[_draw(len(between), generator)]
+        pair, between = lesson.pairs[random_index(len(lesson.pairs), generator)]
+        target = between[random_index(len(between), generator)]
         background = sent(background_colour(self.background, generator), self.device)
         left, right = lesson.images[pair.left], lesson.images[pair.right]
         both = fields_moved_to(rectified(left, right, self.model.person_px), self.device)
@@ -196,7 +193,3 @@ def _section(config: Config) -> GpsModel:
     if not isinstance(config.model, GpsModel):
         raise TypeError(f"not a stereo network: {config.model!r}")
     return config.model
-
-
-def _draw(count: int, generator: torch.Generator) -> int:
-    return int(torch.randint(count, (1,), generator=generator, device="cpu"))

@@ -23,7 +23,7 @@ from dyngs.human_fields.network import FieldNetwork
 from dyngs.human_fields.people import Person, metric, moments, person_of, sources_of, spread, window
 from dyngs.human_fields.scene import PredictedField, network_of
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights
+from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, of_moment, random_index
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
@@ -78,11 +78,7 @@ class FieldPredictor:
         return PredictedField(section_of(self.config), self.network, sources, body, scale, background=background)
 
     def run_config(self, views: Sequence[int]) -> Config:
-        data, time = self.data, self.views[views[0]].time
-        known = sorted(distinct_times(self.views))
-        if time is not None and len(known) > 1:
-            row = min(range(len(known)), key=lambda i: abs(known[i] - time))
-            data = data.model_copy(update={"frames": f"{row}:{row + 1}"})
+        data = of_moment(self.data, self.views[views[0]].time, distinct_times(self.views).values())
         model = PredictedFieldModel.model_validate({"network": self.config.model.kind})
         return self.config.model_copy(update={"data": data, "model": model})
 
@@ -124,16 +120,16 @@ class FieldLearner(Learner[FieldNetwork]):
     def _views(self, person: Person, generator: torch.Generator) -> tuple[list[int], int]:
         """Return views of a moment to predict from, every other time evenly around the person, and another view."""
         rings = [ring for ring in moments(person.views).values() if len(ring) > FEWEST_VIEWS]
-        ring = rings[_draw(len(rings), generator)]
+        ring = rings[random_index(len(rings), generator)]
         most = min(self.model.source_views, len(ring) - 1)
-        count = FEWEST_VIEWS + _draw(most - FEWEST_VIEWS + 1, generator)
-        if _draw(2, generator):
-            sources = spread(ring, count, _draw(len(ring), generator))
+        count = FEWEST_VIEWS + random_index(most - FEWEST_VIEWS + 1, generator)
+        if random_index(2, generator):
+            sources = spread(ring, count, random_index(len(ring), generator))
         else:
             order = torch.randperm(len(ring), generator=generator, device="cpu")[:count]
             sources = [ring[i] for i in order.tolist()]
         others = [i for i in ring if i not in sources]
-        return sources, others[_draw(len(others), generator)]
+        return sources, others[random_index(len(others), generator)]
 
     def _part(self, image: Image, generator: torch.Generator) -> Image:
         """Return the part of an image around a pixel of the person."""
@@ -141,7 +137,7 @@ class FieldLearner(Learner[FieldNetwork]):
         side, where = self.model.patch, (image.alpha > _SOLID).nonzero()
         if not len(where):
             return window(image, 0, 0, side)
-        row, column = where[_draw(len(where), generator)].tolist()
+        row, column = where[random_index(len(where), generator)].tolist()
         return window(image, column - side // 2, row - side // 2, side)
 
     def _open_person(self, person: int) -> Person:
@@ -189,7 +185,3 @@ def section_of(config: Config) -> FieldPredictorModel:
 
 def template_of(model: FieldPredictorModel) -> BodyTemplate:
     return default_template() if model.body is None else read_body(model.body)
-
-
-def _draw(count: int, generator: torch.Generator) -> int:
-    return int(torch.randint(count, (1,), generator=generator, device="cpu"))

@@ -9,14 +9,14 @@ A kind of network has a module with ``learner(config, generator)``, which return
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from dyngs.config import Config, TrainConfig
+from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
@@ -103,6 +103,20 @@ class Learner(ABC, Generic[N]):
     def load(self, checkpoint: Checkpoint) -> None:
         """Take over weights, and what is stored next to them. Raises DyngsError."""
         load_weights(self.network, checkpoint)
+
+
+def random_index(count: int, generator: torch.Generator) -> int:
+    """Return a random whole number below ``count``, the same on every device; ``generator`` is of the CPU."""
+    return int(torch.randint(count, (1,), generator=generator, device="cpu"))
+
+
+def of_moment(data: DataConfig, time: float | None, times: Collection[float]) -> DataConfig:
+    """Return the options with the time step of a capture at ``times`` that is nearest to ``time``; None: as given."""
+    moments = sorted(set(times))
+    if time is None or len(moments) < 2:
+        return data
+    row = min(range(len(moments)), key=lambda i: abs(moments[i] - time))
+    return data.model_copy(update={"frames": f"{row}:{row + 1}"})
 
 
 def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:

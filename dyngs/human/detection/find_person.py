@@ -20,7 +20,7 @@ from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
 from dyngs.capture.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.capture import Capture, View, all_views
+from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.errors import DyngsError, counted
@@ -91,12 +91,8 @@ def find_person(
 
 
 def _cameras_of(capture: Capture) -> list[_Camera]:
-    groups: dict[int, list[View]] = {}
-    for view in all_views(capture.splits):
-        groups.setdefault(view.camera_id, []).append(view)
     cameras = []
-    for _, views in sorted(groups.items()):
-        views.sort(key=lambda view: (view.time or 0.0, view.name))
+    for views in by_camera(capture.splits).values():
         size = target_size(views[0].width, views[0].height, 1.0, SIDE)
         images = [read_image(view.image_path, (view.width, view.height))[..., :3] for view in views]
         cameras.append(_Camera(tuple(views), np.stack([area_downscale_uint8(x, *size).numpy() for x in images])))

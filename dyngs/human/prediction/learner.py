@@ -28,7 +28,7 @@ from dyngs.human.prediction.texel_maps import TexelMaps, observe_texels, to_atla
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import load_template
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
-from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, updated
+from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, random_index, updated
 from dyngs.models.renderable import Renderable, Rendering
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
@@ -144,7 +144,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         filmed = self.people[person]
-        choice = _draw(len(filmed.choices), generator)
+        choice = random_index(len(filmed.choices), generator)
         targets = self._targets(filmed, filmed.choices[choice], generator)
         background = sent(background_colour(self.background, generator), self.device)
         drawing = replace(render_options(self.model), nonfinite="trust")
@@ -169,7 +169,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
         """Return images of one time step that were not predicted from, where there are any."""
         views = person.sitter.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
-        frame = views[others[_draw(len(others), generator)]].frame
+        frame = views[others[random_index(len(others), generator)]].frame
         shown = [i for i in others if views[i].frame == frame]
         order = torch.randperm(len(shown), generator=generator, device="cpu").tolist()
         return [person.images[shown[i]].to(self.device) for i in order[: self.model.target_views]]
@@ -292,7 +292,3 @@ def _section(config: Config) -> HumanPredictorModel:
     if not isinstance(config.model, HumanPredictorModel):
         raise TypeError(f"not a network: {config.model!r}")
     return config.model
-
-
-def _draw(count: int, generator: torch.Generator) -> int:
-    return int(torch.randint(count, (1,), generator=generator, device="cpu"))
