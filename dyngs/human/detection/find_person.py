@@ -179,7 +179,8 @@ def with_found_person(
     if folder.is_dir():
         say(f"person:  found before, in {folder}")
     else:
+        detector = chosen_detector((), None)
         say(f"person:  found first, as by `dyngs data people`, into {folder}")
-        say(write_found_person(data, folder, chosen_detector((), None), report, say).summary())
+        say(write_found_person(data, folder, detector, report, say).summary())
     note_sources(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})
