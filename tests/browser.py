@@ -17,6 +17,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
+import time
 from importlib.util import find_spec
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal
@@ -62,6 +63,7 @@ class Page:
 
     def __init__(self, driven: playwright.Page, timeout: float) -> None:
         self.driven = driven
+        self._timeout = timeout
         self.errors: list[str] = []
         self.warnings: list[str] = []
         self.requests: list[str] = []
@@ -73,9 +75,16 @@ class Page:
         driven.on("websocket", lambda socket: self._asked(socket.url))
 
     def wait_for(self, expression: str, timeout: float | None = None) -> None:
-        """Return once a JavaScript ``expression`` is true. Raises playwright's TimeoutError after ``timeout`` s."""
-        limit = None if timeout is None else 1000 * timeout
-        self.driven.wait_for_function(expression, timeout=limit)
+        """Return once a JavaScript ``expression`` is true. Raises TimeoutError after ``timeout`` s.
+
+        Asked again from here: playwright's own wait_for_function evaluates the text inside the page from its second
+        try on, which the content security policy of our pages forbids.
+        """
+        end = time.monotonic() + (self._timeout if timeout is None else timeout)
+        while not self.driven.evaluate(expression):
+            if time.monotonic() > end:
+                raise TimeoutError(f"not true in time: {expression}")
+            self.driven.wait_for_timeout(20)
 
     def evaluate(self, expression: str, argument: Any = None) -> Any:
         """Return the value of a JavaScript expression, or of a function of ``argument``; a promise is awaited."""

@@ -214,7 +214,7 @@ def test_a_browser_without_webgl_is_told(tmp_path: Path, browser: Browser) -> No
     page = browser.open(None)
     page.driven.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.driven.goto((tmp_path / "page.html").as_uri())
-    page.driven.wait_for_function("document.getElementById('message').textContent.includes('WebGL 2')")
+    page.wait_for("document.getElementById('message').textContent.includes('WebGL 2')")
     page.close()
 
 
