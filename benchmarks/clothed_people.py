@@ -4,9 +4,9 @@
                                         [--gamma 1] [--size 400] [--frames 20] [--new-frames 8]
 
 AVATAR.glb is a glTF 2.0 file with a skin and the joint names of a common program, in a T-pose that faces +z, without
-compression. The motions are AMASS files for the free template (`dyngs convert` makes them of other formats). The people
-of docs/human.md are VALID avatars (https://github.com/c-frame/valid-avatars-glb, MIT, (c) 2022 Tiffany Do), whose files
-are compressed; Node decodes them, once:
+compression. The motions are AMASS files for the free template (`dyngs data motion` makes them of other formats). The
+people of docs/human.md are VALID avatars (https://github.com/c-frame/valid-avatars-glb, MIT, (c) 2022 Tiffany Do),
+whose files are compressed; Node decodes them, once:
 
     npm i @gltf-transform/core @gltf-transform/extensions @gltf-transform/functions meshoptimizer sharp
     node decode.mjs Black_F_2_Casual.glb plain.glb        # decode.mjs, with "type": "module" in package.json:

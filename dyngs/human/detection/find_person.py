@@ -59,7 +59,8 @@ def find_person(
     """Find a person in all views, write masks and key points to ``folder``, and return where they are.
 
     Left and right are made the same over time. Where a camera stands, outlines of masks are those of what stands before
-    its background. Views without the person get an empty mask. Says what was found, and what will be bad about it.
+    its background. Views without the person, or a camera that never shows them, get empty masks. Says what was found,
+    and what will be bad about it.
     Raises DyngsError: nobody is found, or not so many.
 
     Args:
@@ -72,20 +73,26 @@ def find_person(
         report("cameras in which the person is found", index + 1, len(cameras))
         where = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
         if not people:
-            raise DyngsError(
-                f"{capture.root}: {where}{detector.name} finds nobody in {counted(len(camera.views), 'image')}; look "
-                "at them, or give masks of another program to `dyngs data fit` (docs/person.md)"
-            )
+            say(f"warning: {where}{detector.name} finds nobody, its images are left out")
+            for view in camera.views:
+                write_image(folder / "masks" / f"{view.name}.png", np.zeros((view.height, view.width), np.uint8))
+            continue
         if not 1 <= number <= len(people):
             raise DyngsError(f"{capture.root}: {where}--person {number}, but people found: {len(people)}")
         person, swapped = with_sides(people[number - 1])
         say(f"{where}{_summary(person, detector)}; left and right swapped in {counted(swapped, 'image')}")
-        for warning in warnings_of(camera.images, person, [x for x in people if x is not people[number - 1]]):
+        others = [x for x in people if x is not people[number - 1]]
+        for warning in warnings_of(camera.images, person, others, alone=len(cameras) == 1):
             say(f"warning: {where}{warning}")
         _write_masks(camera, person, folder / "masks", say)
         for view, own in zip(camera.views, person, strict=True):
             if own is not None:
                 points[view.name] = own.keypoints * np.array([camera.scale, camera.scale, 1.0])
+    if not points:
+        raise DyngsError(
+            f"{capture.root}: {detector.name} finds nobody in {counted(sum(len(x.views) for x in cameras), 'image')}; "
+            "look at them, or give masks of another program to `dyngs data fit` (docs/person.md)"
+        )
     _write_keypoints(folder / "keypoints.json", points)
     return FitInputs(keypoints=folder / "keypoints.json", masks=folder / "masks")
 

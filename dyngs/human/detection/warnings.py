@@ -21,7 +21,11 @@ _SHOULDERS, _ANKLES = (5, 6), (15, 16)
 
 
 def warnings_of(
-    images: np.ndarray, person: Sequence[Detection | None], others: Sequence[Sequence[Detection | None]]
+    images: np.ndarray,
+    person: Sequence[Detection | None],
+    others: Sequence[Sequence[Detection | None]],
+    *,
+    alone: bool = True,
 ) -> list[str]:
     """Return lines on what will be bad.
 
@@ -29,6 +33,7 @@ def warnings_of(
         images: (F, H, W, 3) uint8.
         person: their detection in each image.
         others: the same of the other people.
+        alone: there is no other camera.
     """
     seen = [(image, x) for image, x in zip(images, person, strict=True) if x is not None]
     detections, count = [x for _, x in seen], len(images)
@@ -44,7 +49,7 @@ def warnings_of(
         > OFTEN * len(seen),
         f"the person is {height:.0f} px high; come nearer or record larger images": height < SMALL,
         f"{counted(blurred, 'image')} blurred; more light, or slower motion, helps": blurred > OFTEN * len(seen),
-        "the person never turns around: what the camera never sees will be a guess": not _turns(detections),
+        "the person never turns around: what the camera never sees will be a guess": alone and not _turns(detections),
     }
     return [line for line, holds in found.items() if holds]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -114,6 +115,23 @@ def test_another_person_and_nobody(clip: Path, tmp_path: Path) -> None:
         find_person(capture_of(clip), Rough(beside=True), tmp_path / "found", report_nothing, [].append, number=3)
     with pytest.raises(DyngsError, match="Rough finds nobody in 10 images"):
         find_person(capture_of(clip), Rough(nobody=True), tmp_path / "found", report_nothing, [].append)
+
+
+def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Path) -> None:
+    capture = capture_of(clip)
+    first = list(capture.splits["train"])
+    others = [replace(view, camera_id=1, name=f"other_{view.name}") for view in first]
+    detector = Rough()
+    once = detector.detect
+    answers = iter([once, lambda images: [[] for _ in images]])
+    detector.detect = lambda images: next(answers)(images)  # type: ignore[method-assign]
+    said: list[str] = []
+    both = capture.replace(splits={"train": (*first, *others)})
+    found = find_person(both, detector, tmp_path / "found", report_nothing, said.append)
+    assert "warning: camera 1: Rough finds nobody, its images are left out" in said
+    assert found.masks is not None
+    assert not any(read_image(found.masks / f"{view.name}.png").any() for view in others)
+    assert overlap(found.masks, 2) > 0.93
 
 
 def test_a_capture_of_the_person_comes_out(
