@@ -244,7 +244,7 @@ class Fitting:
         """Return the fit ``start`` after ``steps`` of Adam on what is named; ``tick`` is called after each.
 
         Frames are taken in a fixed order that covers the clip evenly. Rates begin where they are after the fraction
-        ``fallen`` of a run.
+        ``fallen`` of a run; higher where it is negative.
         """
         # Copies, as updates are in place and ``start`` may be what is taken in the end; without moments.
         found = Parameters({name: x.clone() for name, x in start.values().items()}, start.rates, start.decay)

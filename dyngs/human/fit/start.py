@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,11 +16,25 @@ from dyngs.camera import Cameras
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.times import evenly_spaced
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface
-from dyngs.human.fit.solve import NUM_TURNED, Fitting, Observations, mean_error, new_fit, prior, usual, usual_pose
+from dyngs.human.fit.solve import (
+    NUM_TURNED,
+    Fitting,
+    Observations,
+    frame_pose_of,
+    keypoint_error,
+    mean_error,
+    new_fit,
+    posed_joints,
+    prior,
+    usual,
+    usual_pose,
+)
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.template.joints import JOINT_NAMES
 
 NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor
+LIKELY = 3  # of these, nearest to the key points, that are tried where there are some
+FEW = 3  # views that are drawn in each step, other ones each time
 MOST_ANCHORS = 20  # frames in which headings are tried
 CHANGE_WEIGHT = 0.01
 """Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the square."""
@@ -93,8 +108,8 @@ def first_poses(
     if seen is None:
         raise ValueError("nobody is seen in the first frame")
     standing, up = standing_clip(times, surface, observed), up_of(seen)
-    anchors = [row for row in evenly_spaced(len(times), MOST_ANCHORS) if observed(row) is not None]
-    tried = [_all_headings(standing, row, up, surface, observed, tick) for row in anchors]
+    shown = {row: frame for row in evenly_spaced(len(times), MOST_ANCHORS) if (frame := observed(row)) is not None}
+    anchors, tried = list(shown), [_all_headings(standing, row, up, surface, shown[row], tick) for row in shown]
     path = likely_path([[error for _, _, error in own] for own in tried])
     roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
     ways: list[tuple[int, Tensor | None]] = [(path[0], roots_between(anchors, roots, len(times)))]
@@ -111,21 +126,36 @@ def first_poses(
 
 def num_ticks(frames: int, *, marked: bool) -> int:
     """Return how often ``first_poses`` calls ``tick`` for a clip of so many frames, with or without key points."""
-    return NUM_HEADINGS * len(evenly_spaced(frames, MOST_ANCHORS)) + (frames - 1) * (1 if marked else 1 + _WITHOUT_PATH)
+    headings, ways = (LIKELY, 1) if marked else (NUM_HEADINGS, 1 + _WITHOUT_PATH)
+    return headings * len(evenly_spaced(frames, MOST_ANCHORS)) + (frames - 1) * ways
 
 
 def _all_headings(
-    clip: MotionClip, row: int, up: Tensor, surface: Surface, observed: Observations, tick: Callable[[], None]
+    clip: MotionClip, row: int, up: Tensor, surface: Surface, seen: ObservedFrame, tick: Callable[[], None]
 ) -> list[tuple[Tensor, Tensor, float]]:
-    """Return pose, translation and error of a frame as found from each heading; after the first at half the size."""
-    seen, found = observed(row), []
-    for index in range(NUM_HEADINGS):
-        start = turned(clip, heading(index), up)
-        if seen is not None:
-            levels = (2, 1) if row == 0 else (2,)
-            found.append(_found_from(start, start.poses[row], start.trans[row], row, surface, seen, levels))
+    """Return pose, translation and error of a frame as found from each heading; after the first at half the size.
+
+    With key points only the ``LIKELY`` headings are tried, and the error of others is infinite.
+    """
+    starts = [turned(clip, heading(index), up) for index in range(NUM_HEADINGS)]
+    errors = [_marked_error(start, row, surface, seen) for start in starts]
+    likely = sorted(range(NUM_HEADINGS), key=errors.__getitem__)[: NUM_HEADINGS if seen.joints is None else LIKELY]
+    found = [(start.poses[row], start.trans[row], math.inf) for start in starts]
+    for index in likely:
+        levels = (2, 1) if row == 0 else (2,)
+        found[index] = _found_from(starts[index], *found[index][:2], row, surface, seen, levels)
         tick()
     return found
+
+
+@torch.no_grad()
+def _marked_error(clip: MotionClip, row: int, surface: Surface, seen: ObservedFrame) -> float:
+    """Return the error of the key points of a frame; 0 without any."""
+    if seen.joints is None:
+        return 0.0
+    blank = new_fit(clip, surface)
+    joints = posed_joints(surface.skeleton(blank["betas"]), frame_pose_of(blank, clip, row))
+    return float(keypoint_error(joints, seen.joints, seen.cameras))
 
 
 def _with_row(clip: MotionClip, row: int, pose: Tensor, trans: Tensor) -> MotionClip:
@@ -260,8 +290,8 @@ def _found_from(
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
     learned, fitting = new_fit(one, surface), Fitting(one, surface, usual(one))
     for level in levels:
-        shown = seen.shrunk(level)
-        learned = fitting.run(learned, ("poses", "trans"), STEPS, lambda _, at=shown: at)
+        shown, turns = seen.shrunk(level), itertools.count()
+        learned = fitting.run(learned, ("poses", "trans"), STEPS, lambda _, at=shown, of=turns: at.part(next(of), FEW))
     with torch.no_grad():
         error = float(mean_error(learned, one, surface, {0: seen}) + prior(learned, fitting.expected))
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())

@@ -168,7 +168,10 @@ def test_who_turns_before_one_camera_is_followed(surface: Surface, monkeypatch: 
     place, camera = torch.tensor([0.0, 1.0, 0.0]), ring(1, torch.tensor([0.0, 1.0, 0.0]))
     turns = [0.4 * math.pi + x for x in (0.1, 1.6, 3.1)]  # towards the camera, then sideways, then away from it
     seen = [with_joints(surface, standing(place, turn), camera) for turn in turns]
-    clip = first_poses(torch.linspace(0, 1, 3, dtype=torch.float64), surface, seen.__getitem__)
+    ticks: list[int] = []
+    times = torch.linspace(0, 1, 3, dtype=torch.float64)
+    clip = first_poses(times, surface, seen.__getitem__, lambda: ticks.append(1))
+    assert len(ticks) == num_ticks(3, marked=True) < num_ticks(3, marked=False), "key points leave few headings"
     for root, turn in zip(clip.poses[:, 0], turns, strict=True):
         facing = Rotation.from_rotvec(root.double().numpy()).apply([0.0, 0.0, 1.0])
         assert facing @ np.array([math.sin(turn), 0.0, math.cos(turn)]) > 0.8
