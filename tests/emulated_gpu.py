@@ -36,30 +36,38 @@ def compiler() -> str:
     return found
 
 
-def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str], common: Iterable[str]) -> list[str]:
+def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str], common: Iterable[str] = ()) -> list[str]:
     """Object files of ``sources``.
 
     Args:
-        folder: a new one, in which they lie.
+        folder: for them; it is made.
         sources: C++, also with the endings of CUDA.
         flags: of the compiler.
         common: headers that most of them include; they are read once for all.
     """
     command = [compiler(), "-std=gnu++20", "-fPIC", "-w", f"-I{ROOT / 'csrc'}", *flags]
-    folder.mkdir()
-    headers = folder / "common.hpp"
-    headers.write_text("".join(f'#include "{name}"\n' for name in common), encoding="utf-8")
-    own = ["-x", "c++-header", str(headers), "-o", f"{headers}.gch"]
-    subprocess.run([*command, *own], check=True, timeout=500)
-    command += ["-include", str(headers), "-x", "c++", "-c"]
+    folder.mkdir(exist_ok=True)
+    if common:
+        headers = folder / "common.hpp"
+        headers.write_text("".join(f'#include "{name}"\n' for name in common), encoding="utf-8")
+        own = ["-x", "c++-header", str(headers), "-o", f"{headers}.gch"]
+        subprocess.run([*command, *own], check=True, timeout=500)
+        command += ["-include", str(headers)]
 
     def compile_one(source: Path) -> str:
         target = str(folder / f"{source.name}.o")
-        subprocess.run([*command, str(source), "-o", target], check=True, timeout=500)
+        subprocess.run([*command, "-x", "c++", "-c", str(source), "-o", target], check=True, timeout=500)
         return target
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(compile_one, sources))
+
+
+def as_one(file: Path, sources: Iterable[Path]) -> Path:
+    """A source that includes the others: what their templates share is compiled once, in a third of the time."""
+    texts = (f'#undef kOp\n#define kOp kOp_{source.stem}\n#include "{source}"\n' for source in sources)
+    file.write_text("".join(texts), encoding="utf-8")
+    return file
 
 
 def digest_of_all(folders: Iterable[Path]) -> str:
@@ -104,8 +112,8 @@ def build_module(cache: Path) -> ModuleType:
         for old in cache.glob("*.so"):
             old.unlink()
         with TemporaryDirectory(dir=cache) as work:
-            of_bindings = ("nanobind/ndarray.h", "nanobind/stl/optional.h", "nanobind/stl/tuple.h")
-            objects = compiled(Path(work) / "bindings", [*own, sources / "nb_combined.cpp"], flags, of_bindings)
+            bindings = as_one(Path(work) / "bindings.cpp", own)
+            objects = compiled(Path(work), [bindings, sources / "nb_combined.cpp"], flags)
             # nothing contracted, as in CMakeLists.txt
             optimized = ["-O1", "-ffp-contract=off"]
             objects += compiled(Path(work) / "kernels", KERNELS, optimized, ("cuda/device.hpp", "cuda/sort.hpp"))

@@ -138,9 +138,9 @@ RaySamples<S> ray_samples(const Array<const S>& densities, const MaybeArray<cons
 }
 
 template <class S>
-void forward(Array<const S> densities, Array<const S> colours, Array<const S> starts, Array<const S> ends,
-             Array<const int64_t> offsets, double transmittance_min,
-             const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>>& out, int threads) {
+void composite_samples(Array<const S> densities, Array<const S> colours, Array<const S> starts, Array<const S> ends,
+                       Array<const int64_t> offsets, double transmittance_min,
+                       const std::tuple<Array<S>, Array<S>, Array<S>, Array<S>>& out, int threads) {
   const RaySamples<S> in = ray_samples<S>(densities, colours, starts, ends, offsets, transmittance_min, threads);
   const auto& [colour, transmittance, depth, weights] = out;
   const Composited<S> to{checked(colour, 3 * in.rays, "composite"), checked(transmittance, in.rays, "composite"),
@@ -151,10 +151,10 @@ void forward(Array<const S> densities, Array<const S> colours, Array<const S> st
 }
 
 template <class S>
-void backward(Array<const S> densities, Array<const S> colours, Array<const S> starts, Array<const S> ends,
-              Array<const int64_t> offsets, double transmittance_min,
-              const std::tuple<Array<const S>, Array<const S>, Array<const S>>& grads, Array<S> g_densities,
-              Array<S> g_colours, int threads) {
+void composite_samples_backward(Array<const S> densities, Array<const S> colours, Array<const S> starts,
+                                Array<const S> ends, Array<const int64_t> offsets, double transmittance_min,
+                                const std::tuple<Array<const S>, Array<const S>, Array<const S>>& grads,
+                                Array<S> g_densities, Array<S> g_colours, int threads) {
   const RaySamples<S> in = ray_samples<S>(densities, colours, starts, ends, offsets, transmittance_min, threads);
   const auto& [colour, transmittance, depth] = grads;
   const Composited<const S> from{checked(colour, 3 * in.rays, "composite"),
@@ -185,8 +185,8 @@ void bind_fields(nb::module_& module) {
     module.def("hash_grid_backward", hash_backward<S>);
     module.def("march_count", count_samples<S>);
     module.def("march_samples", write_samples<S>);
-    module.def("composite_forward", forward<S>);
-    module.def("composite_backward", backward<S>);
+    module.def("composite_forward", composite_samples<S>);
+    module.def("composite_backward", composite_samples_backward<S>);
     module.def("reached_samples", reached<S>);
   });
 }
