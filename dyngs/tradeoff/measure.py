@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
 from pydantic import TypeAdapter
+from torch import Tensor
 
-from dyngs.config import SceneModel
-from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.errors import DyngsError
 from dyngs.evaluate.view_scores import Drawing
-from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.scene import render_options
 from dyngs.metrics import Lpips, psnr, ssim
+from dyngs.models.renderable import Renderable
+from dyngs.section import ModelSection
 from dyngs.study.speed import Speed
 from dyngs.study.stored import AS_STORED, read_stored, write_stored
 from dyngs.tradeoff.variants import Variant
@@ -28,6 +27,7 @@ class Measurement:
 
     Attributes:
         psnr, ssim, lpips: means over the views; LPIPS is None where it cannot be computed.
+        num_gaussians: of curved triangles theirs.
         mb: 1e6 bytes on disk: the .dyngs file, or 4 bytes per value needed for rendering where nothing is quantised.
         memory_mb: largest growth of a process that loads and renders the variant, 1e6 bytes; None where unknown.
         speed: None until it is measured.
@@ -75,16 +75,15 @@ def _dominates(a: Sequence[float], b: Sequence[float]) -> bool:
     return all(x >= y for x, y in zip(a, b, strict=True)) and any(x > y for x, y in zip(a, b, strict=True))
 
 
-def with_render_settings(variant: Variant, model: SceneModel) -> SceneModel:
+def with_render_settings(variant: Variant, model: ModelSection) -> ModelSection:
     """Return the ``model`` section of a run with the render settings of a variant."""
-    changes = {"alpha_min": variant.alpha_min, "transmittance_min": variant.transmittance_min}
-    changes |= {"rasterize_mode": None if variant.mode is None else RasterizeMode(variant.mode)}
-    return model.model_copy(update={name: value for name, value in changes.items() if value is not None})
+    changes = {"rasterize_mode" if name == "mode" else name: value for name, value in variant.drawn.items()}
+    return model.model_copy(update=changes)
 
 
-def render_options_of(variant: Variant, model: SceneModel) -> RenderOptions:
-    """Return the render options of a variant of a run with ``model``."""
-    return render_options(with_render_settings(variant, model))
+def variant_drawing(variant: Variant, scene: Renderable, background: Tensor) -> Drawing:
+    """Return the scene of a variant as it is drawn."""
+    return Drawing(scene, replace(scene.options, **variant.drawn), background, variant.scale)
 
 
 def measure_quality(drawing: Drawing, images: Iterable[Image], lpips: Lpips) -> tuple[float, float, float | None]:

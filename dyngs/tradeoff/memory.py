@@ -18,10 +18,9 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.evaluate.view_scores import Drawing
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
-from dyngs.tradeoff.measure import render_options_of
+from dyngs.tradeoff.measure import variant_drawing
 from dyngs.tradeoff.variants import Variant
 
 _STATUS = Path("/proc/self/status")
@@ -102,7 +101,7 @@ def _measure(request: dict[str, Any]) -> None:
     with kernel_threads(1):
         run = load_run(Path(request["folder"]))
         background = torch.tensor(request["background"], device="cpu")
-        drawing = Drawing(run.scene, render_options_of(variant, run.config.model), background, variant.scale)
+        drawing = variant_drawing(variant, run.renderable, background)
         for view in request["views"]:
             pose, intrinsics = (torch.tensor(view[name], device="cpu") for name in ("pose", "intrinsics"))
             drawing.image(Cameras(pose, intrinsics, *view["size"]), view["time"])

@@ -19,6 +19,7 @@ from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.metrics import load_lpips
+from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
@@ -31,13 +32,14 @@ from dyngs.tradeoff.measure import (
     Measurement,
     measure_quality,
     read_measurement,
-    render_options_of,
+    variant_drawing,
     write_measurement,
 )
 from dyngs.tradeoff.memory import MemoryMeter
 from dyngs.tradeoff.pareto import combinations
 from dyngs.tradeoff.variant_runs import VariantRuns, megabytes_on_disk, run_settings
-from dyngs.tradeoff.variants import Variant, Varied, single_changes
+from dyngs.tradeoff.variants import Variant, Varied, is_change, single_changes
+from dyngs.triangles.scene import TriangleScene
 
 TIMED_VIEWS = 8
 """Number of views for timing, evenly spread over the split; quality is measured on all."""
@@ -83,7 +85,7 @@ def sweep(runs: VariantRuns, plan: Plan, log: Callable[[str], None]) -> list[Mea
         own = run_settings(runs.run_dir)  # refuses what cannot be varied before anything is written
         session = _Session(runs, plan, meter, log)
         _require_same_source(runs, plan)
-        idle = [s.name for s in plan.settings if not any(own.allows(s, value) for value in s.values)]
+        idle = [s.name for s in plan.settings if not any(is_change(own, s, value) for value in s.values)]
         if idle:
             log(f"nothing to vary in this run: {', '.join(idle)}")
         singles = [Variant(), *single_changes(plan.settings, own, plan.finetune)]
@@ -129,12 +131,13 @@ class _Session:
             psnr=psnr,
             ssim=ssim,
             lpips=lpips,
-            num_gaussians=len(require_gaussians(drawing.scene, variant.slug)),
+            num_gaussians=_number_of(drawing.scene, variant),
             mb=megabytes_on_disk(folder),
             memory_mb=self._meter.peak_megabytes(folder, variant, shown, self._background) if on_cpu else None,
         )
         write_measurement(path, measurement)
-        counts = f"{counted(measurement.num_gaussians, 'Gaussian')}, {measurement.mb:.2f} MB"
+        noun = "triangle" if isinstance(drawing.scene, TriangleScene) else "Gaussian"
+        counts = f"{counted(measurement.num_gaussians, noun)}, {measurement.mb:.2f} MB"
         self._log(f"{variant.name}: {measurement.psnr:.2f} dB, {counts}")
         return measurement
 
@@ -156,15 +159,18 @@ class _Session:
 
     def _drawing(self, variant: Variant) -> Drawing:
         run = load_run(self._runs.folder(variant))
-        scene = require_gaussians(scene_of_split(run, self._capture, self._plan.split), variant.slug)
-        scene = scene.to(self._plan.device)
-        return Drawing(scene, render_options_of(variant, run.config.model), self._background, variant.scale)
+        scene = scene_of_split(run, self._capture, self._plan.split).to(self._plan.device)
+        return variant_drawing(variant, scene, self._background)
 
     def _images(self, count: int) -> list[Image]:
         return [self._loader[i] for i in evenly_spaced(len(self._loader), count)]
 
     def _path(self, variant: Variant) -> Path:
         return self._runs.out / "points" / f"{variant.slug}.json"
+
+
+def _number_of(scene: Renderable, variant: Variant) -> int:
+    return len(scene if isinstance(scene, TriangleScene) else require_gaussians(scene, variant.slug))
 
 
 def _require_same_source(runs: VariantRuns, plan: Plan) -> None:

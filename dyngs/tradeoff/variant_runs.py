@@ -8,13 +8,13 @@ from pathlib import Path
 
 from dyngs.api.prune import prune_run
 from dyngs.api.train import num_cores
-from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig
+from dyngs.config import BudgetConfig, Config, DynamicModel, FieldSection, PruneConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.config.schema import section_class
 from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import num_bytes_exact, write_scene_file
-from dyngs.kinds import assemble, restored_scene
+from dyngs.kinds import assemble, restored_model
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.stage import prune_
 from dyngs.runs.checkpoint import (
@@ -32,7 +32,8 @@ from dyngs.state import tensors_of
 from dyngs.storage.file import write_scene
 from dyngs.study.runs import finished
 from dyngs.tradeoff.measure import with_render_settings
-from dyngs.tradeoff.variants import RunSettings, Variant
+from dyngs.tradeoff.variants import Settings, Value, Variant
+from dyngs.triangles.keys import BgTriangleModel
 
 FIELD_SIZE = {"control_nodes": "nodes", "hexplane": "channels", "mlp": "width"}
 """The key that sets the size of a field, by its kind; free primitives have none."""
@@ -95,6 +96,9 @@ class VariantRuns:
             changes += ["model.choose=false"]
         if wanted.colour is not None:
             changes.append(f"colour.kind={wanted.colour}")
+        if isinstance(run.model, BgTriangleModel):
+            sizes = {name: getattr(run.model, name) for name in ("max_triangles", "num_first")}
+            changes += [f"model.{name}={max(4, round(wanted.triangles * size))}" for name, size in sizes.items()]
         changes += [*self._where, f"run.dir={out}"]
         return finished(load_resolved(self.run_dir, changes), out)
 
@@ -117,30 +121,37 @@ class VariantRuns:
             return trainer.checkpoint(), config
 
 
-def run_settings(run_dir: Path) -> RunSettings:
+def run_settings(run_dir: Path) -> Settings:
+    """Return what can be varied in a run. Raises DyngsError: nothing can."""
     if has_only_scene_file(run_dir):
         raise DyngsError(f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from")
     config = load_resolved(run_dir)
-    if not config.model.made_of_gaussians:
-        raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to vary")
-    scene = load_run(run_dir).scene
     model = config.model
-    return RunSettings(
-        sh_degree=scene.gaussians.sh_degree,
-        mode=model.rasterize_mode.value,
-        alpha_min=model.alpha_min,
-        transmittance_min=model.transmittance_min,
-        mask_times=config.prune.mask_times,
-        colour=config.colour.kind,
-        field=model.deform.kind if isinstance(model, DynamicModel) and not scene.is_static else None,
-    )
+    own: dict[str, Value | None] = {"storage": None, "scale": 1.0}
+    if isinstance(model, BgTriangleModel):
+        return own | {"triangles": 1.0} | {x: getattr(model, x) for x in ("sh_degree", "segments", "supersampling")}
+    if not isinstance(model, SceneModel):
+        raise DyngsError(f"{run_dir}: model.kind={model.kind} has neither Gaussians nor triangles to vary")
+    scene = load_run(run_dir).scene
+    own |= {
+        "prune": 0.0,
+        "sh_degree": scene.gaussians.sh_degree,
+        "mode": model.rasterize_mode.value,
+        "alpha_min": model.alpha_min,
+        "transmittance_min": model.transmittance_min,
+        "colour": config.colour.kind,
+    }
+    if not isinstance(model, DynamicModel) or scene.is_static:
+        return own
+    own |= {"mask_times": config.prune.mask_times, "field": model.deform.kind, "field_step": 1.0}
+    return own | ({"field_size": 1.0} if model.deform.kind in FIELD_SIZE else {})
 
 
 def megabytes_on_disk(folder: Path) -> float:
     """Return the size of the .dyngs file, or of what rendering needs of a checkpoint as float32, in 1e6 bytes."""
     if has_only_scene_file(folder):
         return 1e-6 * (folder / SCENE_FILE).stat().st_size
-    return 1e-6 * num_bytes_exact(load_run(folder).scene)
+    return 1e-6 * num_bytes_exact(load_run(folder).renderable)
 
 
 def write_chosen(models: VariantRuns, variant: Variant) -> Path:
@@ -189,8 +200,11 @@ def field_changes(config: Config, wanted: Variant) -> Iterator[str]:
 def _with_degree(source: Path, degree: int) -> tuple[Checkpoint, Config]:
     """Return checkpoint and configuration without the spherical harmonics above ``degree``."""
     checkpoint, config = latest_checkpoint(source), load_resolved(source)
-    sh = checkpoint.tensors["gaussians.sh"][:, : num_sh_terms(degree)]
-    cut = replace(checkpoint, tensors=checkpoint.tensors | {"gaussians.sh": sh.contiguous()})
+    name, count = "gaussians.sh", num_sh_terms(degree)
+    if isinstance(config.model, BgTriangleModel):
+        name, count = "triangles.harmonics", count - 1
+    sh = checkpoint.tensors[name][:, :count].contiguous()
+    cut = replace(checkpoint, tensors=checkpoint.tensors | {name: sh})
     return cut, config.model_copy(update={"model": config.model.model_copy(update={"sh_degree": degree})})
 
 
@@ -201,6 +215,6 @@ def _write(folder: Path, checkpoint: Checkpoint, config: Config, source: Path, *
     """
     tensors = checkpoint.tensors
     if not whole:
-        tensors = tensors_of(restored_scene(checkpoint, config.model).state())
+        tensors = tensors_of(restored_model(checkpoint, config.model).state())
     save_checkpoint(folder, replace(checkpoint, tensors=tensors), seconds_at(source, checkpoint.info.step))
     write_config(config, folder)

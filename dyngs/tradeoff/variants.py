@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 from pydantic import ConfigDict
 
@@ -18,6 +18,7 @@ SEVERAL = "several"
 """Stands for the setting of a variant that changes more than one."""
 AUTO = "auto"
 """Storage with the default quantisation of ``dyngs export --format dyngs``."""
+_DRAWN = ("mode", "alpha_min", "transmittance_min", "segments", "supersampling")  # options of a render, by name
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Variant:
         storage: allowed change of images by quantisation, grey levels of 255, or "auto"; None: float32.
         field_step: factor on the quantisation steps of the field.
         mode, alpha_min, transmittance_min: ``model.rasterize_mode`` and so on to render with.
+        segments, supersampling: the same of curved triangles.
+        triangles: factor on the number of triangles to train with.
         scale: width and height rendered, relative to those shown.
     """
 
@@ -51,6 +54,9 @@ class Variant:
     alpha_min: float | None = None
     transmittance_min: float | None = None
     scale: float = 1.0
+    segments: int | None = None
+    supersampling: int | None = None
+    triangles: float = 1.0
 
     @property
     def changes(self) -> dict[str, Value]:
@@ -81,12 +87,17 @@ class Variant:
     @property
     def stored(self) -> Variant:
         """The variant without the changes that only concern rendering."""
-        return replace(self, mode=None, alpha_min=None, transmittance_min=None, scale=1.0)
+        return replace(self, scale=1.0, **dict.fromkeys(_DRAWN))
+
+    @property
+    def drawn(self) -> dict[str, Value]:
+        """The changed options of a render, by name."""
+        return {name: RasterizeMode(x) if name == "mode" else x for name, x in self.changes.items() if name in _DRAWN}
 
     @property
     def trained(self) -> Variant:
         """The variant with only the changes that need training from scratch."""
-        return Variant(colour=self.colour, field=self.field, field_size=self.field_size)
+        return Variant(colour=self.colour, field=self.field, field_size=self.field_size, triangles=self.triangles)
 
     def merged(self, other: Variant) -> Variant:
         """Return this variant with the changes of ``other`` on top."""
@@ -145,35 +156,26 @@ SETTINGS = (
     Varied("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
     Varied("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
     Varied("scale", (0.75, 0.5), low=0.05, high=1.0),
+    Varied("segments", (3, 2, 1), low=1, high=16, integers=True),
+    Varied("supersampling", (1,), low=1, high=4, integers=True),
     Varied("field_step", (4.0, 16.0), low=1 / 64, high=1024),
     Varied("colour", _COLOURS, words=_COLOURS, trains=True),
     Varied("field", _FIELDS, words=_FIELDS, trains=True),
     Varied("field_size", (0.5, 0.25), low=1 / 64, high=64, trains=True),
+    Varied("triangles", (0.5, 0.25), low=1 / 64, high=64, trains=True),
 )
 
 
-@dataclass(frozen=True)
-class RunSettings:
-    """The settings of the run that is varied, as in ``Variant``; ``field`` None: nothing moves."""
+Settings = Mapping[str, Value | None]
+"""The settings that a run has, as in ``Variant``, with its own values."""
 
-    sh_degree: int
-    mode: str
-    alpha_min: float
-    transmittance_min: float
-    mask_times: int
-    colour: str
-    field: str | None
 
-    def allows(self, setting: Varied, value: Value) -> bool:
-        """Whether a value applies to the run and differs from its own."""
-        if setting.name == "sh_degree":
-            return value < self.sh_degree  # pyright: ignore[reportOperatorIssue]
-        if setting.name in ("mask_times", "field", "field_size", "field_step") and self.field is None:
-            return False
-        if setting.name == "field_size" and self.field == "free":  # it grows with the Gaussians
-            return False
-        own = asdict(self) | {"scale": 1.0, "field_size": 1.0, "field_step": 1.0}
-        return own.get(setting.name) != value
+def is_change(own: Settings, setting: Varied, value: Value) -> bool:
+    """Whether a value applies to a run with the settings ``own`` and differs from its own."""
+    if setting.name not in own:
+        return False
+    before = own[setting.name]
+    return value < before if setting.name == "sh_degree" else value != before  # pyright: ignore[reportOperatorIssue]
 
 
 def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Varied, ...]:
@@ -200,13 +202,13 @@ def parse_variations(words: Sequence[str], *, trains: bool) -> tuple[Varied, ...
     return tuple(found.values())
 
 
-def single_changes(settings: Sequence[Varied], run: RunSettings, finetune: int) -> list[Variant]:
+def single_changes(settings: Sequence[Varied], own: Settings, finetune: int) -> list[Variant]:
     """Return one variant per setting and value that applies to a run; pruned and masked ones also with fine-tuning."""
     variants = []
     for setting in settings:
         name = setting.name
         for value in setting.values:
-            if run.allows(setting, value):
+            if is_change(own, setting, value):
                 variant = Variant(**{name: value})  # pyright: ignore[reportArgumentType]
                 if name == "field_step":
                     variant = replace(variant, storage=AUTO)

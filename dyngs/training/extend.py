@@ -15,6 +15,7 @@ from dyngs.errors import DyngsError, counted
 from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
 from dyngs.models.schedule import PUBLISHED_STEPS, scaled
 from dyngs.training.corrections.exposure import WARM_UP
+from dyngs.triangles.keys import BgTriangleModel
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,9 @@ def with_length(config: Config, done: int, steps: int) -> Config:
         case HumanModel():
             fraction = length.share(config.model.refine_from)
             changed["model"] = config.model.model_copy(update={"refine_from": fraction})
+        case BgTriangleModel():
+            fraction = length.share(config.model.texture_from)
+            changed["model"] = config.model.model_copy(update={"texture_from": fraction})
         case _:
             pass
     return config.model_copy(update=changed)

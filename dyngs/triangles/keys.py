@@ -13,7 +13,6 @@ class BgTriangleModel(ModelSection):
     """BG-Triangle (Wu et al. 2025)."""
 
     begins_with_points: ClassVar[bool] = True
-    on_gpu: ClassVar[bool] = False
 
     kind: Literal["bg_triangle"] = Field(
         default="bg_triangle", description="curved triangles with sharp edges (BG-Triangle; docs/family.md)"
@@ -34,9 +33,6 @@ class BgTriangleModel(ModelSection):
     )
     texture_from: Fraction = Field(
         default=0.7, description="fraction of the run after which textures are learned in place of colours"
-    )
-    moves_on: bool = Field(
-        default=True, description="control points are learned to the end; false: until textures begin, as published"
     )
     segments: int = Field(
         default=6,

@@ -69,7 +69,7 @@ class TriangleTraining(Model[TriangleScene]):
 
     @property
     def is_textured(self) -> bool:
-        """Whether textures are learned, and places no more."""
+        """Whether textures are learned, and no triangle comes or goes."""
         return self._patches.texture > 0
 
     def _begin_on_surface(self) -> None:
@@ -104,11 +104,11 @@ class TriangleTraining(Model[TriangleScene]):
             self._tallies.add(self._now)
             self._now = Tallies(len(patches))
         rates = self._rates(step)
-        updates = [self._adam.update(name, x, rates[name]) for name, x in patches.tensors.items() if rates[name] > 0]
+        updates = [self._adam.update(name, x, rates[name]) for name, x in patches.tensors.items()]
         bad = self._adam.steps_(updates, step=step)
         for x in self.leaves:
             x.grad = None
-        if not self.is_textured and self._last_step_of_places <= step < steps:
+        if not self.is_textured and self._first_texture <= step < steps:
             if self._tallies.views >= LEAST_EVERY:
                 self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
@@ -118,14 +118,12 @@ class TriangleTraining(Model[TriangleScene]):
     def _rates(self, step: int) -> dict[str, float]:
         """Return the learning rate of each tensor in ``step``."""
         steps, model = self._run.config.train.steps, self._model
-        until = steps if model.moves_on else self._last_step_of_places
-        moved = min(1.0, step / max(1, until))
+        moved = step / steps
         position = self._unit * model.lr_position ** (1 - moved) * model.lr_position_final**moved
-        begun = self._last_step_of_places if self.is_textured else 0
-        end = steps if self.is_textured else self._last_step_of_places
+        begun = self._first_texture if self.is_textured else 0
+        end = steps if self.is_textured else self._first_texture
         colour = model.lr_colour * LAST_COLOUR ** min(1.0, (step - begun) / max(1, end - begun))
-        stops = self.is_textured and not model.moves_on
-        return {"points": 0.0 if stops else position, "colours": colour, "harmonics": colour / HARMONICS_SLOWER}
+        return {"points": position, "colours": colour, "harmonics": colour / HARMONICS_SLOWER}
 
     def _texture(self) -> None:
         """Learn textures from now on, with the moments of what stays as it is."""
@@ -139,16 +137,18 @@ class TriangleTraining(Model[TriangleScene]):
         return max(LEAST_EVERY, scaled(EVERY, self._run.config.train.steps))
 
     def _is_due(self, step: int) -> bool:
-        until = min(scaled(UNTIL, self._run.config.train.steps), self._last_step_of_places)
-        return not self.is_textured and step % self._interval == 0 and step <= until
+        return not self.is_textured and step % self._interval == 0 and step <= self._last_change
 
     @property
-    def _last_step_of_places(self) -> int:
+    def _last_change(self) -> int:
+        return min(scaled(UNTIL, self._run.config.train.steps), self._first_texture)
+
+    @property
+    def _first_texture(self) -> int:
         return round(self._model.texture_from * self._run.config.train.steps)
 
     def _changed(self, step: int, bad: Tensor | int) -> Updated:
-        until = min(scaled(UNTIL, self._run.config.train.steps), self._last_step_of_places)
-        rounds = 1 + (until - step) // self._interval
+        rounds = 1 + (self._last_change - step) // self._interval
         self._change(self._model.max_triangles, rounds)
         return Updated(bad, is_rearranged=True)
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from moving_scene import Sliding, camera, moving_scene, still_scene
 
-from dyngs.config import StaticModel
 from dyngs.conventions import RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.metrics import Lpips
-from dyngs.tradeoff.measure import measure_quality, render_options_of
+from dyngs.tradeoff.measure import measure_quality, variant_drawing
 from dyngs.tradeoff.variants import Variant
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -25,9 +26,9 @@ def image_of(drawing: Drawing, time: float = 0.0) -> Image:
 
 
 def test_options_are_those_of_the_run_but_for_what_is_changed() -> None:
-    model = StaticModel(near=0.5, eps2d=0.1)
-    assert render_options_of(Variant(), model) == RenderOptions(near=0.5, eps2d=0.1)
-    changed = render_options_of(Variant(mode="antialiased", alpha_min=0.02, transmittance_min=0.01), model)
+    scene = replace(still_scene(), options=RenderOptions(near=0.5, eps2d=0.1))
+    assert variant_drawing(Variant(), scene, BLACK).options == scene.options
+    changed = variant_drawing(Variant(mode="antialiased", alpha_min=0.02, transmittance_min=0.01), scene, BLACK).options
     assert (changed.near, changed.mode) == (0.5, RasterizeMode.ANTIALIASED)
     assert (changed.alpha_min, changed.transmittance_min) == (0.02, 0.01)
 

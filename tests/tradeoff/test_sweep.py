@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
@@ -16,9 +17,8 @@ from dyngs.config import DynamicModel
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.gaussians.scene import render_options
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
-from dyngs.tradeoff.measure import Measurement, read_measurement, render_options_of
+from dyngs.tradeoff.measure import Measurement, read_measurement, variant_drawing
 from dyngs.tradeoff.report import write_report
 from dyngs.tradeoff.sweep import Plan, sweep
 from dyngs.tradeoff.table import table_rows
@@ -139,7 +139,8 @@ def test_the_chosen_run_is_drawn_as_it_was_measured(points: list[Measurement], r
     assert len(chosen.scene) == points[0].num_gaussians / 2
     assert chosen.config.data.downscale == 2 * load_resolved(runs.run_dir).data.downscale
     assert chosen.scene.masks is not None
-    assert render_options(chosen.config.model) == render_options_of(variant, load_resolved(runs.run_dir).model)
+    measured = variant_drawing(variant, load_run(runs.run_dir).scene, torch.zeros(3))
+    assert chosen.scene.options == measured.options
     for single in (Variant(sh_degree=0), Variant(alpha_min=0.02), Variant(storage=2.0)):
         folder = write_chosen(runs, single)
         assert evaluate_run(folder, "test", threads=1).psnr == pytest.approx(named(points, single).psnr)
@@ -179,7 +180,7 @@ def test_free_primitives_are_tried_and_left(run_dir: Path, tmp_path: Path) -> No
 
 def test_masks_that_a_run_has_stay(points: list[Measurement], runs: VariantRuns, tmp_path: Path) -> None:
     masked = VariantRuns(runs.out / "training" / Variant(mask_times=3, finetune=2).slug, tmp_path, 1)
-    assert run_settings(masked.run_dir).mask_times == 3
+    assert run_settings(masked.run_dir)["mask_times"] == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene
         assert scene.masks is not None

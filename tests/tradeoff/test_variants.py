@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngs.errors import DyngsError
-from dyngs.tradeoff.variants import SETTINGS, RunSettings, Variant, Varied, parse_variations, single_changes
+from dyngs.tradeoff.variants import SETTINGS, Variant, Varied, parse_variations, single_changes
 
 VARIANTS = st.builds(
     Variant,
@@ -25,16 +25,23 @@ VARIANTS = st.builds(
     field=st.sampled_from([None, "mlp"]),
     field_size=st.sampled_from([1.0, 0.5]),
     field_step=st.sampled_from([1.0, 4.0]),
+    segments=st.sampled_from([None, 1]),
+    triangles=st.sampled_from([1.0, 0.5]),
 )
-DYNAMIC = RunSettings(
-    sh_degree=2,
-    mode="classic",
-    alpha_min=1 / 255,
-    transmittance_min=1e-4,
-    mask_times=0,
-    colour="sh",
-    field="control_nodes",
-)
+DYNAMIC = {
+    "prune": 0.0,
+    "sh_degree": 2,
+    "storage": None,
+    "mode": "classic",
+    "alpha_min": 1 / 255,
+    "transmittance_min": 1e-4,
+    "scale": 1.0,
+    "mask_times": 0,
+    "colour": "sh",
+    "field": "control_nodes",
+    "field_size": 1.0,
+    "field_step": 1.0,
+}
 
 
 @given(VARIANTS)
@@ -58,7 +65,7 @@ def test_merging_keeps_what_the_other_changes(a: Variant, b: Variant) -> None:
 
 
 def test_what_lies_on_disk_does_not_depend_on_drawing() -> None:
-    drawn = Variant(mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5)
+    drawn = Variant(mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5, segments=2, supersampling=1)
     assert drawn.stored == Variant()
     assert replace(drawn, prune=0.5).stored == Variant(prune=0.5)
     assert replace(drawn, colour="sh", field="mlp", prune=0.5).trained == Variant(colour="sh", field="mlp")
@@ -81,16 +88,16 @@ def test_single_changes_leave_out_what_a_run_is_already() -> None:
         names
     )
     assert not {"sh_degree=2", "mode=classic", "colour=sh", "field=control_nodes"} & set(names)
-    still = replace(DYNAMIC, sh_degree=0, field=None)
+    still = {"sh_degree": 0, "storage": None, "scale": 1.0}
     fewer = [v.name for v in single_changes(parse_variations([], trains=True), still, 0)]
-    assert not any(name.startswith(("mask_times", "sh_degree", "field")) or "field_step" in name for name in fewer)
+    assert fewer == ["storage=auto", "storage=1", "storage=3", "scale=0.75", "scale=0.5"]
 
 
 def test_own_values_are_the_start() -> None:
     variations = parse_variations(["alpha_min=0.008,0.016"], trains=False)
-    assert single_changes(variations, replace(DYNAMIC, alpha_min=0.008), 0) == [Variant(alpha_min=0.016)]
+    assert single_changes(variations, DYNAMIC | {"alpha_min": 0.008}, 0) == [Variant(alpha_min=0.016)]
     variations = parse_variations(["mask_times=6,16"], trains=False)
-    assert single_changes(variations, replace(DYNAMIC, mask_times=6), 0) == [Variant(mask_times=16)]
+    assert single_changes(variations, DYNAMIC | {"mask_times": 6}, 0) == [Variant(mask_times=16)]
 
 
 def test_steps_of_the_field_are_those_of_storage() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,15 @@ from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
+from dyngs.files.write import write_image
 from dyngs.kinds import build
 from dyngs.metrics import psnr
 from dyngs.models.views import training_cameras
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
+from dyngs.tradeoff.variant_runs import VariantRuns
+from dyngs.tradeoff.variants import Variant
+from dyngs.triangles.keys import BgTriangleModel
 from dyngs.triangles.scene import TriangleScene
 
 STEPS = ["train.steps=120", "train.save_every=60"]
@@ -40,10 +46,9 @@ def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
     assert scene.patches.texture == 3
 
 
-@pytest.mark.parametrize("last", ["texture_from=0.5", "moves_on=false"])
-def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path, last: str) -> None:
+def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path) -> None:
     steps = ["train.steps=112", "train.save_every=56"]  # cut right after a change and the first texture
-    run = dyngs.train(config_of(capture, *steps, f"model.{last}", f"run.dir={tmp_path / 'run'}"))
+    run = dyngs.train(config_of(capture, *steps, "model.texture_from=0.5", f"run.dir={tmp_path / 'run'}"))
     path = checkpoint_paths(run)[-1]
     whole = path.read_bytes()
     path.unlink()
@@ -90,6 +95,43 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
     assert np.ptp(np.asarray(visual.vertex_colors)[:, :3]) > 0
 
 
+def test_its_settings_are_traded(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "tradeoff"
+    settings = ("sh_degree=0", "storage=2", "supersampling=1", "scale=0.5", "prune")
+    vary = [word for setting in settings for word in ("--vary", setting)]
+    words = ["tradeoff", str(run), "--out", str(out), *vary, "--rounds", "1", "--combine", "1"]
+    assert main([*words, "--require", "mb<=1", "--minimize", "mb"]) == 0
+    points = {row["name"]: row for row in json.loads((out / "tradeoff.json").read_text())["points"]}
+    base = points["as it is"]
+    assert base["psnr"] == pytest.approx(evaluate_run(run).psnr)
+    assert base["gaussians"] == len(open_run(run).renderable.state()["triangles.points"].tensor)
+    assert points["sh_degree=0"]["mb"] == pytest.approx(base["mb"] * 48 / 72, rel=1e-3)  # and a few bytes
+    assert points["storage=2"]["mb"] < base["mb"] / 2
+    assert all(points[name]["psnr"] != base["psnr"] for name in ("sh_degree=0", "supersampling=1", "scale=0.5"))
+    assert not any("prune" in name for name in points)
+    chosen = next((out / "chosen").iterdir())
+    assert len(open_run(chosen).renderable.state()["triangles.points"].tensor) == base["gaussians"]
+
+
+def test_fewer_triangles_are_trained_for_a_trade(capture: Path, tmp_path: Path) -> None:
+    run = dyngs.train(config_of(capture, "train.steps=60", f"run.dir={tmp_path / 'run'}"))
+    half = VariantRuns(run, tmp_path / "out", 1).folder(Variant(triangles=0.5))
+    model = load_resolved(half).model
+    assert isinstance(model, BgTriangleModel)
+    assert (model.max_triangles, model.num_first) == (150, 75)
+    assert 10 < len(open_run(half).renderable.state()["triangles.points"].tensor) <= 150
+
+
+@pytest.fixture(scope="module")
+def folders(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """BLANK: the same views, of which none shows anything."""
+    blank = tmp_path_factory.mktemp("blank") / "capture"
+    shutil.copytree(capture, blank)
+    for path in blank.rglob("*.png"):
+        write_image(path, np.zeros((24, 24, 4), dtype=np.uint8))
+    return {"RUN": run, "CAPTURE": capture, "BLANK": blank}
+
+
 @pytest.mark.parametrize(
     ("command", "said"),
     [
@@ -97,16 +139,17 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
         (["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"], "1 to 64"),
         (["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"], "radiance field"),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
-        (["tradeoff", "RUN", "--out", "OUT/tradeoff"], "Gaussians"),
+        (["train", "data.root=BLANK", "model.kind=bg_triangle", "run.dir=OUT/run"], "show no surface"),
         (["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.min_fps=5"], "model.max_triangles"),
     ],
 )
 def test_what_does_not_go_is_refused(
-    run: Path, capture: Path, tmp_path: Path, command: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    folders: dict[str, Path], tmp_path: Path, command: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [word.replace("RUN", str(run)).replace("OUT", str(tmp_path)) for word in command]
-    words = [word.replace("CAPTURE", str(capture)) for word in words]
-    assert main(words) == 2
+    words = " ".join(command)
+    for name, folder in (folders | {"OUT": tmp_path}).items():
+        words = words.replace(name, str(folder))
+    assert main(words.split(" ")) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]

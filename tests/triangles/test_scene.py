@@ -73,6 +73,27 @@ def test_gradients_reach_everything() -> None:
         assert bool(x.grad.isfinite().all())
 
 
+def test_what_has_no_area_is_not_drawn_and_spoils_no_gradient() -> None:
+    """All points equal, on a line, not a number, behind the camera and much larger than the scene, with a good one."""
+    nan = SQUARE[0].clone()
+    nan[0, 2, 1] = torch.nan
+    wide = triangle((-1e5, 1e5, -9), (1e5, 1e5, -9), (0, -1e5, -9))
+    useless = [triangle(*[(0.2, 0.1, -1)] * 3), triangle((-1, 0, -1), (0, 0, -1), (1, 0, -1)), nan, wide]
+    alone, together = scene_of(SQUARE[0]), scene_of(SQUARE[0], *useless)
+    points = together.patches.points.clone().requires_grad_()
+    drawn = replace(together, patches=replace(together.patches, points=points)).render(camera())
+    assert torch.equal(drawn.rgb, alone.render(camera()).rgb)
+    drawn.rgb.square().sum().backward()
+    assert points.grad is not None
+    assert points.grad[0].abs().sum() > 0
+    assert points.grad[1:].abs().max() == 0
+
+
+def test_one_that_is_larger_than_the_scene_fills_the_image() -> None:
+    drawn = scene_of(triangle((-1e6, -1e6, 0), (1e6, -1e6, 0), (0, 2e6, 0))).render(camera())
+    torch.testing.assert_close(drawn.rgb[0], RED.expand(32, 32, 3))
+
+
 def test_nothing_in_view_is_the_background() -> None:
     drawn = scene_of(triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))).render(camera(), background=torch.ones(3))
     assert drawn.rgb.min() == 1
