@@ -462,7 +462,10 @@ def test_export_and_render_of_the_file(run_dir: Path, tmp_path: Path, capsys: Ca
         words = ["--path", path, "--frames", "2", "--size", "24x24", "--up=-y"]
         assert main(["render", str(ply), "--out", str(out), *words]) == 0
         assert len(list(out.glob("*.png"))) == 2
+    few = ("--max-gaussians-drawn", "1000")
+    assert main(["render", str(ply), "--out", str(out), *words, *few]) == 0
     capsys.readouterr()
+    assert "a number of Gaussians" in error_line(capsys, "render", ply, "--out", tmp_path, few[0], 0)
     assert "has no splits" in error_line(capsys, "render", ply, "--out", tmp_path, "--split", "test")
     assert "no camera path 'circle'" in error_line(capsys, "render", ply, "--out", tmp_path, "--path", "circle")
 
@@ -507,6 +510,8 @@ def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> N
     assert images("clamped", "--time", "7") == 1
     output = capsys.readouterr()
     assert re.fullmatch(r"dyngs: warning: .*clamped\n", output.err)
+    few = ("--max-gaussians-drawn", 9, "--view", 0)
+    assert "for still scenes" in error_line(capsys, "render", moving_run, "--out", tmp_path, *few)
     assert "no view 'r_9'" in error_line(capsys, "render", moving_run, "--out", tmp_path, "--view", "r_9")
     assert "no range of times" in error_line(capsys, "render", moving_run, "--out", tmp_path, "--times", "x")
     assert "'val' has no views" in error_line(

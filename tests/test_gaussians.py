@@ -118,3 +118,10 @@ def test_stored_sizes_beyond_float32_are_refused() -> None:
     tensors["log_scales"][2, 1] = 88.5
     with pytest.raises(ValueError, match=r"'log_scales' holds sizes beyond e\^88"):
         Gaussians.stored(tensors)
+
+
+def test_joined_parts_follow_each_other() -> None:
+    whole = five()
+    first, rest = torch.tensor([0, 1]), torch.tensor([2, 3, 4])
+    both = Gaussians.joined([whole.select(first), whole.select(rest)])
+    assert all(torch.equal(x, both.tensors()[name]) for name, x in whole.tensors().items())

@@ -211,6 +211,11 @@ def computing_device(choice: str) -> torch.device:
     return device
 
 
+def add_most_drawn(parser: argparse.ArgumentParser, about: str) -> None:
+    kind = whole("a number of Gaussians", 1, 10**9 - 1)
+    parser.add_argument("--max-gaussians-drawn", type=kind, metavar="N", help=about)
+
+
 def is_avatar_file(path: Path) -> bool:
     """Whether a path is an avatar file, as opposed to a run folder or a .ply."""
     return path.is_file() and path.suffix.lower() == ".safetensors"

@@ -67,6 +67,7 @@ def add_parser(commands: args.Commands) -> None:
     background = "background for a path or fixed camera (default: that of training)"
     parser.add_argument("--background", choices=("white", "black"), help=background)
     args.add_up(parser, " of the path")
+    args.add_most_drawn(parser, "of a still scene: draw far parts coarser, and N Gaussians of each image at most")
     args.add_threads(parser)
     args.add_device(parser)
     args.add_data_root(parser)
@@ -133,7 +134,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
     if not _is_path(arguments):
         with ProgressBar() as report:
-            opened = open_run(arguments.source, data_root=args.data_root(arguments))
+            opened = _coarser(arguments, open_run(arguments.source, data_root=args.data_root(arguments)))
             return write_split_images(opened, arguments.split or "test", arguments.out, output, report, device)
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
@@ -141,7 +142,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     if not arguments.fps:
         output = replace(output, fps=path.fps)
     with ProgressBar() as report:
-        return write_path_images(opened.to(device), path, arguments.out, output, report)
+        return write_path_images(_coarser(arguments, opened).to(device), path, arguments.out, output, report)
 
 
 def _opened(arguments: argparse.Namespace) -> Opened:
@@ -158,6 +159,14 @@ def _opened(arguments: argparse.Namespace) -> Opened:
     if arguments.background is not None:
         opened = opened.on_background(arguments.background)
     return opened if arguments.up is None else replace(opened, stated_up=arguments.up)
+
+
+def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:
+    """Return the scene with levels of detail, if they are asked for."""
+    from dyngs.static.levels import LevelScene
+
+    most: int | None = arguments.max_gaussians_drawn
+    return opened if most is None else opened.showing(LevelScene.of(opened.renderable, most))
 
 
 def _path_options(arguments: argparse.Namespace) -> PathOptions:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import torch
@@ -71,6 +71,12 @@ class Gaussians:
         if found.sh.shape[1] not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
             raise ValueError(f"'sh' has {found.sh.shape[1]} terms, which no degree has")
         return found
+
+    @staticmethod
+    def joined(parts: Sequence[Gaussians]) -> Gaussians:
+        """Return the Gaussians of all parts, whose harmonics are of one degree."""
+        tensors = [part.tensors() for part in parts]
+        return Gaussians(**{name: torch.cat([x[name] for x in tensors]) for name in tensors[0]})
 
     def __len__(self) -> int:
         return len(self.means)

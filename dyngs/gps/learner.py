@@ -18,11 +18,12 @@ from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gps.pairs import MAX_ANGLE, Pair, lessons, neighbours, well_spread
 from dyngs.gps.rectification import RectifiedPair, cropped, is_inside, rectified
-from dyngs.gps.surface import GpsNetwork, gaussians_of, joined, offset_loss
+from dyngs.gps.surface import GpsNetwork, gaussians_of, offset_loss
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, of_moment, random_index
 from dyngs.models.renderable import Renderable
@@ -82,7 +83,7 @@ class GpsPredictor:
         for pair in pairs:
             both = rectified(images[pair.left], images[pair.right], self.model.person_px)
             found.append(gaussians_of(both, self.network(both)))
-        gaussians = joined(found)
+        gaussians = Gaussians.joined(found)
         kept = gaussians.opacities >= _FAINT
         for image in images.values():
             kept &= is_inside(image, gaussians.means)

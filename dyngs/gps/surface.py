@@ -112,11 +112,6 @@ def gaussians_of(pair: RectifiedPair, surface: Surface) -> Gaussians:
     )
 
 
-def joined(parts: Sequence[Gaussians]) -> Gaussians:
-    """Return the Gaussians of several pairs together."""
-    return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
-
-
 def offset_loss(pair: RectifiedPair, offsets: Sequence[Tensor], decay: float) -> Tensor:
     """Return the weighted sum of the mean errors of ``offsets``, px, where the truth is known.
 

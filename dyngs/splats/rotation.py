@@ -70,8 +70,7 @@ def placed(gaussians: Gaussians, world: np.ndarray) -> Gaussians | None:
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """Return the Gaussians of all parts, with harmonics of the least degree among them."""
     terms = num_sh_terms(min(part.sh_degree for part in parts))
-    tensors = [part.tensors() | {"sh": part.sh[:, :terms]} for part in parts]
-    return Gaussians(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
+    return Gaussians.joined([part.replace(sh=part.sh[:, :terms]) for part in parts])
 
 
 def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from ray_traced_ball import CENTER, RADIUS, ball, exact_depth, pose_at
 
 from dyngs.config import GpsModel
 from dyngs.gps.rectification import RectifiedPair, rectified
-from dyngs.gps.surface import LARGEST, GpsNetwork, Surface, gaussians_of, joined, offset_loss
+from dyngs.gps.surface import LARGEST, GpsNetwork, Surface, gaussians_of, offset_loss
 
 MODEL = GpsModel(person_px=40, widths=(8, 16, 16))
 
@@ -80,12 +80,3 @@ def test_the_error_of_offsets(pair: RectifiedPair) -> None:
     assert offset_loss(pair, [truth], 0.9) == 0
     wrong = torch.where(pair.offsets.isfinite(), truth + 2, truth + 1e6)
     torch.testing.assert_close(offset_loss(pair, [wrong, truth + 1], 0.5), torch.tensor(2.0))
-
-
-def test_pairs_are_joined(pair: RectifiedPair) -> None:
-    network = GpsNetwork(MODEL, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        one = gaussians_of(pair, network(pair))
-    both = joined([one, one])
-    assert len(both) == 2 * len(one)
-    assert torch.equal(both.means[len(one) :], one.means)

@@ -167,6 +167,5 @@ def surface_gaussians(parts: Sequence[Texels], sh_degree: int) -> tuple[Gaussian
     """Return the ``texel_gaussians`` on the skin of all parts, part by part, their anchors, and normals (N, 3)."""
     made = [texel_gaussians(texels, (0.0,), sh_degree) for texels in parts]
     normals = torch.cat([texels.normals for texels in parts])
-    gaussians = {name: torch.cat([g.tensors()[name] for g, _ in made]) for name in made[0][0].tensors()}
     anchors = {name: torch.cat([a.tensors()[name] for _, a in made]) for name in made[0][1].tensors()}
-    return Gaussians(**gaussians), Anchors(**anchors), normals
+    return Gaussians.joined([g for g, _ in made]), Anchors(**anchors), normals

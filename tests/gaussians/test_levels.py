@@ -1,0 +1,156 @@
+"""Levels of detail: merged Gaussians keep the moments of what they replace, and a cut is the scene, once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from moving_scene import camera
+from splat_scenes import cloud
+
+from dyngs.camera import Cameras
+from dyngs.errors import DyngsError
+from dyngs.gaussians import Gaussians
+from dyngs.gaussians import levels as module
+from dyngs.gaussians.levels import MERGED, Levels, levels_of, merged
+from dyngs.gaussians.rendering import render
+from dyngs.ops.quaternions import rotation_matrices
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "BLOCK", 16)
+
+
+def covariances(gaussians: Gaussians) -> torch.Tensor:
+    half = rotation_matrices(gaussians.quats) @ torch.diag_embed(gaussians.scales)
+    return half @ half.mT
+
+
+def test_merged_moments_are_those_of_the_mixture() -> None:
+    """Checked from samples' moments in closed form: E[x], E[x x^T], and the mean of all colour coefficients."""
+    several = cloud(40, degree=2).to(dtype=torch.float64).replace(logit_opacities=torch.full((40,), -5.0).double())
+    one, shares = merged(several, 4)
+    second = covariances(several) + several.means[:, :, None] * several.means[:, None, :]
+    for i in range(10):
+        own = slice(4 * i, 4 * i + 4)
+        mean = (shares[i, :, None] * several.means[own]).sum(0)
+        mixed = (shares[i, :, None, None] * second[own]).sum(0) - mean[:, None] * mean
+        torch.testing.assert_close(one.means[i], mean)
+        torch.testing.assert_close(covariances(one)[i], mixed)
+        torch.testing.assert_close(one.sh[i], (shares[i, :, None, None] * several.sh[own]).sum(0))
+    torch.testing.assert_close(shares.sum(1), torch.ones(10).double())
+
+
+def test_mass_is_kept_until_it_is_opaque() -> None:
+    """A ball's area is 4 pi r^2: two of equal place and size are twice as opaque as one, and never more than opaque."""
+    ball = cloud(1).to(dtype=torch.float64).replace(log_scales=torch.full((1, 3), -1.0).double())
+    for opacity, expected in ((0.2, 0.4), (0.8, module.LARGEST_OPACITY)):
+        pair = Gaussians.joined([ball.replace(logit_opacities=torch.tensor([opacity]).double().logit())] * 2)
+        one, _ = merged(pair, 2)
+        assert float(one.opacities) == pytest.approx(expected)
+        torch.testing.assert_close(covariances(one), covariances(ball))
+
+
+def test_one_gaussian_that_is_all_there_is_stays_as_it_is() -> None:
+    """The others, of no opacity, have no say, wherever they are."""
+    several = cloud(4).to(dtype=torch.float64)
+    several.logit_opacities[1:] = -torch.inf
+    one, _ = merged(several, 4)
+    torch.testing.assert_close(one.means, several.means[:1])
+    torch.testing.assert_close(covariances(one), covariances(several)[:1])
+    torch.testing.assert_close(one.opacities, several.opacities[:1])
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 1000])
+def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None:
+    gaussians = cloud(count)
+    levels = levels_of(gaussians)
+    assert len(levels.levels[-1]) <= 16
+    for fine, coarse in zip(levels.levels, levels.levels[1:], strict=False):
+        assert len(coarse) == -(-len(fine) // MERGED)
+    assert sorted(levels.levels[0].means[:, 0].tolist()) == sorted(gaussians.means[:, 0].tolist())
+    for i, balls in enumerate(levels.blocks):
+        blocks = [(i, k) for k in range(len(balls))]
+        assert sum(levels.count(block) for block in blocks) == len(levels.levels[i])
+        assert all(len(levels.of_block(block)) == levels.count(block) for block in blocks)
+        if i:
+            below = [child for block in blocks for child in levels.children(block)]
+            assert below == [(i - 1, k) for k in range(len(levels.blocks[i - 1]))]
+
+
+def test_boxes_of_the_tree_are_apart(small_blocks: None) -> None:
+    """Halves of the whole do not overlap along the axis that is longest."""
+    order = module._tree_order(cloud(64).means.numpy())
+    assert sorted(order) == list(range(64))
+    points = cloud(64).means.numpy()[order]
+    axis = int(np.ptp(points, axis=0).argmax())
+    assert points[:32, axis].max() <= points[32:, axis].min()
+
+
+def whole(levels: Levels, cut: list[tuple[int, int]]) -> list[int]:
+    """How often the cut shows each block of the finest level."""
+    shown = np.zeros(len(levels.blocks[0]), int)
+    for level, place in cut:
+        shown[place * MERGED**level : (place + 1) * MERGED**level] += 1
+    return shown.tolist()
+
+
+def test_a_cut_shows_everything_once(small_blocks: None) -> None:
+    levels = levels_of(cloud(1000))
+    counts = []
+    for pixels in (0.0, 0.5, 2.0, 8.0, 1e9):
+        cut = levels.cut(camera(), pixels=pixels)
+        assert set(whole(levels, cut)) == {1}
+        counts.append(sum(levels.count(block) for block in cut))
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] == len(levels.levels[-1])
+    for most in (20, 100, 500):
+        cut = levels.cut(camera(), most)
+        assert set(whole(levels, cut)) == {1}
+        assert sum(levels.count(block) for block in cut) <= most
+
+
+def test_the_finest_cut_is_the_scene_to_the_bit(small_blocks: None) -> None:
+    """Seen whole; equal depths, which no two here have, would be drawn in another order."""
+    gaussians = cloud(300)
+    levels = levels_of(gaussians)
+    seen = levels.seen_by(camera(), pixels=0.0)
+    assert len(seen) == 300
+    assert torch.equal(render(seen, camera()).rgb, render(gaussians, camera()).rgb)
+
+
+def test_equal_gaussians_give_equal_levels(small_blocks: None) -> None:
+    one, other = (levels_of(cloud(300)) for _ in range(2))
+    for a, b in zip(one.levels, other.levels, strict=True):
+        assert all(torch.equal(x, b.tensors()[name]) for name, x in a.tensors().items())
+
+
+def test_what_is_behind_or_beside_the_camera_stays_coarse(small_blocks: None) -> None:
+    levels = levels_of(cloud(1000))
+    pose = camera().cam_from_world.clone()
+    for turn in (
+        torch.diag(torch.tensor([-1.0, 1, -1, 1])),
+        torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]),
+    ):
+        away = Cameras(turn @ pose, camera().intrinsics, camera().width, camera().height)
+        assert levels.cut(away, pixels=0.0) == [(len(levels.levels) - 1, 0)]
+
+
+def test_from_afar_fewer_look_the_same(small_blocks: None) -> None:
+    """A cloud a few pixels wide: five times fewer, and nearer to what a camera of many more pixels sees."""
+    gaussians = cloud(2000)
+    pose = camera().cam_from_world.clone()
+    pose[0, 2, 3] *= 20
+    far = Cameras(pose, camera().intrinsics, camera().width, camera().height)
+    sharp = Cameras(pose, camera().intrinsics * torch.tensor([8.0, 8, 1])[:, None], 8 * far.width, 8 * far.height)
+    truth = torch.nn.functional.avg_pool2d(render(gaussians, sharp).rgb.permute(0, 3, 1, 2), 8).permute(0, 2, 3, 1)
+    seen = levels_of(gaussians).seen_by(far)
+    assert len(seen) < len(gaussians) / 5
+    errors = [float((render(x, far).rgb - truth).square().mean()) for x in (seen, gaussians)]
+    assert errors[0] < 1.02 * errors[1]
+
+
+def test_nothing_has_no_levels() -> None:
+    with pytest.raises(DyngsError, match="without Gaussians"):
+        levels_of(cloud(1).select(torch.zeros(0, dtype=torch.long)))

@@ -1,0 +1,56 @@
+"""A still scene in levels of detail is drawn as the scene is, by every camera in the detail that it needs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from moving_scene import moving_scene, sliding_nodes
+from scene_kinds import onlooker, scene_of_kind
+from small_triangles import bent
+from splat_scenes import AROUND, cloud
+
+from dyngs.errors import DyngsError
+from dyngs.gaussians import levels
+from dyngs.gaussians.rendering import RenderOptions
+from dyngs.static.levels import LevelScene
+from dyngs.static.scene import StaticScene
+from dyngs.triangles.scene import TriangleOptions, TriangleScene
+
+
+def test_near_it_is_the_scene_itself() -> None:
+    still = StaticScene(
+        gaussians=cloud(), filter_std=torch.full((400,), 0.02), background=torch.tensor([0.2, 0.5, 0.9])
+    )
+    options = RenderOptions(depth="expected", mode="antialiased")  # type: ignore[arg-type]
+    one, other = (x.render(AROUND, options=options) for x in (still, LevelScene.of(still)))
+    assert torch.equal(one.rgb, other.rgb)
+    assert torch.equal(one.transmittance, other.transmittance)
+    assert one.depth is not None
+    assert other.depth is not None
+    assert torch.equal(one.depth, other.depth)
+
+
+def test_few_are_drawn_where_few_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(levels, "BLOCK", 16)
+    still = StaticScene(gaussians=cloud(2000))
+    coarse = LevelScene.of(still, most=300).on_background(torch.ones(3))
+    image, truth = coarse.render(AROUND).rgb, still.on_background(torch.ones(3)).render(AROUND).rgb
+    assert not torch.equal(image, truth)
+    assert float((image - truth).abs().mean()) < 0.08
+
+
+def test_colours_of_a_network_are_drawn_too() -> None:
+    coloured = scene_of_kind("control_nodes")
+    still = StaticScene(gaussians=coloured.at(0.5), colour=coloured.colour)
+    image = still.render(onlooker()).rgb
+    assert torch.equal(LevelScene.of(still).render(onlooker()).rgb, image)
+    assert not torch.equal(image, replace(still, colour=None).render(onlooker()).rgb)
+
+
+def test_other_scenes_are_refused() -> None:
+    with pytest.raises(DyngsError, match="for still scenes"):
+        LevelScene.of(moving_scene(sliding_nodes()))
+    with pytest.raises(DyngsError, match="not made of Gaussians"):
+        LevelScene.of(TriangleScene(bent(2), 1.0, TriangleOptions(), torch.ones(3)))
