@@ -7,10 +7,11 @@ import pytest
 from dyngs.cli import main
 
 
-def error_line(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """What stderr says about a command line that must be refused: one line."""
-    assert main(list(arguments)) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("dyngs: error: ")
-    assert error.count("\n") == 1
-    return error
+def error_line(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """What stderr says about a command line that must be refused: one line, and nothing on stdout."""
+    assert main([str(a) for a in arguments]) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith("dyngs: error: ")
+    assert output.err.count("\n") == 1
+    assert output.out == ""
+    return output.err

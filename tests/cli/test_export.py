@@ -1,7 +1,8 @@
-"""``dyngs export`` of cameras, pages and people with their skeleton, from the command line."""
+"""``dyngs export`` of all that moves, cameras, pages and people with their skeleton, from the command line."""
 
 from __future__ import annotations
 
+import argparse
 import re
 import shutil
 from pathlib import Path
@@ -11,16 +12,18 @@ import pytest
 import torch
 from bare_person import bare_run, bare_scene
 from gltf_skins import SkinnedGlb
-from moving_scene import write_moving_run
+from moving_scene import moved_x, write_moving_run
+from refused import error_line
 
 import dyngs
-from dyngs.cli import main
+from dyngs.cli import export, main
 from dyngs.config import DataConfig
 from dyngs.data.geometry import camera_center
 from dyngs.data.read import read_capture
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.runs.avatar import write_avatar
+from dyngs.splats.formats import read_splats
 
 
 def run_of(still: Path, folder: Path, refine: str) -> Path:
@@ -197,3 +200,68 @@ def test_a_scene_without_a_person(tmp_path: Path, capsys: pytest.CaptureFixture[
     run = write_moving_run(tmp_path / "run")
     assert main(["export", str(run), "--joints", "--out", "x.ply"]) == 2
     assert re.search(r"needs the run of a person \(model\.kind=human\), this one is", capsys.readouterr().err)
+
+
+@pytest.fixture(scope="module")
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_moving_run(tmp_path_factory.mktemp("moving"), standing=True)
+
+
+ROUNDING = 1e-7  # of float32, where weights of nodes add up to nearly 1
+
+
+def test_export_of_a_moving_run(moving_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def export(*words: object) -> str:
+        assert main(["export", str(moving_run), *[str(w) for w in words]]) == 0
+        return capsys.readouterr().out
+
+    def x_of(path: Path) -> list[float]:
+        return read_splats(path).gaussians.means[:, 0].tolist()
+
+    every, moving, still = (0, 1, 2, 3, 4), (1, 3), (0, 2, 4)
+    assert "note: this is time 0" in export()
+    assert x_of(moving_run / "splats.ply") == pytest.approx(moved_x(every, 0.0).tolist(), abs=ROUNDING)
+    assert "this is time" not in export("--time", 0.5, "--out", tmp_path / "middle.ply")
+    assert x_of(tmp_path / "middle.ply") == pytest.approx(moved_x(every, 0.5).tolist(), abs=ROUNDING)
+    assert "3 files" in export("--times", "0:1:3", "--out", tmp_path / "seq")
+    assert x_of(tmp_path / "seq" / "frame_0002.ply") == pytest.approx(moved_x(every, 1.0).tolist(), abs=ROUNDING)
+    export("--times", "0:1:3", "--dynamic")
+    assert x_of(moving_run / "splats_dynamic" / "frame_0001.ply") == pytest.approx(
+        moved_x(moving, 0.5).tolist(), abs=ROUNDING
+    )
+    for words, path in (
+        (["--static"], moving_run / "splats_static.ply"),
+        (["--static", "--times", "0:1:3", "--out", tmp_path / "still.ply"], tmp_path / "still.ply"),
+        (["--static", "--times", "0:1:3", "--out", tmp_path / "still"], tmp_path / "still" / "splats_static.ply"),
+    ):
+        export(*words)
+        assert x_of(path) == pytest.approx(moved_x(still, 0.0).tolist(), abs=ROUNDING)
+    wrong = ["--times", "0:1:3", "--out", tmp_path / "a.ply"]
+    assert "a sequence is a folder of files" in error_line(capsys, "export", moving_run, *wrong)
+
+
+def test_export_of_tracks(moving_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(moving_run), "--format", "tracks"]) == 0
+    assert "5 Gaussians, 2 of them moving, at 5 times" in capsys.readouterr().out
+    with np.load(moving_run / "tracks.npz", allow_pickle=False) as stored:
+        assert stored["times"].tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
+        assert stored["positions"].shape == (5, 5, 3)
+    words = ["--format", "tracks", "--dynamic", "--times", "0:2:3", "--out", str(tmp_path / "t.npz")]
+    assert main(["export", str(moving_run), *words]) == 0
+    assert "1 of 3 times lie outside" in capsys.readouterr().err
+    with np.load(tmp_path / "t.npz", allow_pickle=False) as stored:
+        assert stored["positions"][:, 0, 0] == pytest.approx(moved_x((1, 3), 0.0).tolist(), abs=ROUNDING)
+        assert stored["ids"].tolist() == [1, 3]
+
+
+def test_export_accepts_every_suffix_that_its_help_names(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "--help"]) == 0
+    text = capsys.readouterr().out
+    motions = re.search(r"motion for a person: (.*?)--max", text, re.DOTALL)
+    assert motions is not None
+    others = {".kind", ".js", ".root"}  # model.kind, three.js, data.root
+    found = set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
+    assert {".ply", ".spz", ".4dgs", ".safetensors", ".html"} <= found
+    for suffix in found:
+        arguments = argparse.Namespace(out=Path(f"x{suffix}"), format=None, times=None, motion=None, time=None)
+        assert export._kind(arguments)

@@ -57,3 +57,17 @@ def test_they_fill_the_box() -> None:
     assert not torch.equal(draws[0], draws[2])
     octants = (draws[0] > box_of(gaussians, 1.0)[0]).float() @ torch.tensor([1.0, 2, 4])
     assert octants.long().bincount(minlength=8).min() > 400
+
+
+def test_the_box_holds_what_is_solid() -> None:
+    """All but the outer percent of it, with a tenth to spare."""
+    gaussians = cloud(300).replace(logit_opacities=torch.full((300,), 2.0))
+    center, half_size = box_of(gaussians, 1.0)
+    inside = ((gaussians.means - center).abs() <= half_size).all(1)
+    assert inside.float().mean() > 0.93
+    far = gaussians.means.clone()
+    far[:2] = 1e6
+    logits = gaussians.logit_opacities.clone()
+    logits[2:40], far[2:40] = -10.0, -500.0
+    bounded = box_of(gaussians.replace(means=far, logit_opacities=logits), 1.0)
+    assert (bounded[1] < 1.5 * half_size).all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import given
@@ -9,7 +11,19 @@ from hypothesis import strategies as st
 from scenes import random_scene
 from torch import Tensor
 
-from dyngs.config import AutoColour, NetworkColour, ShColour
+from dyngs.config import (
+    AutoColour,
+    Config,
+    DataConfig,
+    DefaultStrategy,
+    NetworkColour,
+    RandomInit,
+    RunConfig,
+    ShColour,
+    StaticModel,
+    TrainConfig,
+)
+from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import network_of
 from dyngs.gaussians.colour.training import (
@@ -21,6 +35,7 @@ from dyngs.gaussians.colour.training import (
     rate_factor,
 )
 from dyngs.gaussians.rendering import RenderOptions, render
+from dyngs.kinds import GaussianTrainer, assemble, restored_scene
 from dyngs.state import tensors_of
 
 
@@ -177,3 +192,99 @@ def test_the_entropy_is_weighted_and_of_nothing_zero() -> None:
     (term,) = ColourTraining(ShColour(opacity_entropy=0.5)).penalties(some).values()
     assert float(term) == pytest.approx(0.5 * float(opacity_entropy(some.logit_opacities)))
     assert float(opacity_entropy(torch.zeros(0))) == 0
+
+
+MEASURED_AFTER = 24
+
+
+COLOURS = {
+    "network": NetworkColour(width=8, depth=1, opacity_entropy=1e-3),
+    "none pays": AutoColour(tolerance=300.0),
+    "some pay": AutoColour(tolerance=0.0),
+}
+
+
+@pytest.fixture(scope="module")
+def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture")
+    write_still_capture(folder, StillOptions(size=16, num_train=7, num_test=1, samples=1))
+    return folder
+
+
+def _coloured(
+    capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None
+) -> GaussianTrainer:
+    return assemble(
+        Config(
+            data=DataConfig(root=capture),
+            model=StaticModel(sh_degree=1),
+            init=RandomInit(num_random=50),
+            colour=colour,
+            strategy=strategy or DefaultStrategy(),
+            train=TrainConfig(steps=40, sh_every=1),
+            run=RunConfig(threads=1),
+        )
+    )
+
+
+@pytest.mark.parametrize("name", COLOURS)
+def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name: str) -> None:
+    """From a checkpoint before the harmonics are measured, and from one after."""
+    whole = _coloured(seven_views, COLOURS[name])
+    losses = []
+    for step in range(1, 41):
+        if step in (20, 31):
+            resumed = _coloured(seven_views, COLOURS[name])
+            resumed.restore(whole.checkpoint())
+        losses.append(whole.step().loss)
+        if step > 20:
+            resumed.step()
+    assert sum(losses[-7:]) < sum(losses[:7])
+    wanted, found = whole.checkpoint().tensors, resumed.checkpoint().tensors
+    assert wanted.keys() == found.keys()
+    assert all(torch.equal(x, found[key]) for key, x in wanted.items())
+
+
+@pytest.mark.parametrize("name", ["none pays", "some pay"])
+def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> None:
+    """For good: they stay zero while the set changes; the view that tells is not trained on before."""
+    busy = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000)
+    trainer = _coloured(seven_views, COLOURS[name], busy)
+    seen, findings, counts = set(), {}, set()
+    for step in range(1, 41):
+        report = trainer.step()
+        counts.add(len(trainer.model.scene.gaussians))
+        if report.finding is not None:
+            findings[step] = report.finding
+            dropped = trainer.model.colours.frozen_rest()
+        if step <= MEASURED_AFTER:
+            seen.add(report.image.name)
+    assert len(seen) == 6
+    assert list(findings) == [MEASURED_AFTER]
+    assert len(counts) > 4
+    sh, frozen = trainer.model.scene.gaussians.sh, trainer.model.colours.frozen_rest()
+    if name == "none pays":
+        assert "does not pay" in findings[MEASURED_AFTER]
+        assert sh.shape[1] == 1
+    else:
+        assert dropped is not None
+        assert frozen is not None
+        assert 0 < int(frozen.sum()) < len(frozen) == len(sh)
+        assert torch.equal((sh[:, 1:] == 0).flatten(1).all(1), frozen)
+
+
+def test_a_network_stores_no_harmonics(seven_views: Path, tmp_path: Path) -> None:
+    """And what was trained is drawn with it."""
+    trainer = _coloured(seven_views, COLOURS["network"])
+    for _ in range(30):
+        trainer.step()
+    assert trainer.model.scene.gaussians.sh_degree == 0
+    scene, network = restored_scene(trainer.checkpoint(), trainer.config.model), trainer.model.colours.network
+    assert network is not None
+    camera = trainer.images[0].cameras
+    gaussians, shader = trainer.model.scene.gaussians.detach(), network.shader(None, None)
+    drawn = scene.render(camera, options=RenderOptions(), background=torch.zeros(3)).rgb
+    assert torch.equal(drawn, render(gaussians, camera, shader=shader).rgb.detach())
+    assert not torch.equal(drawn, render(gaussians, camera).rgb)
+    assert scene.colour is not None
+    assert scene.num_colour_values == 3 * len(gaussians) + scene.colour.num_values

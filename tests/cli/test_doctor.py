@@ -1,0 +1,49 @@
+"""``dyngs doctor``: what there is, what is broken, what would be faster."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import dyngs
+from dyngs.cli import main
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
+Capture = pytest.CaptureFixture[str]
+
+
+def test_doctor(capsys: Capture) -> None:
+    assert main(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"instruction set v\d \(\S+\), compiled: v\d", text)
+    assert "broken" not in text
+
+
+def test_doctor_reports_kernels_that_this_processor_cannot_run() -> None:
+    environment = ENVIRONMENT | {"DYNGS_ISA": "v9"}
+    command = [sys.executable, "-m", "dyngs", "doctor"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert re.search(r"native core +broken +DYNGS_ISA=v9", done.stdout)
+    assert done.stderr.startswith("dyngs: error: this installation cannot work: native core")
+
+
+def test_doctor_reports_a_faster_instruction_set(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setattr("dyngs.ops.native.built_isas", lambda: ("v2",))
+    monkeypatch.setattr("dyngs.ops.native.core", SimpleNamespace(best_isa=lambda: "v4"))
+    assert main(["doctor"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "compiled: v2; this processor also runs v4 (AVX-512): install again on it for more speed" in text
+
+
+def test_one_openmp_runtime() -> None:
+    """torch and the native core share one pool of threads."""
+    code = "import dyngs.ops.native\nfrom dyngs.cli.doctor import openmp_runtimes\nprint(len(openmp_runtimes() or [1]))"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "1"

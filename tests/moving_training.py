@@ -1,0 +1,146 @@
+"""A dynamic scene and how it is trained, driven as the trainer does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from moving_scene import Lines
+from scenes import look_around
+from tiny_fields import cloud
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import ControlNodesField, DynamicModel
+from dyngs.data.loader import Image
+from dyngs.deform.field import FieldSetup
+from dyngs.deform.fields import new_field
+from dyngs.deform.random_gaussians import box_of
+from dyngs.deform.scene import DynamicScene
+from dyngs.deform.still_error import StillErrors
+from dyngs.deform.training import DeformSchedule, DynamicTraining, TrainingViews
+from dyngs.gaussians import EditResult, Gaussians
+from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.scene import GaussianTimeStep
+from dyngs.gaussians.schedule import Rates
+from dyngs.state import part_of, tensors_of
+
+FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
+FOCAL, DISTANCE = 100.0, 3.0
+TIMES = tuple(i / 20 for i in range(21))
+
+
+THRESHOLD = 0.3
+
+
+def camera() -> Cameras:
+    intrinsics = torch.tensor([[FOCAL, 0, 50], [0, FOCAL, 50], [0, 0, 1]])
+    return Cameras(look_around(1, torch.float32), intrinsics[None], 100, 100)
+
+
+def image(time: float | None) -> Image:
+    return Image("view", camera(), torch.zeros(100, 100, 3), None, None, time)
+
+
+def flat_cloud(count: int = 9) -> Gaussians:
+    """Gaussians at depth 3 of ``camera``, where a pixel covers 0.03 units."""
+    means = torch.rand((count, 3), generator=torch.Generator().manual_seed(1)) - 0.5
+    means[:, 2] = 0.0
+    gaussians = cloud(count).replace(means=means)
+    return leaves(gaussians)
+
+
+def leaves(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(**{name: x.clone().requires_grad_() for name, x in gaussians.tensors().items()})
+
+
+def alike(errors: Tensor) -> StillErrors:
+    return StillErrors(errors, errors)
+
+
+def unmeasured(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
+    return alike(torch.zeros(len(gaussians_at(0.0))))
+
+
+@dataclass
+class Run:
+    """A scene and how it is trained, driven as the trainer does."""
+
+    training: DynamicTraining
+    scene: DynamicScene
+
+    def time_step(self, time: float | None, step: int) -> GaussianTimeStep:
+        return self.training.time_step(self.scene, image(time), step)
+
+    def drawn_at(self, time: float) -> Gaussians:
+        """At the end of the run."""
+        return self.time_step(time, STEPS).gaussians.detach()
+
+    def after_step(self, step: int, result: EditResult | None = None) -> int:
+        """Optimize, follow ``result``, bring up to date; the number of rows left out for bad gradients."""
+        left_out = self.training.optimize(self.scene, step)
+        if result is not None and result.edit is not None:
+            edited = self.scene.edited(result.edit)
+            self.scene = edited.with_gaussians(leaves(edited.gaussians))
+        self.scene = self.training.after_step(self.scene, step, result is not None)
+        return int(left_out)
+
+    def grow(self, step: int) -> EditResult | None:
+        grown = self.training.revised(self.scene, step)
+        if grown is None:
+            return None
+        self.scene, result = grown
+        return result
+
+    @property
+    def model_state(self) -> dict[str, Tensor]:
+        """What is stored beside the Gaussians."""
+        return part_of(tensors_of(self.scene.state()), "model")
+
+
+def new_run(
+    gaussians: Gaussians,
+    times: tuple[float, ...] = TIMES,
+    still_errors: Callable[[Callable[[float], Gaussians]], StillErrors] = unmeasured,
+    update: FilterUpdate | None = None,
+    cameras_stay: bool = False,
+    full: int = FULL,
+    **options: object,
+) -> Run:
+    """Before the first step."""
+    defaults = {
+        "deform": ControlNodesField(nodes=4),
+        "num_random_moving": 0,
+        "motion_sparsity": 0.0,
+        "freeze_below_px": THRESHOLD,
+    }
+    capture = TrainingViews(times, [camera()], 1.0, still_errors, cameras_stay)
+    schedule = DeformSchedule(FINE, FINE, full, FINE, (SPLIT,), Rates(STEPS))
+    model = DynamicModel.model_validate(defaults | options)
+    training = DynamicTraining(model, schedule, capture, update or FilterUpdate(), torch.Generator())
+    return Run(training, training.first_scene(gaussians))
+
+
+def begun(gaussians: Gaussians, **options: object) -> Run:
+    """After the coarse phase, as if the errors had said that all of the Gaussians move.
+
+    Along a straight line each unless told otherwise.
+    """
+    run = new_run(gaussians, **options)  # type: ignore[arg-type]
+    setup = FieldSetup(*box_of(gaussians, 1.0), len(run.scene.times), len(gaussians), 1.0)
+    made = new_field(run.training.options.deform, setup, torch.Generator().manual_seed(0))
+    field = made if "deform" in options else Lines(setup)
+    run.scene = replace(run.scene, field=field, moving=torch.arange(len(gaussians)))
+    return run
+
+
+def move(run: Run, speeds: Tensor) -> None:
+    """Let Gaussian i go from -speeds[i] to speeds[i] along x, world units."""
+    assert run.scene.field is not None
+    run.scene.field.parameters["means"].data[:, 0, 0] = speeds
+
+
+def speeds_of(run: Run) -> Tensor:
+    assert run.scene.field is not None
+    return run.scene.field.parameters["means"].detach()[:, 0, 0]
