@@ -19,17 +19,7 @@ _UNDER_PLOT = (
     "<p>Thick lines: Pareto fronts of the two axes. Thin lines: the values of one setting in their order. "
     "Hover over a point for its name.</p>"
 )
-_HEAD = (
-    "changed",
-    "PSNR dB",
-    "SSIM",
-    "LPIPS",
-    "fps",
-    "times as fast (quartiles)",
-    "MB",
-    "memory MB",
-    "Gaussians or triangles",
-)
+_HEAD = ("changed", "PSNR dB", "SSIM", "LPIPS", "fps", "times as fast (quartiles)", "MB", "memory MB", "number")
 _COSTS = ("dB lost per doubled speed", "dB lost per halved size")
 EXCHANGE_HEAD = ("setting", *_COSTS, "most speed, times", "most size, times")
 

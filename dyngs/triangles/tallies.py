@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, max_pool2d
 
+from dyngs.camera import Cameras
 from dyngs.ops.patches import Places
 from dyngs.state import Role, State, with_role
 from dyngs.tensor_checks import require_tensor
+from dyngs.triangles.scene import TriangleScene
 
 CELLS = 6  # Cells along u and v of a triangle that were seen or not (Wu et al. 2025)
 FAINTEST_EDGE = 0.2  # Slopes of an image below this are no edges
@@ -65,6 +67,17 @@ class Tallies:
         for name, x in found.tensors().items():
             x.copy_(require_tensor(name, stored[name], tuple(x.shape)))
         return found
+
+
+@torch.no_grad()
+def most_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
+    """Return (P,) the pixels that each triangle has in the view of ``cameras``, one each, that shows most of it."""
+    most = torch.zeros(len(scene), device="cpu")
+    for camera in cameras:
+        ids = scene.view(camera, scene.options).places.ids.long()
+        shown = torch.bincount(ids, minlength=len(scene)) / scene.options.supersampling**2
+        most = torch.maximum(most, shown)
+    return most
 
 
 def outlines(places: Places) -> Tensor:

@@ -10,23 +10,24 @@ from torch import Tensor
 
 from dyngs.adam import AdamState
 from dyngs.data.loader import Image
-from dyngs.errors import DyngsError
+from dyngs.errors import DyngsError, counted
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.schedule import scaled
 from dyngs.models.views import evaluation_background
 from dyngs.state import State, prefixed
-from dyngs.triangles.densify import change
+from dyngs.triangles.densify import Change, change
 from dyngs.triangles.keys import BgTriangleModel
 from dyngs.triangles.patches import Patches
 from dyngs.triangles.scene import TriangleOptions, TriangleScene, rendering_of, scene_options, stored_triangles
-from dyngs.triangles.tallies import Tallies, slopes_of
+from dyngs.triangles.tallies import Tallies, most_pixels, slopes_of
 
 EVERY, LEAST_EVERY, UNTIL = 300, 50, 18_000
 """Steps between changes of a 30,000-step run, the fewest in any run, and after how many of 30,000 none is changed."""
 HARMONICS_SLOWER = 20.0  # than colours
 LAST_COLOUR = 0.1  # Of their learning rate, at the end of each stage
+LEAST_SHOWN = 1.0  # px of some training view, of each triangle that stays
 
 
 First = Callable[[RunStart, BgTriangleModel], tuple[Patches, float]]
@@ -108,7 +109,9 @@ class TriangleTraining(Model[TriangleScene]):
         bad = self._adam.steps_(updates, step=step)
         for x in self.leaves:
             x.grad = None
-        if not self.is_textured and self._first_texture <= step < steps:
+        if step == steps:
+            return self._finished(bad)
+        if not self.is_textured and self._first_texture <= step:
             if self._tallies.views >= LEAST_EVERY:
                 self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
@@ -152,9 +155,23 @@ class TriangleTraining(Model[TriangleScene]):
         self._change(self._model.max_triangles, rounds)
         return Updated(bad, is_rearranged=True)
 
+    def _finished(self, bad: Tensor | int) -> Updated:
+        """Remove what no training view shows."""
+        images = self._run.images
+        shown = most_pixels(self.scene, (images[i].cameras for i in range(len(images))))
+        count, stays = len(self._patches), shown >= LEAST_SHOWN
+        if bool(stays.all()) or not bool(stays.any()):
+            return Updated(bad)
+        none = {name: x.detach()[:0] for name, x in self._patches.tensors.items()}
+        self._apply(Change(stays.nonzero()[:, 0], none))
+        gone = f"{count - len(self._patches):,} of {counted(count, 'triangle')} are removed"
+        return Updated(bad, f"{gone}: no training view shows more than {LEAST_SHOWN:g} px of them", True)
+
     def _change(self, most: int, rounds: int) -> None:
         """Remove and split; see ``change``."""
-        found = change(self._patches, self._tallies, self._unit, most, rounds)
+        self._apply(change(self._patches, self._tallies, self._unit, most, rounds))
+
+    def _apply(self, found: Change) -> None:
         adam = AdamState(
             {name: found.of_moments(name, x) for name, x in self._adam.exp_avg.items()},
             {name: found.of_moments(name, x) for name, x in self._adam.exp_avg_sq.items()},

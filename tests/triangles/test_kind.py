@@ -28,6 +28,7 @@ from dyngs.tradeoff.variant_runs import VariantRuns
 from dyngs.tradeoff.variants import Variant
 from dyngs.triangles.keys import BgTriangleModel
 from dyngs.triangles.scene import TriangleScene
+from dyngs.triangles.tallies import most_pixels
 
 STEPS = ["train.steps=120", "train.save_every=60"]
 
@@ -44,6 +45,8 @@ def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
     assert isinstance(scene, TriangleScene)
     assert 100 < len(scene.patches) <= 300
     assert scene.patches.texture == 3
+    views = open_run(run).capture.splits["train"]
+    assert most_pixels(scene, training_cameras(views, load_resolved(run).data)).min() >= 1
 
 
 def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from small_triangles import camera, triangle
 
 from dyngs.ops.patches import Places, visible_patches
 from dyngs.state import tensors_of
-from dyngs.triangles.tallies import Tallies, outlines, slopes_of
+from dyngs.triangles.patches import Patches
+from dyngs.triangles.scene import TriangleOptions, TriangleScene
+from dyngs.triangles.tallies import Tallies, most_pixels, outlines, slopes_of
 
 BEHIND = triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))
 LARGE = triangle((-3, -3, 0), (3, -3, 0), (-3, 3, 0))
@@ -36,6 +39,16 @@ def test_what_is_seen_is_counted() -> None:
     assert tallies.cells[0].sum() == 2 * len(places.ids) / 4, "four drawn pixels a pixel"
     expected = float((~outlines(places)).sum()) / 4  # drawn pixels are quarters of the image's
     torch.testing.assert_close(tallies.edges, torch.tensor([expected, 0.0]))
+
+
+def test_the_view_that_shows_most_counts() -> None:
+    points = torch.cat([triangle((-1, -1, 0), (1, -1, 0), (-1, 1, 0)), BEHIND])
+    patches = Patches(points, torch.zeros(2, 6, 3), torch.zeros(2, 0, 3))
+    scene = TriangleScene(patches, 1.0, TriangleOptions(supersampling=2))
+    most = most_pixels(scene, [camera(distance=8), camera(), camera(distance=6)])
+    assert most[0] == pytest.approx(0.5 * 19.2**2, rel=0.03)  # half a square of 2 units, 32 * 1.2 / 4 px each
+    assert most[1] == 0
+    assert torch.equal(most, most_pixels(scene, [camera()]))
 
 
 def test_outlines_are_where_ids_change() -> None:
