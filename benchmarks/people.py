@@ -132,7 +132,7 @@ def avatar_of(data: DataConfig, views: tuple[View, ...], seconds: float) -> Meth
 
     def make(chosen: list[int]) -> tuple[Renderable, float, float]:
         cameras = [[v for v in views if v.frame == views[i].frame].index(views[i]) for i in chosen]
-        words = [f"data.root={data.root}", f"data.train_cameras={cameras}", "run.threads=1"]
+        words = [f"data.root={data.root}", f"data.train_cameras={cameras}", "run.threads=1", "data.test_every=0"]
         moment = [] if views[0].frame is None else ["data.frames=0:1"]
         config = load_config(packaged_preset("human"), words + moment)
         _, setup, stepping = trained_avatar(config, TRIED)
@@ -213,7 +213,7 @@ def main() -> None:
         config, checkpoint = trained_network(network)
         steps = [int(number) for number in given.steps.split(",")] if config.model.kind == "human_predictor" else [0]
         for i, data in enumerate(people):
-            own = config.data.model_copy(update={"root": data.root, "longest_side": given.size})
+            own = config.data.model_copy(update={"root": data.root, "longest_side": given.size, "test_every": 0})
             trained = partial(
                 kind_of(config.model).predictor, config, checkpoint, own, say=print, report=report_nothing
             )

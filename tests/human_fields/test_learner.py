@@ -58,7 +58,9 @@ def test_a_prediction_is_a_run(run: Path, folder: Path, tmp_path: Path, capsys: 
     again = predict(run, person_of(folder), tmp_path / "again", made.views)
     state = load_run(again.run_dir).renderable.state()
     assert all(torch.equal(x.tensor, state[name].tensor) for name, x in found.renderable.state().items())
-    assert evaluate_run(made.run_dir, "test", threads=1).psnr > 5
+    report = evaluate_run(made.run_dir, "test", threads=1)
+    assert report.psnr > 5
+    assert report.notes == (), "nothing is left to train"
     assert "is not made of Gaussians" in error_line(capsys, "export", str(made.run_dir), "--format", "ply")
     assert "a predicted field is not trained" in error_line(capsys, "train", "--resume", str(made.run_dir))
     assert "is not trained" in error_line(
