@@ -32,6 +32,7 @@ class ModelSection(Section):
         may_move: a field moves it over the times of the capture.
         draws_whole_images: in training; what needs these (priors, masks of what disagrees, refined cameras, exposures)
             does not go with a model that draws some pixels of an image.
+        is_trained: not only predicted, so that a run may be unfinished.
     """
 
     made_of_gaussians: ClassVar[bool] = False
@@ -40,6 +41,7 @@ class ModelSection(Section):
     is_posed: ClassVar[bool] = False
     may_move: ClassVar[bool] = False
     draws_whole_images: ClassVar[bool] = True
+    is_trained: ClassVar[bool] = True
     if TYPE_CHECKING:
         kind: Any = None
         """Name of the kind."""

@@ -293,7 +293,7 @@ def parameter_megabytes(scene: GaussianScene) -> float:
 
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     notes = []
-    if run.step < run.config.total_steps:
+    if run.step < run.config.total_steps and run.config.model.is_trained:
         notes.append(
             f"the run is not finished: it stands at step {run.step:,} of {run.config.total_steps:,}, and its schedules "
             "where they were then"

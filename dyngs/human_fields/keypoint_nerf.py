@@ -155,7 +155,8 @@ def hull(seen: Seen, key_points: Tensor) -> Hull:
     for i in range(len(sources)):
         nearest = max(float(depth[i].min()), NEAR)
         pixels = math.ceil(reach * float(sources.intrinsics[i, 0, 0]) / nearest) + 1  # that a cell may reach over
-        alpha = max_pool2d(sources.rgba[i : i + 1, 3:], 2 * pixels + 1, 1, pixels)
+        alpha = max_pool2d(sources.rgba[i : i + 1, 3:], (2 * pixels + 1, 1), 1, (pixels, 0))
+        alpha = max_pool2d(alpha, (1, 2 * pixels + 1), 1, (0, pixels))
         occupied &= grid_sample(alpha, grid[i][None, None], mode="nearest", align_corners=False)[0, 0, 0] > VISIBLE
     where = occupied.nonzero()[:, 0]
     occupied[where] = from_bones(middles[where], key_points) < AROUND

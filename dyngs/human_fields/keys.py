@@ -62,6 +62,7 @@ class PredictedFieldModel(ModelSection):
     """What such a network has predicted: not trained, but drawn like any other scene."""
 
     draws_whole_images: ClassVar[bool] = False
+    is_trained: ClassVar[bool] = False
 
     kind: Literal["predicted_field"] = Field(
         default="predicted_field", description="a field of a person, as `dyngs predict` writes it; it is not trained"

@@ -15,12 +15,13 @@ from dyngs.data.loader import Image
 from dyngs.data.people_set import captures_in
 from dyngs.data.times import distinct_times
 from dyngs.errors import DyngsError
+from dyngs.gps.pairs import MIN_ANGLE, angle
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human_fields.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human_fields.network import FieldNetwork
-from dyngs.human_fields.people import Person, metric, moments, person_of, sources_of, spread, window
+from dyngs.human_fields.people import Person, metric, moments, person_of, require_shown, sources_of, spread, window
 from dyngs.human_fields.scene import PredictedField, network_of
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import Example, Learner, Predictor, image_loss, load_weights, of_moment, random_index
@@ -72,8 +73,15 @@ class FieldPredictor:
             raise DyngsError(
                 f"{self.name}: {shown[0].name} and {other.name} show two moments; give views of the same one"
             )
+        if all(angle(shown[0], view) < MIN_ANGLE for view in shown[1:]):
+            raise DyngsError(
+                f"{self.name}: {shown[0].name} and the others look from the same direction; give other views"
+            )
         body, scale = self.person.body_in(shown[0])
-        sources = sources_of([self.person.images[i] for i in views], scale)
+        images = [self.person.images[i] for i in views]
+        for image in images:
+            require_shown(self.name, image, body, scale)
+        sources = sources_of(images, scale)
         background = evaluation_background(self.config.data.background, True)[1]
         return PredictedField(section_of(self.config), self.network, sources, body, scale, background=background)
 

@@ -29,6 +29,7 @@ KEY_POINTS = 22
 """Joints that are key points: those of the body, which SMPL, SMPL-H and SMPL-X have in common."""
 MULTIPLE = 8  # Sides of images are padded to multiples of so many pixels
 MARGIN = 8  # px of background around a person
+MISFIT = 0.25  # Of the size of a silhouette, how far its box may be from that of the body
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,33 @@ def sources_of(images: Sequence[Image], scale: float) -> Sources:
         torch.cat([getattr(x, name) for x in cameras]).to(rgba) for name in ("cam_from_world", "intrinsics")
     )
     return Sources(rgba, poses, intrinsics)
+
+
+def require_shown(name: str, image: Image, body: Body, scale: float) -> None:
+    """Raise DyngsError, for the capture ``name``, unless an image shows a person where the body is (world units in m).
+
+    The box of its silhouette must be that of the body, to ``MISFIT`` of its longer side: clothes and hair stand out
+    less, and cameras that are wrong rarely do.
+    """
+    assert image.alpha is not None
+    rows, columns = ((image.alpha > 0.5).any(side).nonzero()[:, 0] for side in (1, 0))
+    if not len(rows):
+        raise DyngsError(f"{name}: {image.name} shows no silhouette of a person; give its mask, or other views")
+    camera = metric(image.cameras.to(dtype=torch.float32), scale)
+    local = body.vertices @ camera.cam_from_world[0, :3, :3].T + camera.cam_from_world[0, :3, 3]
+    if bool((local[:, 2] <= 0).any()):
+        raise DyngsError(
+            f"{name}: the body lies behind the camera of {image.name}; its calibration or the body is wrong"
+        )
+    pixels = (local @ camera.intrinsics[0].T)[:, :2] / local[:, 2:]
+    size = pixels.new_tensor([camera.width, camera.height])
+    shown = torch.stack([torch.stack([x[0], x[-1] + 1]) for x in (columns, rows)], 1).to(pixels)
+    apart = (shown - torch.stack([pixels.amin(0), pixels.amax(0)]).clamp_min(0).minimum(size)).abs()
+    if float(apart.max()) > MISFIT * float((shown[1] - shown[0]).max()):
+        raise DyngsError(
+            f"{name}: {image.name} shows the person {float(apart.max()):.0f} px from where the body is by its camera; "
+            "the calibration or the body is wrong"
+        )
 
 
 def window(image: Image, left: int, top: int, side: int) -> Image:

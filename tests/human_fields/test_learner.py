@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from refused import error_line
 from tiny_field_people import NETWORKS, field_config
 
@@ -57,7 +58,9 @@ def test_a_prediction_is_a_run(run: Path, folder: Path, tmp_path: Path, capsys: 
     again = predict(run, person_of(folder), tmp_path / "again", made.views)
     state = load_run(again.run_dir).renderable.state()
     assert all(torch.equal(x.tensor, state[name].tensor) for name, x in found.renderable.state().items())
-    assert evaluate_run(made.run_dir, "test", threads=1).psnr > 5
+    report = evaluate_run(made.run_dir, "test", threads=1)
+    assert report.psnr > 5
+    assert report.notes == (), "nothing is left to train"
     assert "is not made of Gaussians" in error_line(capsys, "export", str(made.run_dir), "--format", "ply")
     assert "a predicted field is not trained" in error_line(capsys, "train", "--resume", str(made.run_dir))
     assert "is not trained" in error_line(
@@ -71,6 +74,21 @@ def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_p
         predict(run, person, out, 1)
     with pytest.raises(DyngsError, match=f"--steps 3: {run.name} is not trained on the images of one person"):
         predict(run, person, out, 2, steps=3)
+    twice = Path(shutil.copytree(person, tmp_path / "twice"))
+    listed = json.loads((twice / "transforms_train.json").read_text())
+    listed["frames"][2]["transform_matrix"] = listed["frames"][1]["transform_matrix"]
+    (twice / "transforms_train.json").write_text(json.dumps(listed))
+    with pytest.raises(DyngsError, match="look from the same direction"):
+        predict(run, twice, out, tuple(Path(x["file_path"]).name for x in listed["frames"][1:3]))
+    for file in (tmp_path / "twice").rglob("images/**/*.png"):
+        Image.open(file).convert("RGB").save(file)
+    with pytest.raises(DyngsError, match="twice: the images have no silhouettes"):
+        predict(run, twice, out, 2)
+    half = Path(shutil.copytree(run, tmp_path / "half"))
+    weights = checkpoint_paths(half)[-1]
+    weights.write_bytes(weights.read_bytes()[: weights.stat().st_size // 2])
+    with pytest.raises(DyngsError, match=weights.name):
+        predict(half, person, out, 2)
     moving = tmp_path / "moving"
     shutil.copytree(person, moving)
     file = moving / "transforms_train.json"

@@ -14,7 +14,17 @@ from dyngs.config import DataConfig
 from dyngs.errors import DyngsError
 from dyngs.human.avatar.observations import project_points
 from dyngs.human.template.body_reader import default_template
-from dyngs.human_fields.people import KEY_POINTS, Person, metric, moments, person_of, sources_of, spread, window
+from dyngs.human_fields.people import (
+    KEY_POINTS,
+    Person,
+    metric,
+    moments,
+    person_of,
+    require_shown,
+    sources_of,
+    spread,
+    window,
+)
 
 
 def test_key_points_are_the_true_ones(person: Person, folder: Path) -> None:
@@ -95,3 +105,23 @@ def test_captures_that_do_not_do_are_refused(folder: Path, tmp_path: Path) -> No
     (copy / "body_train.npz").unlink()
     with pytest.raises(DyngsError, match="ann: has no body parameters, which say where the key points are"):
         person_of(DataConfig(root=copy), default_template())
+
+
+def test_a_body_that_is_elsewhere_is_told(person: Person) -> None:
+    """Wrong focal lengths, a camera that looks past the person or away from it, and masks that show nobody."""
+    image, (body, scale) = person.images[0], person.body_in(person.views[0])
+    require_shown("ann", image, body, scale)
+    camera, turn = image.cameras, torch.eye(4)
+    assert image.alpha is not None
+
+    def told(message: str, **changes: object) -> None:
+        with pytest.raises(DyngsError, match=f"ann: .*{message}"):
+            require_shown("ann", replace(image, **changes), body, scale)
+
+    long = camera.intrinsics * torch.tensor([[1.6], [1.6], [1.0]])
+    told("calibration or the body is wrong", cameras=replace(camera, intrinsics=long))
+    for degrees, message in ((20, "px from where the body is"), (180, "lies behind the camera")):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        turn[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        told(message, cameras=replace(camera, cam_from_world=turn @ camera.cam_from_world))
+    told("shows no silhouette", alpha=torch.zeros_like(image.alpha))
