@@ -70,10 +70,9 @@ def raising(error: BaseException) -> Callable[[], None]:
 
 
 def test_help_names_every_command(capsys: Capture) -> None:
-    for arguments in ([], ["--help"]):
-        assert main(arguments) == 0
-        text = capsys.readouterr().out
-        assert all(re.search(rf"^\s+{verb}\s", text, re.M) for verb in VERBS)
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(re.search(rf"^\s+{verb}\s", text, re.M) for verb in VERBS)
 
 
 def test_version(capsys: Capture) -> None:
@@ -127,6 +126,16 @@ def test_debug_shows_the_cause_before_the_line(
     assert lines[-1].startswith("dyngs: error: cameras.json: cannot be read (KeyError: 'fl_x')")
     assert lines.count("KeyError: 'fl_x'") == 1
     assert sum(line.startswith("Traceback") for line in lines) == 2
+
+
+def test_without_a_command_it_says_what_to_do_next(capsys: Capture) -> None:
+    """On a small screen, and nothing that does not exist."""
+    assert main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 20
+    assert max(map(len, lines)) <= 100
+    named = set(re.findall(r"dyngs (?!docs|doctor)([a-z]+)", "\n".join(lines)))
+    assert {"demo", "train", "view"} <= named <= {*VERBS, "view"}
 
 
 def test_without_debug_there_is_only_the_line(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 import dyngs
 
@@ -248,3 +249,13 @@ def test_drawing_and_evaluating_leave_packages_alone_that_few_scenes_need() -> N
         f"print([m for m in {absent!r} if m in sys.modules])"
     )
     assert run_python(code).strip() == "[]"
+
+
+def test_the_conda_recipe_needs_what_pip_does() -> None:
+    """Versions, too; two packages have other names on conda-forge."""
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    recipe = yaml.safe_load((ROOT / "packaging" / "recipe.yaml").read_text(encoding="utf-8"))
+    wanted = re.findall(r'^  "([\w-]+)([^"]*)",', project.split("dependencies = [")[1].split("\n]")[0], re.MULTILINE)
+    names = {"torch": "pytorch", "OpenImageIO": "py-openimageio"}
+    assert recipe["requirements"]["run"][1:] == [f"{names.get(name, name)} {versions}" for name, versions in wanted]
+    assert f'version = "{recipe["context"]["version"]}"' in project

@@ -56,6 +56,20 @@ _OF_DATA = ("inspect", "sfm", "fit", "motion", "synth")
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
+_NEXT = f"""\
+dyngs {__version__}: Gaussian splatting of what stands, what moves, and people, on the CPU.
+
+  dyngs demo                            a small moving scene from start to end, in minutes
+  dyngs train static data.root=PHOTOS   a scene from a folder of photos, or a video
+  dyngs train dynamic data.root=CAPTURE one that moves
+  dyngs train human data.root=VIDEO     a person
+  dyngs view runs/NAME                  look at it
+  dyngs render runs/NAME --out images   images and videos; `dyngs export` writes files for others
+
+`dyngs --help` lists all commands, `dyngs docs` is the manual, `dyngs doctor` checks what is here.\
+"""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (default: ``sys.argv``) and return the exit code."""
     if "_ARGCOMPLETE" in os.environ:  # a shell asks, at the Tab key
@@ -105,6 +119,9 @@ def _dispatch(arguments: list[str]) -> int:
         require_name(word)
     if arguments and arguments[0] in _OF_DATA:
         raise DyngsError(f"the command {arguments[0]!r} belongs to data: run `dyngs data {arguments[0]}`")
+    if not arguments:
+        print(_NEXT)
+        return 0
     parser = make_parser()
     try:
         parsed = _parsed(parser, arguments)

@@ -45,6 +45,9 @@ _UNFIT: dict[str, dict[str, str]] = {
     | _FOR_DYNGS,
 }
 """Options that do not go with a format, and why."""
+_ONLY = dict.fromkeys(("level", "segments", "cells"), "surface, not of a person")
+_ONLY |= {"levels": "html", "max_gaussians_drawn": "html --levels"}
+"""Options that go with one format."""
 
 _EPILOG = """\
 examples:
@@ -65,6 +68,7 @@ examples:
   dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
   dyngs export runs/stereo --format network --out net.safetensors   the weights of a network, for `dyngs predict`
   dyngs export runs/dance --out dance.html                        a page that plays in any browser, offline
+  dyngs export town.ply --format html --levels --out town         a large scene, fetched as it is looked at
 """
 
 
@@ -99,6 +103,9 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--cells", type=int, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
     parser.add_argument("--segments", type=int, metavar="N", help=about)
+    about = "--format html of a still scene: a folder for a web server, fetched coarse first, in levels of detail"
+    parser.add_argument("--levels", action="store_true", help=about)
+    args.add_most_drawn(parser, "--levels: so many Gaussians of an image are drawn at most, as on phones")
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "what moves rigidly as animated nodes of a .glb; the rest stands as at --time"
@@ -123,10 +130,9 @@ def run(arguments: argparse.Namespace) -> int:
     writers |= {"surface": _export_surface, "network": _export_network}
     if arguments.bodies:
         return _export_bodies(arguments)
-    if kind != "surface":
-        for option in ("level", "segments", "cells"):
-            if getattr(arguments, option) is not None:
-                raise DyngsError(f"--{option} goes with --format mesh, not of a person")
+    for option, needs in _ONLY.items():
+        if kind != needs.split()[0] and getattr(arguments, option) not in (None, False):
+            raise DyngsError(f"--{option.replace('_', '-')} goes with --format {needs.replace('surface', 'mesh')}")
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
@@ -218,9 +224,6 @@ def _part(arguments: argparse.Namespace) -> Part:
     return "still" if arguments.static else "moving" if arguments.dynamic else "all"
 
 
-# ---------------------------------------------------------------------------------------------------- Gaussians
-
-
 def _export_splats(
     arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None, kind: str
 ) -> list[Path]:
@@ -298,9 +301,6 @@ def _export_tracks(arguments: argparse.Namespace, opened: Opened, times: tuple[f
     moving = f"{int(tracks.moving.sum()):,} of them moving"
     args.print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
     return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]
-
-
-# ---------------------------------------------------------------------------------------------------- other files
 
 
 def _export_dyngs(arguments: argparse.Namespace) -> int:
@@ -438,22 +438,29 @@ def _export_surface(arguments: argparse.Namespace) -> int:
 
 
 def _export_page(arguments: argparse.Namespace) -> int:
-    """Write a page that plays in a browser by itself."""
-    from dyngs.export.html.page import write_page
+    """Write a page that plays in a browser by itself, or a folder whose page fetches a scene in levels of detail."""
+    from dyngs.export.html.page import write_levels, write_page
     from dyngs.runs.opened import open_scene
 
     source: Path = arguments.run_dir
-    if arguments.out is None and args.is_avatar_file(source):
-        raise DyngsError(f"{source}: where to? Give --out FILE.html")
-    out: Path = arguments.out or source / "scene.html"
-    if out.suffix.lower() not in (".html", ".htm") or out.is_dir():
+    most, levels = arguments.max_gaussians_drawn, arguments.levels
+    if most is not None and not levels:
+        raise DyngsError("--max-gaussians-drawn goes with --levels")
+    if arguments.out is None and not source.is_dir():
+        raise DyngsError(f"{source}: where to? Give --out {'FOLDER' if levels else 'FILE.html'}")
+    out: Path = arguments.out or source / ("scene" if levels else "scene.html")
+    is_page = out.suffix.lower() in (".html", ".htm")
+    if levels and is_page:
+        raise DyngsError(f"{out}: --levels writes a folder; give --out {out.with_suffix('')}")
+    if not levels and (not is_page or out.is_dir()):
         raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
     opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
-    if arguments.from_up is not None:
-        opened = replace(opened, stated_up=arguments.from_up)
-    written = write_page(opened, out, time=0.0 if arguments.time is None else arguments.time)
+    opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
+    written = write_levels(opened, out, most=most) if levels else write_page(opened, out, time=arguments.time or 0.0)
+    where = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
+    where = where if levels else "it plays in any browser with WebGL 2, offline"
     args.print_notes(written.notes)
-    print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); it plays in any browser with WebGL 2, offline")
+    print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); {where}")
     return 0
 
 

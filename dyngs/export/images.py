@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from dyngs.ops.device import CPU
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened, split_views
 
+_DEVICE = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9¹²³]", re.IGNORECASE)  # Windows opens no file of these names
 _SHEET_ROWS = 12
 _DEPTH_SAMPLES = 8
 
@@ -234,4 +236,5 @@ def _files(stem: str) -> set[str]:
 
 
 def _safe(part: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in part).lstrip(".") or "_"
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in part).lstrip(".") or "_"
+    return f"{name}_" if _DEVICE.fullmatch(name.split(".")[0]) else name

@@ -72,7 +72,8 @@ class Levels:
         """
         sizes = [sizes_on_image(balls, camera) for balls in self.blocks]
         top: Block = (len(self.levels) - 1, 0)
-        cut, drawn, waiting = {top}, self.count(top), [(-sizes[-1][0], top)]
+        cut, drawn = {top}, self.count(top)
+        waiting: list[tuple[float, Block]] = [(-float(sizes[-1][0]), top)]
         while waiting:
             size, block = heapq.heappop(waiting)
             children = self.children(block)
@@ -82,7 +83,7 @@ class Levels:
             cut.remove(block)
             cut.update(children)
             for child in children:
-                heapq.heappush(waiting, (-sizes[child[0]][child[1]], child))
+                heapq.heappush(waiting, (-float(sizes[child[0]][child[1]]), child))
         return sorted(cut)
 
     def seen_by(self, camera: Cameras, most: int | None = None, pixels: float = PIXELS) -> Gaussians:
@@ -113,7 +114,7 @@ def levels_of(gaussians: Gaussians) -> Levels:
     points = torch.cat([gaussians.means.double(), sizes[:, None]], dim=1)
     order = torch.from_numpy(_tree_order(points.float().numpy()))
     level, points = gaussians.select(order), points[order]
-    spreads = torch.zeros(len(order), dtype=torch.float64)  # variances
+    spreads = level.means.new_zeros(len(order), dtype=torch.float64)  # variances
     levels, blocks = [level], [_balls(level, spreads)]
     while len(level) > BLOCK:
         level, points, spreads = _next_level(level, points, spreads)
@@ -151,7 +152,7 @@ def _next_level(level: Gaussians, points: Tensor, spreads: Tensor) -> tuple[Gaus
     told: list[Tensor] = []
     count = -(-len(level) // MERGED)
     for first in range(0, count, _AT_ONCE):
-        rows = torch.arange(MERGED * first, MERGED * min(first + _AT_ONCE, count))
+        rows = torch.arange(MERGED * first, MERGED * min(first + _AT_ONCE, count), device="cpu")
         own = rows.clamp_max(len(level) - 1)
         several = level.select(own).to(dtype=torch.float64)
         several.logit_opacities[rows >= len(level)] = -torch.inf

@@ -224,6 +224,8 @@ def test_file_stems_known_answers() -> None:
     assert file_stems(["../../etc/passwd", "/etc/shadow"]) == ["passwd", "shadow"]
     assert file_stems(["sheet", "r", "r_depth"]) == ["sheet_2", "r", "r_depth_2"]
     assert file_stems(["..", "", "C:\\x"]) == ["view", "view_2", "C__x"]
+    # devices of Windows, whatever follows them, but not names that only begin so
+    assert file_stems(["a/CON", "a/nul.left", "a/com1", "a/console"]) == ["CON_", "nul.left_", "com1_", "console"]
 
 
 @settings(max_examples=25, deadline=None)

@@ -8,8 +8,12 @@ async function inflated(base64) {
   const text = atob(base64.trim());
   const bytes = new Uint8Array(text.length);
   for (let i = 0; i < bytes.length; ++i) bytes[i] = text.charCodeAt(i);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
+  return inflatedStream(new Blob([bytes]).stream());
+}
+
+async function inflatedStream(stream) {
+  const whole = new Response(stream.pipeThrough(new DecompressionStream("deflate")));
+  return new Uint8Array(await whole.arrayBuffer());
 }
 
 // Floats, row by row, of a list that is stored column by column, each column of a chunk of rows in its own range.

@@ -38,19 +38,24 @@ class Drawing {
 
   // A list of four numbers each as a texture: "32F", "16F", or whole numbers, "16UI" and "32UI".
   list(name, values, kind) {
-    const { gl } = this, texels = Math.max(Math.ceil(values.length / 4), 1), height = Math.ceil(texels / ROW);
+    const entry = this.reserve(name, values.length / 4, kind);
+    entry.padded = new values.constructor(4 * ROW * entry.height);
+    this.refill(entry, values);
+    return entry;
+  }
+
+  // A texture for a list of so many texels.
+  reserve(name, texels, kind) {
+    const { gl } = this, height = Math.ceil(Math.max(Math.ceil(texels), 1) / ROW);
     if (height > this.limit) throw new Error(`this scene is too large for this device: ${this.scene.count} Gaussians`);
-    const padded = new values.constructor(4 * ROW * height);
-    padded.set(values);
-    const texture = gl.createTexture(), whole = kind.endsWith("UI");
-    const entry = { name, texture, unit: this.textures.length, kind, padded, height, texels };
+    const texture = gl.createTexture(), whole = kind.endsWith("UI"), format = whole ? gl.RGBA_INTEGER : gl.RGBA;
+    const type = { "16UI": gl.UNSIGNED_SHORT, "32UI": gl.UNSIGNED_INT }[kind] || gl.FLOAT;
+    const entry = { name, texture, unit: this.textures.length, height, format, type };
     this.textures.push(entry);
     gl.activeTexture(gl.TEXTURE0 + entry.unit);
     gl.bindTexture(gl.TEXTURE_2D, texture);
     this.unfiltered();
-    const format = whole ? gl.RGBA_INTEGER : gl.RGBA;
-    const type = { "16UI": gl.UNSIGNED_SHORT, "32UI": gl.UNSIGNED_INT }[kind] || gl.FLOAT;
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl["RGBA" + kind], ROW, height, 0, format, type, padded);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl["RGBA" + kind], ROW, height, 0, format, type, null);
     return entry;
   }
 
@@ -61,20 +66,31 @@ class Drawing {
   }
 
   refill(entry, values) {
-    const { gl } = this;
     entry.padded.set(values);
+    this.write(entry, 0, entry.padded);
+  }
+
+  // Writes whole rows of a texture, from a texel on.
+  write(entry, texel, values) {
+    const { gl } = this;
     gl.activeTexture(gl.TEXTURE0 + entry.unit);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, entry.height, gl.RGBA, gl.FLOAT, entry.padded);
+    gl.texSubImage2D(
+      gl.TEXTURE_2D, 0, 0, texel / ROW, ROW, values.length / (4 * ROW), entry.format, entry.type, values);
   }
 
   prepareHarmonics() {
-    const { lists, count, degree } = this.scene, columns = 3 * ((degree + 1) ** 2 - 1), width = 4 * this.harmonicTexels;
-    if (!degree) return;
-    const rest = new Float32Array(width * count);
-    for (let i = 0; i < count; ++i)
-      for (let k = 0; k < columns; ++k) rest[width * i + k] = lists.rest[columns * i + k];
-    this.list("uHarmonics", rest, "16F");
+    const { lists, count, degree } = this.scene;
+    if (degree) this.list("uHarmonics", packedHarmonics(lists, count, this.harmonicTexels), "16F");
   }
+}
+
+// The other harmonics of `count` Gaussians or triangles, in so many texels each.
+function packedHarmonics(lists, count, texels) {
+  const columns = lists.rest.length / count, width = 4 * texels;
+  const rest = new Float32Array(width * count);
+  for (let i = 0; i < count; ++i)
+    for (let k = 0; k < columns; ++k) rest[width * i + k] = lists.rest[columns * i + k];
+  return rest;
 }
 
 // Where a camera of camFromWorld stands.

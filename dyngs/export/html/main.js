@@ -8,8 +8,7 @@ class App {
   constructor(scene) {
     this.scene = scene;
     this.canvas = document.getElementById("canvas");
-    this.renderer = scene.segments
-      ? new TriangleRenderer(this.canvas, scene) : new Renderer(this.canvas, scene, new Motion(scene));
+    this.renderer = rendererOf(this.canvas, scene, () => this.changed());
     this.camera = new OrbitCamera(scene);
     this.player = new Player(scene, () => this.changed());
     this.coarse = 1; // fraction of the pixels' sides that are drawn
@@ -97,7 +96,9 @@ class App {
     this.player.playing = false;
     this.player.time = view.time ?? this.player.time;
     this.player.show();
-    this.renderer.draw({ ...view, time: this.player.time });
+    const asked = { ...view, time: this.player.time };
+    await this.renderer.arrived?.(asked);
+    this.renderer.draw(asked);
     return this.image();
   }
 
@@ -118,16 +119,32 @@ function fullScreen() {
   else document.documentElement.requestFullscreen?.();
 }
 
-async function main() {
+function rendererOf(canvas, scene, changed) {
+  if (scene.segments) return new TriangleRenderer(canvas, scene);
+  if (scene.levels) return new LevelRenderer(canvas, scene, changed);
+  return new Renderer(canvas, scene, new Motion(scene));
+}
+
+// Shows a line, or hides it where it is empty.
+function tell(line) {
   const message = document.getElementById("message");
+  message.textContent = line;
+  message.hidden = !line;
+}
+
+async function main() {
   try {
-    const app = new App(await readScene());
+    const scene = await readScene();
+    if (scene.levels && location.protocol === "file:")
+      throw new Error("its parts are fetched, so open it by a web server, such as `python -m http.server`");
+    const app = new App(scene);
+    await app.renderer.begun?.(); // its first picture, however coarse
     app.drawNow(1);
-    message.hidden = true;
+    tell("");
     window.dyngs = app;
     if (app.scene.moves) app.player.toggle(true);
   } catch (error) {
-    message.textContent = `This scene cannot be shown: ${error.message}`;
+    tell(`This scene cannot be shown: ${error.message}`);
     throw error;
   }
 }

@@ -20,6 +20,7 @@ from dyngs.deform.windows import EDGE, OPEN
 from dyngs.export.html.curves import Curves, curves_of, fitted_curves
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
+from dyngs.gaussians.levels import BLOCK, MERGED, PIXELS, Block, Levels
 from dyngs.gaussians.order import storage_order
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
@@ -76,9 +77,13 @@ class Lists:
         """Number of bytes before they are deflated."""
         return self._size
 
+    def deflated(self) -> bytes:
+        """Return the block as zlib writes it."""
+        return zlib.compress(b"".join(self._parts), 9)
+
     def text(self) -> str:
         """Return the block, deflated, in base64."""
-        return base64.b64encode(zlib.compress(b"".join(self._parts), 9)).decode("ascii")
+        return base64.b64encode(self.deflated()).decode("ascii")
 
     def _add(self, name: str, data: bytes, kind: str, shape: tuple[int, ...], **more: int) -> None:
         rows, columns = shape
@@ -107,6 +112,31 @@ def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str,
     if scene.colour is not None:
         told["network"] = _add_network(scene.colour, lists)
     return told | {"count": len(scene), "frames": len(scene.times), "moves": not scene.is_static}
+
+
+def add_levels(levels: Levels, colour: ColourNetwork | None, lists: Lists) -> dict[str, Any]:
+    """Add where the blocks of ``levels`` are, and a colour network, and return what the page needs to know about all.
+
+    The page fetches the blocks, see ``block_numbers``.
+    """
+    told: dict[str, Any] = {} if colour is None else {"network": _add_network(colour, lists)}
+    lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
+    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), with_rest=colour is None)
+    sizes = [len(level) for level in levels.levels]
+    known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": PIXELS, "layout": coarsest.layout}
+    degree = levels.levels[0].sh_degree if colour is None else 0
+    return told | {"levels": known, "degree": degree, "count": sizes[0], "frames": 0, "moves": False}
+
+
+def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> Lists:
+    """Return the lists of a block, ``BLOCK`` rows each; the last ones of a block that has fewer are never seen."""
+    gaussians = levels.of_block(block)
+    rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
+    padded = gaussians.select(rows)
+    padded.logit_opacities[len(gaussians) :] = -MOST_LOGIT
+    lists = Lists()
+    _add_gaussians(padded, lists, with_rest=with_rest)
+    return lists
 
 
 def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:

@@ -18,8 +18,9 @@ from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.errors import counted
 from dyngs.export.chosen_path import front_of, orbit_around, points_at, view_to_show
-from dyngs.export.html.numbers import Lists, add_scene, add_triangles
+from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_numbers
 from dyngs.export.html.template import filled, script_safe, source_hash
+from dyngs.files.outputs import new_folder, require_new_folder
 from dyngs.files.write import write_text
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.posing import LEFT_OUT
@@ -27,13 +28,15 @@ from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.rotation import AXES
+from dyngs.static.levels import LevelScene
 from dyngs.triangles.scene import TriangleScene
 
 HERE = Path(__file__).parent
-SCRIPTS = ("data.js", "motion.js", "sort.js", "drawing.js", "renderer.js", "triangles.js", "camera.js", "player.js")
-SCRIPTS += ("main.js",)
+SCRIPTS = ("data.js", "motion.js", "sort.js", "drawing.js", "renderer.js", "levels.js", "triangles.js", "camera.js")
+SCRIPTS += ("player.js", "main.js")
 SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
 SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
+PAGE = "index.html"  # in the folder of a scene in levels
 TOLERANCE = 0.25  # pixels of the first view that a place at its target may be off where motion is fitted
 
 
@@ -47,7 +50,7 @@ class WrittenPage:
     """A page on disk."""
 
     path: Path  # of it
-    num_bytes: int  # its size
+    num_bytes: int  # its size, with that of the blocks that it fetches
     header: dict[str, Any]  # what it says except for the layout
     notes: tuple[str, ...]  # lines about what was chosen or left out
 
@@ -61,13 +64,44 @@ def write_page(
     begin with and to go through, each a batch of one; without any, those of the capture, or around the scene.
     """
     inputs_of(opened).require_output(path)
-    if title is None:
-        title = opened.name if opened.captured is not None else Path(opened.name).stem
     lists = Lists()
     header = _header(opened, time, views, lists)
-    text = _assembled(header | {"layout": lists.layout}, lists.text(), title)
+    text = _assembled(header | {"layout": lists.layout}, lists.text(), _title(opened, title))
     write_text(path, text)
     return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
+
+
+def write_levels(
+    opened: Opened, folder: Path, *, most: int | None = None, title: str | None = None, views: Sequence[Cameras] = ()
+) -> WrittenPage:
+    """Write the page of a still scene in levels of detail: a new folder of ``PAGE`` and the blocks that it fetches.
+
+    ``most``: Gaussians that the page draws at most. Others as of ``write_page``. Raises DyngsError: a scene that moves
+    or is not made of Gaussians, or a folder that exists already.
+    """
+    require_new_folder(folder)
+    levelled = LevelScene.of(opened.renderable, most)
+    levels, colour = levelled.levels, levelled.scene.colour
+    lists = Lists()
+    told = add_levels(levels, colour, lists) | _drawn(levelled.options)
+    told["levels"]["most"] = most
+    header = told | _shown(opened, 0.0, *_beginning(opened, views))
+    text = _assembled(header | {"layout": lists.layout}, lists.text(), _title(opened, title))
+    size = len(text.encode())
+    with new_folder(folder) as started:
+        write_text(started / PAGE, text)
+        for level, balls in enumerate(levels.blocks):
+            for place in range(len(balls)):
+                data = block_numbers(levels, (level, place), with_rest=colour is None).deflated()
+                (started / f"{level}-{place}.bin").write_bytes(data)
+                size += len(data)
+    return WrittenPage(folder / PAGE, size, header, _notes(opened, header))
+
+
+def _title(opened: Opened, title: str | None) -> str:
+    if title is not None:
+        return title
+    return opened.name if opened.captured is not None else Path(opened.name).stem
 
 
 def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
@@ -88,15 +122,24 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists) -> dict[str, Any]:
-    views, target = (views, _middle(opened)) if views else _views(opened)
-    upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
+    views, target = _beginning(opened, views)
     if isinstance(opened.renderable, TriangleScene):
         told = add_triangles(opened.renderable, lists)
     else:
         apart = float((views[0].centers[0] - views[0].centers.new_tensor(target)).norm())
         pixel = max(apart, 1e-6) / float(views[0].intrinsics[0, 1, 1])
         told = add_scene(opened.scene, lists, TOLERANCE * pixel) | _drawn(opened.scene.options)
-    shown = {
+    return told | _shown(opened, time, views, target)
+
+
+def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
+    """Return the cameras of a page, ``views`` if there are any, and the point to look at."""
+    return (views, _middle(opened)) if views else _views(opened)
+
+
+def _shown(opened: Opened, time: float, views: Sequence[Cameras], target: list[float]) -> dict[str, Any]:
+    upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
+    return {
         "near": opened.renderable.options.near,
         "background": opened.background.tolist(),
         "target": target,
@@ -105,7 +148,6 @@ def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists)
         "time": time,
         "views": [_view(camera) for camera in views],
     }
-    return told | shown
 
 
 def _drawn(options: RenderOptions) -> dict[str, Any]:
@@ -168,7 +210,8 @@ def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
     fixed |= {"header": script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
     kind = "triangle" if "texture" in header else "Gaussian"
-    fixed["about"] = f"{counted(header['count'], kind)}, {size / 1e6:.1f} MB"
+    fixed["about"] = counted(header["count"], kind) + ("" if "levels" in header else f", {size / 1e6:.1f} MB")
+    fixed["fetched"] = " connect-src 'self';" if "levels" in header else ""  # nothing, but for blocks
     return filled(page, fixed)
 
 

@@ -42,19 +42,7 @@ class Renderer extends Drawing {
 
   prepareLists() {
     const { scene, motion } = this, { lists, count } = scene;
-    const packed = new Float32Array(16 * count);
-    for (let i = 0; i < count; ++i) {
-      const at = 16 * i;
-      for (let k = 0; k < 3; ++k) {
-        packed[at + k] = lists.means[3 * i + k];
-        packed[at + 8 + k] = lists.log_scales[3 * i + k];
-        packed[at + 12 + k] = lists.base[3 * i + k];
-      }
-      packed[at + 3] = lists.logit_opacities[i];
-      packed[at + 11] = lists.filter_std ? lists.filter_std[i] : 0;
-      for (let k = 0; k < 4; ++k) packed[at + 4 + k] = lists.quats[4 * i + k];
-    }
-    this.list("uGaussians", packed, "32F");
+    this.list("uGaussians", packedGaussians(lists, count), "32F");
     this.prepareHarmonics();
     if (motion.drivers) this.prepareDrivers();
     if (motion.bones) {
@@ -205,4 +193,21 @@ class Renderer extends Drawing {
     gl.uniform1i(this.copy.at("uImage"), this.textures.length);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
+}
+
+// `count` Gaussians, 16 numbers each, see project.glsl.
+function packedGaussians(lists, count) {
+  const packed = new Float32Array(16 * count);
+  for (let i = 0; i < count; ++i) {
+    const at = 16 * i;
+    for (let k = 0; k < 3; ++k) {
+      packed[at + k] = lists.means[3 * i + k];
+      packed[at + 8 + k] = lists.log_scales[3 * i + k];
+      packed[at + 12 + k] = lists.base[3 * i + k];
+    }
+    packed[at + 3] = lists.logit_opacities[i];
+    packed[at + 11] = lists.filter_std ? lists.filter_std[i] : 0;
+    for (let k = 0; k < 4; ++k) packed[at + 4 + k] = lists.quats[4 * i + k];
+  }
+  return packed;
 }

@@ -8,8 +8,13 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -21,15 +26,18 @@ from PIL import Image
 from scene_kinds import KINDS, onlooker, scene_of_kind
 from small_triangles import bent
 from small_triangles import camera as before_triangles
+from splat_scenes import cloud
 
 from dyngs.camera import Cameras
 from dyngs.conventions import RasterizeMode
-from dyngs.export.html.page import MOST_VIEWS, SCRIPTS, SHADERS, WrittenPage, write_page
+from dyngs.errors import DyngsError
+from dyngs.export.html.page import MOST_VIEWS, PAGE, SCRIPTS, SHADERS, WrittenPage, write_levels, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr, ssim
 from dyngs.runs.opened import Opened, open_run, opened_scene
+from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
 from dyngs.triangles.scene import TriangleOptions, TriangleScene
 
@@ -216,6 +224,101 @@ def test_a_browser_without_webgl_is_told(tmp_path: Path, browser: Browser) -> No
     page.driven.goto((tmp_path / "page.html").as_uri())
     page.wait_for("document.getElementById('message').textContent.includes('WebGL 2')")
     page.close()
+
+
+class Served(SimpleHTTPRequestHandler):
+    """A folder on a web server, of which the blocks in ``cut_off`` arrive in part, once."""
+
+    cut_off: ClassVar[set[str]] = set()
+
+    def send_head(self) -> Any:
+        name = self.path.strip("/")
+        if name not in self.cut_off:
+            return super().send_head()
+        self.cut_off.remove(name)
+        self.send_response(200)
+        self.send_header("Content-Length", "99999")
+        self.end_headers()
+        return io.BytesIO(b"x")
+
+    def log_message(self, format: str, *args: Any) -> None: ...
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Served, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+def levels_of_a_cloud(folder: Path, most: int | None = None) -> tuple[LevelScene, Cameras]:
+    """Five blocks of ``BLOCK`` Gaussians or fewer."""
+    gaussians = cloud(14_000, degree=1)
+    still = StaticScene(gaussians=gaussians.replace(log_scales=gaussians.log_scales - 1), background=torch.ones(3))
+    view = large(camera(), 6)
+    written = write_levels(replace(opened_scene(still), stated_up="-y"), folder, most=most, views=(view,))
+    assert written.num_bytes == sum(file.stat().st_size for file in folder.iterdir())
+    assert sorted(file.name for file in folder.iterdir()) == [*(f"0-{i}.bin" for i in range(4)), "1-0.bin", PAGE]
+    return LevelScene.of(still, most), view
+
+
+def from_afar(view: Cameras, factor: float) -> Cameras:
+    pose = view.cam_from_world.clone()
+    pose[0, 2, 3] *= factor
+    return replace(view, cam_from_world=pose)
+
+
+@needs_browser
+@pytest.mark.parametrize("most", [None, 9000])
+def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_path: Path) -> None:
+    scene, view = levels_of_a_cloud(tmp_path / "page", most)
+    with served(tmp_path / "page") as address:
+        page = browser.open(address, 320, 240)
+        page.wait_for("window.dyngs !== undefined")
+        for factor in (1.0, 30.0):
+            one = from_afar(view, factor)
+            assert psnr(shown(page, one, 0.0), scene.render(one).rgb[0]) > 38
+            drawn = sum(scene.levels.count(block) for block in scene.levels.cut(one, most))
+            assert drawn == (14_000 if most is None and factor == 1 else 3_500)
+            cut = page.evaluate("[...dyngs.renderer.motion.drawn].map((row) => dyngs.renderer.tree.countOf(row))")
+            assert sum(cut) == drawn
+        assert page.errors == []
+        assert all(request.startswith(address) for request in page.requests)
+        assert len(page.requests) == (6 if most is None else 2)
+        page.close()
+
+
+@needs_browser
+def test_what_a_server_cut_off_is_asked_for_again(browser: Browser, tmp_path: Path) -> None:
+    scene, view = levels_of_a_cloud(tmp_path / "page")
+    Served.cut_off |= {"1-0.bin", "0-2.bin"}
+    with served(tmp_path / "page") as address:
+        page = browser.open(address, 320, 240)
+        page.wait_for("document.getElementById('message').textContent.includes('trying again')")
+        page.wait_for("window.dyngs !== undefined")
+        assert psnr(shown(page, view, 0.0), scene.render(view).rgb[0]) > 38
+        assert page.evaluate("document.getElementById('message').hidden")
+        page.close()
+
+
+@needs_browser
+def test_a_page_of_levels_from_a_disk_says_what_it_needs(browser: Browser, tmp_path: Path) -> None:
+    levels_of_a_cloud(tmp_path / "page")
+    page = browser.open((tmp_path / "page" / PAGE).as_uri(), 320, 240)
+    page.wait_for("document.getElementById('message').textContent.includes('http.server')")
+    page.close()
+
+
+def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> None:
+    still = opened_scene(still_scene())
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").touch()
+    with pytest.raises(DyngsError, match="exists already"):
+        write_levels(still, tmp_path / "full")
+    with pytest.raises(DyngsError, match="for still scenes"):
+        write_levels(opened_scene(sliding_scene()), tmp_path / "new")
+    assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine"]
 
 
 def test_a_page_names_no_host_and_allows_none(tmp_path: Path) -> None:
