@@ -43,7 +43,7 @@ ROWS = {
         "both": (),
         "both, not fine-tuned": (ONCE,),
     },
-    "scores": {name: (f"prune.score={name}",) for name in ("sensitivity", "contribution", "variation", "temporal")},
+    "scores": {name: (f"prune.score={name}",) for name in ("sensitivity", "contribution", "variation")},
 }
 
 

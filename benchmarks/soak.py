@@ -304,7 +304,9 @@ class Soak:
         self.tallies = {job: Tally() for job in jobs}
         self.references: dict[str, Reference] = {}
         with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-            for words in (*SOURCES.values(), JOBS["export"].replace("OUT", "stored")):
+            moves = any("moving" in JOBS[job] for job in jobs)
+            sources = [words for name, words in SOURCES.items() if moves or "moving" not in name]
+            for words in (*sources, JOBS["export"].replace("OUT", "stored")):
                 if dyngs(words.split()) != 0:  # in this process, which imports all that the children need
                     raise SystemExit(f"dyngs {words} failed")
         if Path("/proc/self/task").exists() and len(list(Path("/proc/self/task").iterdir())) > 1:

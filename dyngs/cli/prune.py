@@ -45,7 +45,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--max-loss", type=_decibels, metavar="DB", help=about)
     about = "no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else"
     parser.add_argument("--prune", metavar="R", help=about)
-    scores = ("variation", "sensitivity", "contribution", "temporal")
+    scores = ("variation", "sensitivity", "contribution")
     parser.add_argument("--score", choices=scores, help="importance score of a Gaussian (default sensitivity)")
     about = "no search: number of key times of visibility masks (default: no masks)"
     parser.add_argument("--masks", metavar="K", help=about)

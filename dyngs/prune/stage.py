@@ -66,10 +66,6 @@ class Importance:
         return self.fractions.sum(0)
 
     @property
-    def temporal(self) -> Tensor:
-        return (self._volumes() * self._variation()).sum(0)
-
-    @property
     def variation(self) -> Tensor:
         """(N,) sum_k gamma(k) g(k) C(k), the spatio-temporal variation score of 4DGS-1K (Yuan et al. 2025) for a
         canonical form that moves.
@@ -201,8 +197,6 @@ def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> T
     match score:
         case "variation":
             return found.variation
-        case "temporal":
-            return found.temporal
         case "contribution" | "sensitivity":
             return found.contribution if found.slopes is None else found.slopes
 

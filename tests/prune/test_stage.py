@@ -136,7 +136,7 @@ def test_without_a_stage_nothing_changes(still: Path, tmp_path: Path) -> None:
     assert load_run(train(config)).step == 8
 
 
-@pytest.mark.parametrize("score", ["variation", "sensitivity", "contribution", "temporal"])
+@pytest.mark.parametrize("score", ["variation", "sensitivity", "contribution"])
 def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> None:
     stage = STAGE.model_copy(update={"score": score})
     trainer = trained(moving_config(moving, tmp_path, "control_nodes", stage))
@@ -254,7 +254,6 @@ def test_in_a_still_scene_variation_is_twice_the_contribution() -> None:
     """g is 2 where nothing bends, gamma 1 where all are of one size."""
     found = constant([[1.0, 5.0, 0.25]] * 4)
     torch.testing.assert_close(found.variation, 2 * found.contribution)
-    torch.testing.assert_close(found.temporal, torch.full((3,), 8.0))
 
 
 def test_of_equal_contributions_the_steady_one_is_worth_more() -> None:
@@ -290,7 +289,7 @@ def test_scores_are_finite_where_something_is_never_seen() -> None:
             return Offsets(torch.zeros(len(means), 3), logit_opacities=torch.full((len(means),), -200.0 * time))
 
     found = importance(views(moving_scene(Fading(), rows=(0, 1, 2, 3, 4))), slopes=True)
-    for scores in (found.variation, found.temporal, found.contribution):
+    for scores in (found.variation, found.contribution):
         assert scores.isfinite().all()
 
 

@@ -36,7 +36,7 @@ class PruneConfig(Section):
     """A last stage with fewer Gaussians, after ``train.steps`` (docs/prune.md). Off where nothing is asked for."""
 
     fraction: float = Field(default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none")
-    score: Literal["variation", "sensitivity", "contribution", "temporal"] = Field(
+    score: Literal["variation", "sensitivity", "contribution"] = Field(
         default="sensitivity", description="importance of a Gaussian (docs/prune.md); the lowest are removed"
     )
     mask_times: int = Field(
