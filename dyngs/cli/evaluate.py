@@ -85,12 +85,14 @@ def report_table(report: EvalReport) -> Table:
     field = f", {report.field_mb:.1f} of them the field" if report.num_moving else ""
     deforming = f", {report.deform_fraction:.0%} of the time deforming" if report.num_moving else ""
     table.add_row("image size", f"{report.width}x{report.height} on {report.background}")
-    table.add_row("Gaussians", f"{report.num_gaussians:,}")
+    if report.num_gaussians:
+        table.add_row("Gaussians", f"{report.num_gaussians:,}")
     if report.num_moving:
         table.add_row("moving", f"{report.num_moving:,} ({report.moving_fraction:.1%})")
     stored = "" if report.stored_mb is None else f"{report.stored_mb:.2f} MB on disk, as float32 "
     table.add_row("model", f"{stored}{report.model_mb:.1f} MB{field}")
-    table.add_row("colour", f"{report.colour_floats:.1f} numbers per Gaussian")
+    if report.num_gaussians:
+        table.add_row("colour", f"{report.colour_floats:.1f} numbers per Gaussian")
     table.add_row("rendering", f"{report.fps:.1f} frames/s{deforming}")
     table.add_row("training", f"{counted(report.step, 'step')} in {report.seconds_train:.0f} s")
     return table
