@@ -16,7 +16,6 @@ KEYS = [
     "model.kind=bg_triangle",
     "model.max_triangles=300",
     "model.num_first=150",
-    "model.segments=3",
     "model.gaussian_steps=60",
 ]
 

@@ -129,7 +129,7 @@ def run_settings(run_dir: Path) -> Settings:
     model = config.model
     own: dict[str, Value | None] = {"storage": None, "scale": 1.0}
     if isinstance(model, BgTriangleModel):
-        return own | {"triangles": 1.0} | {x: getattr(model, x) for x in ("sh_degree", "segments", "supersampling")}
+        return own | {"triangles": 1.0} | {x: getattr(model, x) for x in ("sh_degree", "supersampling")}
     if not isinstance(model, SceneModel):
         raise DyngsError(f"{run_dir}: model.kind={model.kind} has neither Gaussians nor triangles to vary")
     scene = load_run(run_dir).scene

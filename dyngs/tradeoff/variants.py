@@ -18,7 +18,7 @@ SEVERAL = "several"
 """Stands for the setting of a variant that changes more than one."""
 AUTO = "auto"
 """Storage with the default quantisation of ``dyngs export --format dyngs``."""
-_DRAWN = ("mode", "alpha_min", "transmittance_min", "segments", "supersampling")  # options of a render, by name
+_DRAWN = ("mode", "alpha_min", "transmittance_min", "supersampling")  # options of a render, by name
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Variant:
         storage: allowed change of images by quantisation, grey levels of 255, or "auto"; None: float32.
         field_step: factor on the quantisation steps of the field.
         mode, alpha_min, transmittance_min: ``model.rasterize_mode`` and so on to render with.
-        segments, supersampling: the same of curved triangles.
+        supersampling: the same of curved triangles.
         triangles: factor on the number of triangles to train with.
         scale: width and height rendered, relative to those shown.
     """
@@ -54,7 +54,6 @@ class Variant:
     alpha_min: float | None = None
     transmittance_min: float | None = None
     scale: float = 1.0
-    segments: int | None = None
     supersampling: int | None = None
     triangles: float = 1.0
 
@@ -156,7 +155,6 @@ SETTINGS = (
     Varied("alpha_min", (0.008, 0.016, 0.032), low=1e-6, high=0.5),
     Varied("transmittance_min", (1e-3, 1e-2, 5e-2), low=1e-6, high=0.5),
     Varied("scale", (0.75, 0.5), low=0.05, high=1.0),
-    Varied("segments", (3, 2, 1), low=1, high=16, integers=True),
     Varied("supersampling", (1,), low=1, high=4, integers=True),
     Varied("field_step", (4.0, 16.0), low=1 / 64, high=1024),
     Varied("colour", _COLOURS, words=_COLOURS, trains=True),

@@ -34,12 +34,6 @@ class BgTriangleModel(ModelSection):
     texture_from: Fraction = Field(
         default=0.7, description="fraction of the run after which textures are learned in place of colours"
     )
-    segments: int = Field(
-        default=6,
-        ge=1,
-        le=16,
-        description="most segments of an edge: a triangle is drawn as their square, as few as it is flat enough for",
-    )
     supersampling: int = Field(default=2, ge=1, le=4, description="pixels are drawn as the mean of its square")
     lr_position: Positive = Field(
         default=4e-3, le=1, description="learning rate of control points at first, in half sides of the scene"

@@ -139,11 +139,7 @@ def rendering_of(views: list[View], background: Tensor | None, options: Triangle
 
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     """Return how triangles of a scene of half side ``unit`` are drawn."""
-    return TriangleOptions(
-        near=model.near * unit,
-        segments=model.segments,
-        supersampling=model.supersampling,
-    )
+    return TriangleOptions(near=model.near * unit, supersampling=model.supersampling)
 
 
 def stored_triangles(checkpoint: Checkpoint) -> tuple[Patches, float]:

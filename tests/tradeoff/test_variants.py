@@ -25,7 +25,7 @@ VARIANTS = st.builds(
     field=st.sampled_from([None, "mlp"]),
     field_size=st.sampled_from([1.0, 0.5]),
     field_step=st.sampled_from([1.0, 4.0]),
-    segments=st.sampled_from([None, 1]),
+    supersampling=st.sampled_from([None, 1]),
     triangles=st.sampled_from([1.0, 0.5]),
 )
 DYNAMIC = {
@@ -65,7 +65,7 @@ def test_merging_keeps_what_the_other_changes(a: Variant, b: Variant) -> None:
 
 
 def test_what_lies_on_disk_does_not_depend_on_drawing() -> None:
-    drawn = Variant(mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5, segments=2, supersampling=1)
+    drawn = Variant(mode="antialiased", alpha_min=0.01, transmittance_min=0.01, scale=0.5, supersampling=1)
     assert drawn.stored == Variant()
     assert replace(drawn, prune=0.5).stored == Variant(prune=0.5)
     assert replace(drawn, colour="sh", field="mlp", prune=0.5).trained == Variant(colour="sh", field="mlp")
