@@ -71,7 +71,7 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
     assert moving.psnr_moving > max(16.5, static.psnr_moving + 1)  # 16.83, 15.09
     assert moving.track_error_px is not None
     assert moving.track_motion_px is not None
-    assert moving.track_error_px < 0.76 * moving.track_motion_px  # 0.707, 0.972
+    assert moving.track_error_px < 0.75 * moving.track_motion_px  # 0.707, 0.972
 
 
 def test_a_ball_that_rolls_is_followed_as_a_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
