@@ -45,9 +45,9 @@ _UNFIT: dict[str, dict[str, str]] = {
     | _FOR_DYNGS,
 }
 """Options that do not go with a format, and why."""
-_ONLY = dict.fromkeys(("level", "segments", "cells"), "surface, not of a person")
-_ONLY |= {"levels": "html", "max_gaussians_drawn": "html --levels"}
-"""Options that go with one format."""
+_ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of a person"))
+_ONLY |= {"levels": ("html", "html"), "max_gaussians_drawn": ("html", "html --levels")}
+"""Options that go with one format, and how it is asked for."""
 
 _EPILOG = """\
 examples:
@@ -130,9 +130,9 @@ def run(arguments: argparse.Namespace) -> int:
     writers |= {"surface": _export_surface, "network": _export_network}
     if arguments.bodies:
         return _export_bodies(arguments)
-    for option, needs in _ONLY.items():
-        if kind != needs.split()[0] and getattr(arguments, option) not in (None, False):
-            raise DyngsError(f"--{option.replace('_', '-')} goes with --format {needs.replace('surface', 'mesh')}")
+    for option, (only, asked) in _ONLY.items():
+        if kind != only and getattr(arguments, option) not in (None, False):
+            raise DyngsError(f"--{option.replace('_', '-')} goes with --format {asked}")
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")

@@ -137,6 +137,8 @@ class DefaultDensifier(Densifier):
         return {"grad_sum": self.grad_sum, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
+        if not state:  # of a run that was edited after its end: counted anew from the next step on
+            state = {"grad_sum": self.grad_sum[:0], "seen": self.seen[:0]}
         count = len(state["seen"])
         self.grad_sum, self.seen = (require_tensor(x, state[x], (count,)).clone() for x in ("grad_sum", "seen"))
         self._step_grad_sum, self._step_seen = (torch.zeros(0, device=self.seen.device) for _ in range(2))

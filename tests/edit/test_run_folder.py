@@ -126,6 +126,9 @@ def test_a_part_in_the_coordinates_of_the_frame(tmp_path: Path) -> None:
     torch.testing.assert_close(open_run(part).scene.gaussians.means, means[kept], rtol=0, atol=0)
     assert open_run(part).frame == open_run(once).frame
     assert at_end(load_resolved(part), part).num_gaussians == int(kept.sum())  # as pruning begins
+    assert main(["train", "--resume", str(part), "train.steps=3"]) == 0  # goes on as any run
+    assert open_run(part).info.step == 3
+    assert len(open_run(part).scene) == int(kept.sum())
     (part / "scene.dyngs").touch()
     for file in (part / "checkpoints").iterdir():
         file.unlink()
