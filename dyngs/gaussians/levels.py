@@ -72,7 +72,8 @@ class Levels:
         """
         sizes = [sizes_on_image(balls, camera) for balls in self.blocks]
         top: Block = (len(self.levels) - 1, 0)
-        cut, drawn = {top}, self.count(top)
+        cut: set[Block] = {top}
+        drawn = self.count(top)
         waiting: list[tuple[float, Block]] = [(-float(sizes[-1][0]), top)]
         while waiting:
             size, block = heapq.heappop(waiting)
