@@ -9,6 +9,7 @@ from dyngs.cli import main
 
 def error_line(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     """What stderr says about a command line that must be refused: one line, and nothing on stdout."""
+    capsys.readouterr()  # of earlier commands
     assert main([str(a) for a in arguments]) == 2
     output = capsys.readouterr()
     assert output.err.startswith("dyngs: error: ")
