@@ -7,12 +7,12 @@ import pytest
 from dyngs.cli import main
 
 
-def error_line(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """What stderr says about a command line that must be refused: one line, and nothing on stdout."""
+def error_line(capsys: pytest.CaptureFixture[str], *arguments: object, begun: bool = False) -> str:
+    """What stderr says about a command line that must be refused: one line; nothing on stdout, unless it has begun."""
     capsys.readouterr()  # of earlier commands
     assert main([str(a) for a in arguments]) == 2
     output = capsys.readouterr()
     assert output.err.startswith("dyngs: error: ")
     assert output.err.count("\n") == 1
-    assert output.out == ""
+    assert begun or output.out == ""
     return output.err

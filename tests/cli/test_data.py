@@ -193,7 +193,7 @@ def test_inspect_takes_keys_of_data(tmp_path: Path, capsys: PrintedOutput) -> No
     image.rename(tmp_path / "own.png")
     image.symlink_to(tmp_path / "own.png")
     capsys.readouterr()
-    assert "set data.follow_links=true" in error_line(capsys, "data", "inspect", str(root))
+    assert "set data.follow_links=true" in error_line(capsys, "data", "inspect", str(root), begun=True)
     assert main(["data", "inspect", str(root), "--deep", "data.follow_links=true"]) == 0
     assert "a link that leads out of the capture" in capsys.readouterr().out
     assert "give keys of data" in error_line(capsys, "data", "inspect", str(root), "train.steps=3")

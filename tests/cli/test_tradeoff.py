@@ -27,7 +27,7 @@ def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFi
     assert {f.name for f in out.iterdir()} >= {f"tradeoff.{suffix}" for suffix in ("csv", "json", "svg", "html", "png")}
     (chosen,) = (out / "chosen").iterdir()
     assert len(load_run(chosen).scene) == 5
-    error = error_line(capsys, *words, "--require", "mb<=0.000001")
+    error = error_line(capsys, *words, "--require", "mb<=0.000001", begun=True)
     assert "no measured variant has mb<=1e-06; mb<=1e-06 is too strict" in error
 
 
