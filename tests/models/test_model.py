@@ -45,7 +45,7 @@ TRAINED = {
     "nerf": ("still", ["model.width=16", "model.coarse=8", "model.fine=8", "model.rays=32"]),
     "bg_triangle": (
         "still",
-        ["init.num_random=40", "model.segments=2", "model.gaussian_steps=20", "model.num_first=40"],
+        ["init.num_random=40", "model.gaussian_steps=20", "model.num_first=40"],
     ),
     "toy": ("still", []),
 }

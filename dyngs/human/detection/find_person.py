@@ -74,8 +74,7 @@ def find_person(
         where = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
         if not people:
             say(f"warning: {where}{detector.name} finds nobody, its images are left out")
-            for view in camera.views:
-                write_image(folder / "masks" / f"{view.name}.png", np.zeros((view.height, view.width), np.uint8))
+            _write_empty_masks(camera, folder / "masks")
             continue
         if not 1 <= number <= len(people):
             raise DyngsError(f"{capture.root}: {where}--person {number}, but people found: {len(people)}")
@@ -137,6 +136,11 @@ def _write_masks(camera: _Camera, person: Sequence[Detection | None], folder: Pa
         say(f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)")
     for view, mask in zip(camera.views, masks if better is None else better, strict=True):
         write_image(folder / f"{view.name}.png", at_size(mask, view))
+
+
+def _write_empty_masks(camera: _Camera, folder: Path) -> None:
+    for view in camera.views:
+        write_image(folder / f"{view.name}.png", np.zeros((view.height, view.width), np.uint8))
 
 
 def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
