@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,6 +22,7 @@ from dyngs.human.fit.solve import (
     FRAMES,
     BodyFit,
     Fitting,
+    InTurn,
     LensFit,
     body_fit,
     drawn_frame,
@@ -45,7 +45,6 @@ Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people.
 clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
 PLACING = 40  # most steps of Adam in which a clip is moved to its silhouettes: three numbers are learned
-VIEWS = 3  # views of a frame, other ones each time, that are drawn while images are small
 TRIAL, PROMISING = 4, 0.75
 """What is tried next is learned in the last of so many parts of its steps at first, when rates are low, and in all of
 them where that gains this fraction of ``GAIN``. Where a limb is off, it gains several times that."""
@@ -126,18 +125,6 @@ class Seen:
     def halves(self) -> dict[int, ObservedFrame | None]:
         """The frames to fit to at half the size."""
         return {row: None if frame is None else frame.shrunk(2) for row, frame in self.used.items()}
-
-
-class InTurn:
-    """Observations of a few views of each frame, other ones each time; ``frames`` are all views, by row of the clip."""
-
-    def __init__(self, frames: Mapping[int, ObservedFrame | None]) -> None:
-        self._frames, self._turns = frames, Counter[int]()
-
-    def __call__(self, row: int) -> ObservedFrame | None:
-        frame = self._frames[row]
-        self._turns[row] += 1
-        return None if frame is None else frame.part(self._turns[row], VIEWS)
 
 
 def fit_capture(

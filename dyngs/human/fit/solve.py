@@ -7,6 +7,7 @@ shape parameters, P discs, V views, K key points.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -109,7 +110,20 @@ FOCAL, FOCAL_WEIGHT = 0.35, 1e-3
 PADDING, PADDING_WEIGHT = 0.01, 2e-3
 """Metres between skin and silhouette that cost as much as one unit of shape, and the weight of their mean square."""
 FRAMES = 3  # frames drawn in each step
+VIEWS = 3  # views of a frame, other ones each time, that are drawn where not all are (``InTurn``)
 Observations = Callable[[int], ObservedFrame | None]  # returns what is seen in a row of the clip
+
+
+class InTurn:
+    """Observations of a few views of each frame, other ones each time; ``frames`` are all views, by row of the clip."""
+
+    def __init__(self, frames: Mapping[int, ObservedFrame | None]) -> None:
+        self._frames, self._turns = frames, Counter[int]()
+
+    def __call__(self, row: int) -> ObservedFrame | None:
+        frame = self._frames[row]
+        self._turns[row] += 1
+        return None if frame is None else frame.part(self._turns[row], VIEWS)
 
 
 def new_fit(clip: MotionClip, surface: Surface) -> Parameters:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,6 +18,7 @@ from dyngs.human.fit.silhouettes import ObservedFrame, Surface
 from dyngs.human.fit.solve import (
     NUM_TURNED,
     Fitting,
+    InTurn,
     Observations,
     frame_pose_of,
     keypoint_error,
@@ -34,7 +34,6 @@ from dyngs.human.template.joints import JOINT_NAMES
 
 NUM_HEADINGS = 8  # directions that a person may face, all of which are tried in every anchor
 LIKELY = 3  # of these, nearest to the key points, that are tried where there are some
-FEW = 3  # views that are drawn in each step, other ones each time
 MOST_ANCHORS = 20  # frames in which headings are tried
 CHANGE_WEIGHT = 0.01
 """Error that costs as much as a turn of 45 degrees from one anchor to the next; it grows with the square."""
@@ -290,8 +289,7 @@ def _found_from(
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
     learned, fitting = new_fit(one, surface), Fitting(one, surface, usual(one))
     for level in levels:
-        shown, turns = seen.shrunk(level), itertools.count()
-        learned = fitting.run(learned, ("poses", "trans"), STEPS, lambda _, at=shown, of=turns: at.part(next(of), FEW))
+        learned = fitting.run(learned, ("poses", "trans"), STEPS, InTurn({0: seen.shrunk(level)}))
     with torch.no_grad():
         error = float(mean_error(learned, one, surface, {0: seen}) + prior(learned, fitting.expected))
     own = Rotation.from_rotvec(learned["poses"][0].detach().numpy())

@@ -19,10 +19,8 @@ from dyngs.human.fit.capture_fit import (
     GAIN,
     RESOLUTION,
     TRIAL,
-    VIEWS,
     CaptureFit,
     FitEffort,
-    InTurn,
     TriedFit,
     fit_capture,
     fitted_clips,
@@ -32,7 +30,7 @@ from dyngs.human.fit.capture_fit import (
     split_views,
 )
 from dyngs.human.fit.silhouettes import surface_of
-from dyngs.human.fit.solve import body_fit, new_fit
+from dyngs.human.fit.solve import VIEWS, InTurn, body_fit, new_fit
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
