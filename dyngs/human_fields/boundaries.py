@@ -10,6 +10,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -17,6 +18,7 @@ from dyngs.human.template.mesh import Fragments, rasterize, vertex_normals
 from dyngs.human_fields.people import Body
 
 OUTWARDS, INWARDS = 0.06, 0.04  # How far the copies are from the mesh, m
+FAR = 0.1  # Heights above the body are known up to here, m
 _NEAREST = 0.05  # Least depth of what is drawn, m
 
 
@@ -42,6 +44,23 @@ class Boundaries:
         vertices = vertices.astype(np.float64)
         normals = vertex_normals(vertices, faces)
         return faces, vertices, vertices + OUTWARDS * normals, vertices - INWARDS * normals
+
+    @cached_property
+    def _tree(self) -> tuple[cKDTree, np.ndarray]:
+        """Return the vertices of the body (M, 3) to be searched, and their normals (M, 3)."""
+        faces, vertices, _, _ = self._meshes
+        return cKDTree(vertices), vertex_normals(vertices, faces)
+
+    def height(self, points: Tensor) -> Tensor:
+        """Return how far points (N, 3) are from the body, m, along the normal of the nearest vertex; negative inside."""
+        tree, normals = self._tree
+        places = points.detach().cpu().double().numpy()
+        distance, nearest = tree.query(places, distance_upper_bound=FAR)
+        known = np.isfinite(distance)
+        nearest[~known] = 0
+        inside = ((places - tree.data[nearest]) * normals[nearest]).sum(1) < 0
+        height = np.where(known, np.where(inside, -distance, distance), FAR)
+        return torch.from_numpy(height).to(points)
 
     def depth(self, camera: Cameras) -> Tensor:
         """Return depths (H, W) of the body, m, infinite beside it."""

@@ -45,7 +45,7 @@ HIDDEN_BY = 0.03  # What lies so far behind the body is hidden by it, m
 SHARPNESS = 200.0  # Of the first surfaces, per m
 AROUND = 0.5  # Half of where rays are looked at without boundaries, m before and behind the middle of the key points
 GEOMETRY = 16  # Features of what is known about the surface at a sample
-EDGE = 0.05  # Alpha up to which, and less than 1 from which, a ray surely misses or meets the person
+HINTS = 6  # What is known of a sample from the body and the silhouettes
 _FAR = 1e3  # Stands for no depth, m
 
 
@@ -73,9 +73,9 @@ class EgHumanNerf(FieldNetwork):
         super().__init__(model.features)
         self.model = model
         width, pixel = model.width, model.features + FINE
-        self.guide = Perceptron(2 * pixel + 5, width, width, 1)
+        self.guide = Perceptron(2 * pixel + HINTS, width, width, 1)
         self.attention = Perceptron(pixel + 5, width, 1)
-        self.surface = Perceptron(2 * pixel + 5, width, width, 1 + GEOMETRY)
+        self.surface = Perceptron(2 * pixel + HINTS, width, width, 1 + GEOMETRY)
         colours = 3 + FINE
         self.blend = Perceptron(3 * colours + GEOMETRY + 5, width, width // 2, 1)
         self.sharpness = nn.Parameter(torch.tensor(math.log(SHARPNESS), device="cpu"))
@@ -135,10 +135,9 @@ class EgHumanNerf(FieldNetwork):
         if generator is not None:
             shifts = torch.rand(shifts.shape, generator=generator, device="cpu")
         at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
-        prior = self._prior(at, body)
-        points = rays.origins[:, None] + rays.directions[:, None] * at[..., None]
-        looked = known.seen.look(points.flatten(0, 1))
-        hints = self._hints(looked, prior, (at - first) / (last - first))
+        points = (rays.origins[:, None] + rays.directions[:, None] * at[..., None]).flatten(0, 1)
+        looked, prior = known.seen.look(points), self._prior(known, points, at, body)
+        hints = self._hints(looked, prior, body - at, (at - first) / (last - first))
         guide = self.guide(torch.cat([mean_and_variance(looked.features), hints], -1))
         signed = prior + LIMIT * guide.view(at.shape)
         near = expected_surface(at.detach(), signed.detach())[:, None] + at.new_tensor(OFFSETS)
@@ -163,7 +162,8 @@ class EgHumanNerf(FieldNetwork):
         facts = torch.cat([hidden[..., None].to(apart), apart], -1)
         logits = self.attention(torch.cat([looked.features, facts], -1))[..., 0]
         weights = (logits - 1e4 * (hidden & ~hidden.all(0))).softmax(0)
-        hints = self._hints(looked, self._prior(at, body), (at - first) / (last - first))
+        prior = self._prior(known, points, at, body)
+        hints = self._hints(looked, prior, body - at, (at - first) / (last - first))
         found = self.surface(torch.cat([mean_and_variance(looked.features, weights), hints], -1))
         signed = interpolated(own_at, own_signed, at) + LIMIT * found[:, 0].view(at.shape)
         own = torch.cat([looked.rgb, looked.features[..., -FINE:]], -1)
@@ -171,19 +171,26 @@ class EgHumanNerf(FieldNetwork):
         colours = blended(self.blend(torch.cat([own, both, facts], -1))[..., 0], looked.rgb, hidden)
         return signed, colours.view(*at.shape, 3)
 
-    def _prior(self, at: Tensor, body: Tensor) -> Tensor:
-        """Return signed ray distances (R, K) to the body; without boundaries to the middle of the key points."""
-        limit = OUTWARDS if self.model.boundaries else AROUND
-        return (body - at).clamp(-limit, limit)
+    def _prior(self, known: Known, points: Tensor, at: Tensor, body: Tensor) -> Tensor:
+        """Return the signed ray distances (R, K) that learning begins with, of points (R K, 3) at distances (R, K).
 
-    @staticmethod
-    def _hints(looked: Look, prior: Tensor, place: Tensor) -> Tensor:
-        """Return (R K, 5): the distance to the body, where in its interval a sample is, and if silhouettes hold it."""
-        known = torch.stack([prior / OUTWARDS, place, prior.abs() / OUTWARDS], -1).flatten(0, 1)
+        Their heights above the body, which also say something where a ray passes beside it; without boundaries the
+        distances to the middle of the key points.
+        """
+        if not self.model.boundaries:
+            return (body - at).clamp(-AROUND, AROUND)
+        return known.own.boundaries.height(points).view(at.shape).clamp(-LIMIT, LIMIT)
+
+    def _hints(self, looked: Look, prior: Tensor, ahead: Tensor, place: Tensor) -> Tensor:
+        """Return (R K, 6): the distance to the body in any direction and along the ray (R, K), m, where in its interval
+        a sample is, and if silhouettes hold it."""
+        limit = OUTWARDS if self.model.boundaries else AROUND
+        along = ahead.clamp(-limit, limit) / OUTWARDS
+        known = torch.stack([prior / LIMIT, prior.abs() / LIMIT, along, place], -1).flatten(0, 1)
         return torch.cat([known, looked.alpha.amin(0)[:, None], looked.alpha.mean(0)[:, None]], -1)
 
     def penalty(self, picture: Picture, image: Image, scale: float) -> Tensor:
-        """Return the mean error of signed ray distances, of rays that surely miss or meet the person."""
+        """Return the mean error of signed ray distances; rays meet the person where alpha is above a half."""
         if not self.needs_depth or not picture.samples:
             return picture.colour.new_zeros(())
         assert image.depth is not None
@@ -194,7 +201,7 @@ class EgHumanNerf(FieldNetwork):
             truth, alpha = (x.flatten()[samples.rays][:, None] for x in (image.depth, image.alpha))
             surface = truth / (scale * z[samples.rays][:, None])
             wanted = torch.where(alpha > 0.5, surface - samples.at, LIMIT).clamp(-LIMIT, LIMIT)
-            counts = (alpha < EDGE) | ((alpha > 1 - EDGE) & (truth > 0))
+            counts = (alpha <= 0.5) | (truth > 0)
             error = (samples.signed - wanted).abs() * counts
             total = total + error.sum() / (LIMIT * samples.at.shape[1] * counts.sum().clamp_min(1))
         return self.model.srdf_weight * total
