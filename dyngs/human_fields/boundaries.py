@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -18,7 +18,6 @@ from dyngs.human.template.mesh import Fragments, rasterize, vertex_normals
 from dyngs.human_fields.people import Body
 
 OUTWARDS, INWARDS = 0.06, 0.04  # How far the copies are from the mesh, m
-FAR = 0.1  # Heights above the body are known up to here, m
 _NEAREST = 0.05  # Least depth of what is drawn, m
 
 
@@ -46,21 +45,19 @@ class Boundaries:
         return faces, vertices, vertices + OUTWARDS * normals, vertices - INWARDS * normals
 
     @cached_property
-    def _tree(self) -> tuple[cKDTree, np.ndarray]:
+    def _tree(self) -> tuple[KDTree, np.ndarray]:
         """Return the vertices of the body (M, 3) to be searched, and their normals (M, 3)."""
         faces, vertices, _, _ = self._meshes
-        return cKDTree(vertices), vertex_normals(vertices, faces)
+        return KDTree(vertices), vertex_normals(vertices, faces)
 
     def height(self, points: Tensor) -> Tensor:
-        """Return how far points (N, 3) are from the body, m, along the normal of the nearest vertex; negative inside."""
+        """Return how far points (N, 3) are from the nearest vertex of the body, m; negative inside."""
         tree, normals = self._tree
         places = points.detach().cpu().double().numpy()
-        distance, nearest = tree.query(places, distance_upper_bound=FAR)
-        known = np.isfinite(distance)
-        nearest[~known] = 0
+        found, rows = tree.query(places)
+        distance, nearest = np.asarray(found), np.asarray(rows)
         inside = ((places - tree.data[nearest]) * normals[nearest]).sum(1) < 0
-        height = np.where(known, np.where(inside, -distance, distance), FAR)
-        return torch.from_numpy(height).to(points)
+        return torch.from_numpy(np.where(inside, -distance, distance)).to(points)
 
     def depth(self, camera: Cameras) -> Tensor:
         """Return depths (H, W) of the body, m, infinite beside it."""

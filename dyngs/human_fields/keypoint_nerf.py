@@ -33,6 +33,9 @@ AROUND = 0.3  # m around the bones that a person fills
 CELLS = 32  # Of the cube around a person, along an axis
 VISIBLE = 0.1  # Alpha from which an image shows the person
 DENSEST = 100.0  # Density, per m, that the network's output is a multiple of
+THICK = 0.065  # How far the surface is from the bones at first, m
+STEEP = 60.0  # By how much raw densities fall at first, per m from the bones
+HINTS = 4  # What is known of a sample from the bones and the silhouettes
 POOLED, GEOMETRY = 32, 24  # Features of a sample per image, and of what is known about its surface
 
 
@@ -52,7 +55,7 @@ class KeypointNerf(FieldNetwork):
         width, colours = model.width, 3 + FINE + GEOMETRY
         self.step = model.step
         self.per_image = Perceptron(CODE + model.features + FINE, width, width, POOLED)
-        self.geometry = Perceptron(2 * POOLED, width, width, 1 + GEOMETRY)
+        self.geometry = Perceptron(2 * POOLED + HINTS, width, width, 1 + GEOMETRY)
         self.blend = Perceptron(3 * colours + 4, width, width // 2, 1)
         begin(self, generator)
 
@@ -84,23 +87,30 @@ class KeypointNerf(FieldNetwork):
             samples = kept_samples(samples, (seen.alpha(places(samples, own.space)) > VISIBLE).all(0))[0]
             points = places(samples, own.space)
             code = spatial_code(points, known.body.key_points, seen.sources)
-            geometry = self._geometry(seen, points, code)
+            geometry = self._geometry(known, points, code)
             if learns:
                 samples, which = thinned_samples(density(geometry), samples, shifts)
             else:
                 samples, which = reached_samples(density(geometry), samples)
             points, geometry = points[which], geometry[which]
         if learns:
-            geometry = self._geometry(seen, points, code[:, which])
+            geometry = self._geometry(known, points, code[:, which])
         densities = density(geometry)
         colours = self._colours(seen, geometry, points, rays.directions[samples.rays.long()])
         drawn = composite(densities, colours, samples)
         return drawn.colour, drawn.transmittance, drawn.depth
 
-    def _geometry(self, seen: Seen, points: Tensor, code: Tensor) -> Tensor:
-        """Return (M, 1 + GEOMETRY): raw densities, and what is known of the surface at points (M, 3)."""
-        per_image = self.per_image(torch.cat([code, seen.look(points).features], -1))
-        return self.geometry(mean_and_variance(per_image))
+    def _geometry(self, known: Known, points: Tensor, code: Tensor) -> Tensor:
+        """Return (M, 1 + GEOMETRY): raw densities, and what is known of the surface at points (M, 3).
+
+        Densities begin with those of limbs of one thickness.
+        """
+        looked, bone = known.seen.look(points), from_bones(points, known.body.key_points)[:, None]
+        per_image = self.per_image(torch.cat([code, looked.features], -1))
+        held = torch.stack([looked.alpha.amin(0), looked.alpha.mean(0)], -1)
+        hints = torch.cat([bone / REACH, (bone / REACH).square(), held], -1)
+        found = self.geometry(torch.cat([mean_and_variance(per_image), hints], -1))
+        return torch.cat([found[:, :1] + STEEP * (THICK - bone), found[:, 1:]], -1)
 
     def _colours(self, seen: Seen, geometry: Tensor, points: Tensor, directions: Tensor) -> Tensor:
         """Return (M, 3) colours: of the images, blended."""
