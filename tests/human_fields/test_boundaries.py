@@ -75,6 +75,16 @@ def test_boundaries_of_a_ball_are_balls() -> None:
     assert float((found.end - expected_end)[sure].abs().median()) < 5e-3, "what misses the body comes out again"
 
 
+def test_heights_above_a_ball_are_distances_to_it() -> None:
+    vertices, faces = sphere(RADIUS)
+    body = Body(torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy()))
+    direction = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    heights = torch.linspace(-0.5 * RADIUS, RADIUS, 50)
+    found = Boundaries(body).height((RADIUS + heights)[:, None] * direction)
+    torch.testing.assert_close(found, heights, atol=0.02, rtol=0.02)
+    assert bool((found.sign() == heights.sign())[heights.abs() > 0.02].all())
+
+
 def test_a_thin_body_ends_behind_its_front() -> None:
     """Eroded by more than its radius it is inside out, and its back would come first."""
     vertices, faces = sphere(0.03)
