@@ -24,7 +24,7 @@ _UNSEEN = -30.0  # Logit of an opacity that is never drawn
 class Sides:
     """To which of S sides each of N Gaussians belongs."""
 
-    of: Tensor  # (N,) uint8
+    of: Tensor  # (N,) int64
     toward: Tensor  # (S, 3) unit vectors from the middle to where a side is seen from
     middle: Tensor  # (3,) of what is seen, in the world
 
@@ -34,7 +34,7 @@ class Sides:
         device = centers[0].device
         middle = Gaussians.joined(parts).means.mean(0)
         sizes = torch.tensor([len(part) for part in parts], device=device)
-        of = torch.arange(len(parts), dtype=torch.uint8, device=device).repeat_interleave(sizes)
+        of = torch.arange(len(parts), dtype=torch.int64, device=device).repeat_interleave(sizes)
         return Sides(of, normalize(torch.stack([*centers]) - middle, dim=1), middle)
 
     def seen_by(self, camera: Cameras, gaussians: Gaussians) -> Gaussians:
@@ -57,5 +57,5 @@ class Sides:
         if "sides.of" not in tensors:
             return None
         toward = require_tensor("toward", tensors["sides.toward"], (None, 3))
-        of = require_indices("of", tensors["sides.of"], (count,), len(toward), torch.uint8)
+        of = require_indices("of", tensors["sides.of"], (count,), len(toward), torch.int64)
         return Sides(of, toward, require_tensor("middle", tensors["sides.middle"], (3,)))

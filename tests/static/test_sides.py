@@ -57,7 +57,7 @@ def test_sides_follow_their_gaussians_and_are_stored() -> None:
     tensors = {name.removeprefix("model."): x for name, x in tensors_of(scene.state()).items()}
     again = StaticScene.restored(scene.gaussians, tensors)
     assert again.sides is not None
-    assert torch.equal(again.sides.of, (kept >= 40).to(torch.uint8))
+    assert torch.equal(again.sides.of, (kept >= 40).long())
     assert torch.equal(again.render(RING).rgb, scene.render(RING).rgb)
     assert not torch.equal(again.render(RING).rgb, replace(again, sides=None).render(RING).rgb)
     assert StaticScene.restored(scene.gaussians, {}).sides is None
@@ -66,8 +66,8 @@ def test_sides_follow_their_gaussians_and_are_stored() -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("of", torch.full((100,), 2, dtype=torch.uint8)),
-        ("of", torch.zeros(99, dtype=torch.uint8)),
+        ("of", torch.full((100,), 2, dtype=torch.int64)),
+        ("of", torch.zeros(99, dtype=torch.int64)),
         ("of", torch.zeros(100)),
         ("toward", torch.zeros(2, 2)),
         ("middle", torch.full((3,), torch.nan)),
