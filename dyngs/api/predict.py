@@ -21,7 +21,7 @@ from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import require_empty
-from dyngs.runs.network_file import read_network
+from dyngs.runs.network_file import published_network, read_network
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def predict(
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train --resume`` refines it.
 
     Args:
-        network: run folder of a network that predicts people, see ``dyngs.models.prediction``, or a file of its
-            weights, see ``dyngs.runs.network_file``.
+        network: run folder of a network that predicts people, see ``dyngs.models.prediction``, a file of its weights,
+            see ``dyngs.runs.network_file``, or the name of published ones.
         capture: of a person, in any format that has silhouettes.
         out: a new run folder.
         views: how many of the training views to predict from; or their names; None: as many as the network is for.
@@ -80,7 +80,9 @@ def predict(
 
 
 def trained_network(network: Path) -> tuple[Config, Checkpoint]:
-    """Return configuration and weights of a network, from its run or a file of weights. Raises DyngsError."""
+    """Return configuration and weights of a network: its run, a file, or a published name. Raises DyngsError."""
+    if not network.exists() and network.name == str(network):
+        network = published_network(network.name)
     if network.is_file():
         return read_network(network)
     config = network_config(network)

@@ -205,6 +205,10 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
 
 
 def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
+    sides = getattr(opened.scene, "sides", None)
+    if sides is not None:
+        line = f"found from {len(sides.toward)} sides, of which dyngs draws the one nearest to the camera; a file shows"
+        args.print_notes((f"{line} all of them at once, less sharply: predict from two views for a sharp one",))
     return opened if arguments.motion is None else opened.in_motion(arguments.motion)
 
 

@@ -13,7 +13,7 @@ from dyngs.config import Config, DataConfig, GpsModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.conventions import ReportProgress, report_nothing
 from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.loader import ImageLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.people_set import captures_in
 from dyngs.data.read import read_capture
 from dyngs.data.times import distinct_times
@@ -31,6 +31,7 @@ from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.device import CPU, device_for, sent
 from dyngs.state import fields_moved_to
 from dyngs.static.scene import StaticScene
+from dyngs.static.sides import Sides
 from dyngs.static.training import StaticTraining
 
 DECAY = 0.9
@@ -79,17 +80,25 @@ class GpsPredictor:
     def predict(self, views: Sequence[int]) -> StaticScene:
         pairs = neighbours(self.name, self.views, views)
         loader = ImageLoader(self.views, self.data)
-        images, found = {i: loader[i] for i in views}, []
+        images, found, centers = {i: loader[i] for i in views}, [], []
         for pair in pairs:
-            both = rectified(images[pair.left], images[pair.right], self.model.person_px)
-            found.append(gaussians_of(both, self.network(both)))
-        gaussians = Gaussians.joined(found)
-        kept = gaussians.opacities >= _FAINT
-        for image in images.values():
-            kept &= is_inside(image, gaussians.means)
-        gaussians = gaussians.select(kept)
+            both = images[pair.left], images[pair.right]
+            found.append(self._seen_in(*both))
+            centers.append(torch.cat([image.cameras.centers for image in both]).mean(0))
         background = evaluation_background(self.config.data.background, True)[1]
-        return StaticScene(gaussians=gaussians, options=render_options(self.model), background=background)
+        return StaticScene(
+            gaussians=Gaussians.joined(found),
+            sides=Sides.joined(found, centers) if len(pairs) > 1 else None,
+            options=render_options(self.model),
+            background=background,
+        )
+
+    def _seen_in(self, left: Image, right: Image) -> Gaussians:
+        """Return the surface that two views show, inside both silhouettes."""
+        pair = rectified(left, right, self.model.person_px)
+        gaussians = gaussians_of(pair, self.network(pair))
+        inside = is_inside(left, gaussians.means) & is_inside(right, gaussians.means)
+        return gaussians.select(inside & (gaussians.opacities >= _FAINT))
 
     def run_config(self, views: Sequence[int]) -> Config:
         preset = load_config(packaged_preset("static"), ["data.root=."])

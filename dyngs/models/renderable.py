@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -17,6 +18,7 @@ from dyngs.state import Role, State, fields_moved_to
 
 R = TypeVar("R", bound="Renderable")
 T = TypeVar("T")
+Images = TypeVar("Images", bound="Rendering")
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,13 @@ class Rendering:
     def to(self: T, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> T:
         """Return the same images on another device or in another precision; integers stay integers."""
         return fields_moved_to(self, device, dtype)
+
+
+def joined_renderings(found: Sequence[Images]) -> Images:
+    """Return the images of renderings of the same size, of any number of views each, as one rendering."""
+    first = found[0]
+    parts = {f.name: [getattr(x, f.name) for x in found] for f in fields(first)}
+    return replace(first, **{name: None if x[0] is None else torch.cat(x) for name, x in parts.items()})
 
 
 class TimeStep:

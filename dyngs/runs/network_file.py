@@ -6,6 +6,7 @@ Weights are stored as float16, and the section ``model`` of the configuration wi
 from __future__ import annotations
 
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -18,6 +19,8 @@ from dyngs.runs.checkpoint import info_of
 from dyngs.runs.inputs import inputs_of
 
 SUFFIX = ".safetensors"
+PUBLISHED = "dyngs_people_weights"
+"""Package of weights that are known by a name; packaging/weights makes it."""
 
 _KIND = FileKind("dyngs network", "the weights of a network", 1)
 _ADVICE = "; write it again with `dyngs export NET_RUN --format network`"
@@ -57,3 +60,17 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
         if not config.model.is_network:
             raise ValueError(f"it is of model.kind={config.model.kind}")
     return config, Checkpoint(info, {n: x.float() if x.is_floating_point() else x for n, x in tensors.items()}, path)
+
+
+def published_network(name: str) -> Path:
+    """Return the file of the weights ``name`` in the package of published ones. Raises DyngsError: it is not there."""
+    package = find_spec(PUBLISHED)
+    if package is None:
+        advice = "install the package dyngs-people-weights, see docs/people_network.md, to use published weights"
+        raise DyngsError(f"{name}: no run and no file of weights; give the run of a network, or {advice}")
+    files = {x.stem: x for folder in package.submodule_search_locations or () for x in Path(folder).glob(f"*{SUFFIX}")}
+    if name not in files:
+        raise DyngsError(
+            f"{name}: no run and no file of weights; published are {' and '.join(sorted(files)) or 'none'}"
+        )
+    return files[name]

@@ -12,7 +12,7 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.gaussians.levels import Levels, levels_of
 from dyngs.gaussians.scene import require_gaussians
-from dyngs.models.renderable import Renderable, Rendering, TimeStep
+from dyngs.models.renderable import Renderable, Rendering, TimeStep, joined_renderings
 from dyngs.state import State
 from dyngs.static.scene import StaticScene
 
@@ -36,6 +36,10 @@ class LevelScene(Renderable):
         still = require_gaussians(scene, "the scene")
         if not isinstance(still, StaticScene):
             raise DyngsError("levels of detail are for still scenes; export one time of it as .ply, and take that")
+        if still.sides is not None:
+            raise DyngsError(
+                "levels of detail are for scenes that look the same from all sides; this one has a surface each"
+            )
         gaussians = still.at(None)
         return LevelScene(replace(still, gaussians=gaussians, filter_std=None), levels_of(gaussians), most)
 
@@ -73,9 +77,7 @@ class LevelScene(Renderable):
             one = cameras.select(i)
             seen = self.scene.with_gaussians(self.levels.seen_by(one, self.most).to(device=self.device))
             images.append(seen.render(one, options=options, background=background))
-        depths = [x.depth for x in images if x.depth is not None]
-        rgb, transmittance = (torch.cat([getattr(x, name) for x in images]) for name in ("rgb", "transmittance"))
-        return Rendering(rgb, transmittance, torch.cat(depths) if depths else None)
+        return joined_renderings([Rendering(x.rgb, x.transmittance, x.depth) for x in images])
 
     def state(self) -> State:
         return self.scene.state()

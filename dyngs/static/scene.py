@@ -8,25 +8,32 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyngs.camera import Cameras
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import filter_state, filtered, stored_filter
+from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
-from dyngs.models.renderable import clamped_time
+from dyngs.models.renderable import TimeStep, clamped_time, joined_renderings
 from dyngs.state import State
+from dyngs.static.sides import Sides
 
 
 @dataclass(frozen=True, kw_only=True)
 class StaticScene(GaussianScene):
-    """The same N Gaussians at every time."""
+    """The same N Gaussians at every time; with ``sides`` each camera sees those of the side nearest to it."""
 
     filter_std: Tensor | None = None
+    sides: Sides | None = None
     # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing moves
     seen_at: tuple[float, ...] = ()
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
         return StaticScene(
-            gaussians=gaussians, filter_std=stored_filter(tensors, len(gaussians)), seen_at=stored_times(tensors)
+            gaussians=gaussians,
+            filter_std=stored_filter(tensors, len(gaussians)),
+            sides=Sides.stored(tensors, len(gaussians)),
+            seen_at=stored_times(tensors),
         )
 
     @property
@@ -49,9 +56,31 @@ class StaticScene(GaussianScene):
         """Return the Gaussians, fused with their 3D filter if there is one."""
         return GaussianTimeStep(filtered(self.gaussians, self.filter_std), clamped_time(time))
 
+    def render(
+        self,
+        cameras: Cameras,
+        time: float | TimeStep | None = None,
+        *,
+        options: RenderOptions | None = None,
+        background: Tensor | None = None,
+        probe: Tensor | None = None,
+    ) -> GaussianRendering:
+        if self.sides is None:
+            return super().render(cameras, time, options=options, background=background, probe=probe)
+        now = time if isinstance(time, GaussianTimeStep) else self.time_step(None)
+        cameras, found = cameras.to(device=self.device), []
+        for i in range(len(cameras)):
+            own = GaussianTimeStep(self.sides.seen_by(cameras.select(i), now.gaussians), now.time)
+            behind = background if background is None or background.ndim == 1 else background[i]
+            signal = None if probe is None else probe[i : i + 1]
+            found.append(super().render(cameras.select(i), own, options=options, background=behind, probe=signal))
+        return joined_renderings(found)
+
     def edited(self, edit: TopologyEdit) -> StaticScene:
         std = None if self.filter_std is None else edit.apply(self.filter_std)
-        return replace(self, gaussians=self.gaussians.edited(edit), filter_std=std)
+        sides = None if self.sides is None else self.sides.edited(edit)
+        return replace(self, gaussians=self.gaussians.edited(edit), filter_std=std, sides=sides)
 
     def _model_state(self) -> State:
-        return filter_state(self.filter_std) | times_state(self.seen_at)
+        sides = {} if self.sides is None else self.sides.state()
+        return filter_state(self.filter_std) | times_state(self.seen_at) | sides
