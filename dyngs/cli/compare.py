@@ -1,4 +1,4 @@
-"""``dyngs compare``: several models on one capture, with the same time, steps or size."""
+"""``dyngs compare``: several models on one capture, or networks on people, with the same time, steps, size or views."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ examples:
   dyngs compare scans/bench --models static,mip,static_mcmc --minutes 2       -> compare/bench
   dyngs compare scans/dance --models static,dynamic,mine.yaml --steps 7000 data.longest_side=400
   dyngs compare scans/bench --models static,mip --max-mb 2 --peers published.csv --out study
+  dyngs compare HELD_OUT_PEOPLE --models gps,runs/net --predict 2,3,4    networks that predict people from 2, 3, 4 views
 
 Each model is a preset or a YAML file. An interrupted command continues when it is given again. Details: docs/cli.md.
 """
@@ -36,13 +37,17 @@ def add_parser(commands: args.Commands) -> None:
     )
     parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help="capture with cameras, in any format")
     args.add_overrides(parser, "key=value", "overrides for all models")
-    names = "presets and YAML files, separated by commas"
+    names = "presets and YAML files, or networks that predict people, separated by commas"
     parser.add_argument("--models", type=_names, required=True, metavar="A,B,...", help=names)
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--minutes", type=_positive, metavar="M", help="train each for so many minutes")
     limit.add_argument("--steps", type=args.whole("a number of steps", 1, 10**8), metavar="N", help="or so many steps")
     limit.add_argument("--max-mb", type=_positive, metavar="MB", help="or to a file of at most so many 1e6 bytes")
     parser.add_argument("--out", type=args.output_path, metavar="DIR", help="output folder (default compare/CAPTURE)")
+    predict = "predict each person of a folder of captures from so many views, and compare with views between them"
+    parser.add_argument("--predict", type=_counts, metavar="N,N,...", help=predict)
+    spread = "with --predict: from views evenly around the person, not 30 degrees apart"
+    parser.add_argument("--spread", action="store_true", help=spread)
     peers = "CSV of published or foreign figures: columns model, source, psnr, ..."
     parser.add_argument("--peers", type=args.input_path, metavar="FILE", help=peers)
     kind = args.whole("a number of views", 1, 20)
@@ -60,6 +65,10 @@ def _names(text: str) -> list[str]:
     return names
 
 
+def _counts(text: str) -> list[int]:
+    return [args.whole("a number of views", 1, 100)(part) for part in text.split(",")]
+
+
 def _positive(text: str) -> float:
     try:
         value = float(text)
@@ -72,6 +81,10 @@ def _positive(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Train, compare, print the table and write the report; the folder is locked against other commands."""
+    if arguments.predict is not None:
+        return _predict(arguments)
+    if arguments.spread:
+        raise DyngsError("--spread goes with --predict")
     from dyngs.compare.bench import compare, is_finished, require_same_comparison
     from dyngs.compare.peers import read_peers
     from dyngs.compare.plan import planned
@@ -105,6 +118,33 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"note: {MISSING}")
     if arguments.ray is not None and arguments.minutes is not None:
         print(f"note: {counted(len(results), 'model')} by Ray: the same minutes are less on a slower or busier machine")
+    return 0
+
+
+def _predict(arguments: argparse.Namespace) -> int:
+    """Compare networks that predict people; with --minutes an avatar that is trained on the same images, too."""
+    from dyngs.compare.people import STEM, PeopleBench, compare_people
+    from dyngs.ops.native import kernel_threads
+
+    for option in ("steps", "max_mb", "peers", "ray"):
+        if getattr(arguments, option) is not None:
+            raise DyngsError(f"--{option.replace('_', '-')} does not go with --predict")
+    other = [word for word in arguments.overrides if not word.startswith("data.")]
+    if other:
+        raise DyngsError(f"{other[0]}: networks are compared as they were trained; only data.* can be given")
+    bench = PeopleBench(
+        people=arguments.capture,
+        networks=[Path(name) for name in arguments.models],
+        counts=arguments.predict,
+        spread=arguments.spread,
+        avatar_minutes=arguments.minutes,
+        data=[word.removeprefix("data.") for word in arguments.overrides],
+    )
+    out = arguments.out or Path("compare", Path(os.path.abspath(arguments.capture)).name)
+    with kernel_threads(arguments.threads or 1):  # its times are CPU seconds, of which waiting threads take some
+        head, cells = compare_people(bench, out)
+    print_tables(numbers_table("box of the person on white", head, cells))
+    print(f"written: {out / STEM}.md, .csv and pictures of truth, prediction and error")
     return 0
 
 

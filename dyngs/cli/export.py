@@ -205,10 +205,9 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
 
 
 def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
-    sides = getattr(opened.scene, "sides", None)
-    if sides is not None:
-        line = f"found from {len(sides.toward)} sides, of which dyngs draws the one nearest to the camera; a file shows"
-        args.print_notes((f"{line} all of them at once, less sharply: predict from two views for a sharp one",))
+    if getattr(opened.scene, "sides", None) is not None:
+        line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
+        args.print_notes((line,))
     return opened if arguments.motion is None else opened.in_motion(arguments.motion)
 
 
