@@ -82,6 +82,11 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+def pytest_sessionfinish() -> None:
+    """Compiled modules complain of what is left at the exit."""
+    gc.unfreeze()
+
+
 @pytest.fixture(scope="session")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Empty folders. (Each numbered folder of pytest lists all before it: a minute, for those of all tests.)"""
