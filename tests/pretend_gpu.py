@@ -82,12 +82,14 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) 
     result = func(*map(held, args), **options)
     if not to_gpu:
         return result
-    there = type(result)(map(lies_there, result)) if isinstance(result, list | tuple) else lies_there(result)
+    there = lies_there(result)
     return return_and_correct_aliasing(func, args, kwargs, there) if on_gpu and returns_given(func) else there
 
 
 def lies_there(x: Any) -> Any:
     """A result of an operator, with tensors of the GPU in place of those of the CPU."""
+    if isinstance(x, list | tuple):
+        return type(x)(map(lies_there, x))
     return OnGpu(x) if isinstance(x, Tensor) and not isinstance(x, OnGpu) else x
 
 
