@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import zlib
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
@@ -137,6 +138,13 @@ def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> Lists:
     lists = Lists()
     _add_gaussians(padded, lists, with_rest=with_rest)
     return lists
+
+
+def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes]]:
+    """Yield names and bytes of the files of all blocks, as ``levels.js`` asks for them."""
+    for level, balls in enumerate(levels.blocks):
+        for place in range(len(balls)):
+            yield f"{level}-{place}.bin", block_numbers(levels, (level, place), with_rest=with_rest).deflated()
 
 
 def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:

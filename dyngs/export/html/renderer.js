@@ -171,8 +171,7 @@ class Renderer extends Drawing {
     const { gl, scene } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.deep ? this.target : null);
     gl.viewport(0, 0, ...this.size);
-    gl.clearColor(...scene.background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(this.splat.program);
     gl.uniform1f(this.splat.at("uLeast"), scene.alphaMin);
     gl.enable(gl.BLEND);
