@@ -130,7 +130,7 @@ def test_what_cannot_be_shown_is_one_line_in_its_element(browser: Browser, site:
         assert text != good
         (site / name).write_text(text, encoding="utf-8")
     sources = [*broken, "missing.html", "ftp://x/y.html", ""]
-    parts = [*(part for _, part in broken.values()), "404 Not Found", "web server", 'no src="PAGE"']
+    parts = [*(part for _, part in broken.values()), "answered 404", "web server", 'no src="PAGE"']
     with served(site) as server:
         elements = [f'<dyngs-scene src="{src}"></dyngs-scene>' for src in sources]
         (site / "site.css").write_text("dyngs-scene { width: 80px; height: 8px; }", "utf-8")
