@@ -103,7 +103,7 @@ class DyngsScene extends HTMLElement {
   }
 
   async begin(scene, source) {
-    if (scene.levels && location.protocol === "file:")
+    if ((scene.levels || scene.curves?.chunk) && location.protocol === "file:")
       throw new Error("its parts are fetched, so open it by a web server, such as `python -m http.server`");
     const { canvas, help } = this.parts, changed = () => this.changed();
     const renderer = rendererOf(canvas, scene, source, changed);
@@ -163,7 +163,7 @@ class DyngsScene extends HTMLElement {
     }
     const since = now - (this.last ?? -1e9);
     this.last = now;
-    if (this.running) this.player.advance(Math.min(since, 1000) / 1000);
+    if (this.running && !this.renderer.waits?.(this.player.time)) this.player.advance(Math.min(since, 1000) / 1000);
     const change = since > SLOW ? 0.85 : since < SLOW / 2 ? 1.1 : 1;
     if (since < 500 || this.running) this.coarse = Math.min(Math.max(this.coarse * change, COARSEST), 1);
     this.drawNow(this.coarse);
@@ -240,7 +240,7 @@ class DyngsScene extends HTMLElement {
 function rendererOf(canvas, scene, source, changed) {
   if (scene.segments) return new TriangleRenderer(canvas, scene);
   if (scene.levels) return new LevelRenderer(canvas, scene, source, changed);
-  return new Renderer(canvas, scene, new Motion(scene));
+  return new Renderer(canvas, scene, new Motion(scene, scene.curves?.chunk && new Chunks(scene, source, changed)));
 }
 
 if (!customElements.get("dyngs-scene")) customElements.define("dyngs-scene", DyngsScene);

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from dyngs.export.html.template import script_safe
 
-SCRIPTS = ("fetched.js", "data.js", "motion.js", "sort.js", "drawing.js", "renderer.js", "levels.js", "triangles.js")
-SCRIPTS += ("camera.js", "player.js", "controls.js", "element.js")
+SCRIPTS = ("fetched.js", "data.js", "chunks.js", "motion.js", "sort.js", "drawing.js", "renderer.js", "levels.js")
+SCRIPTS += ("triangles.js", "camera.js", "player.js", "controls.js", "element.js")
 SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
 SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 

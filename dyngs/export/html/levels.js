@@ -86,6 +86,10 @@ class Slots {
     return changed;
   }
 
+  has() {
+    return true;
+  }
+
   seen() {
     return null;
   }

@@ -79,12 +79,12 @@ def write_folder(
 ) -> WrittenPage:
     """Write a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and what is fetched when it is seen.
 
-    That is a still scene in blocks of its levels of detail. ``most``: Gaussians of it that are drawn at most. Others as
-    of ``write_page``. Raises DyngsError: ``most`` of a scene that moves or is not made of Gaussians, or a folder that
-    exists already.
+    That is a still scene in blocks of its levels of detail, and a long motion in chunks of time. ``most``: Gaussians of
+    a still scene that are drawn at most. Others as of ``write_page``. Raises DyngsError: ``most`` of another scene, or
+    a folder that exists already.
     """
     require_new_folder(folder)
-    lists = Lists()
+    lists = Lists(chunked=True)
     if most is not None or isinstance(opened.renderable, StaticScene):
         levelled = LevelScene.of(opened.renderable, most)
         levels, colour = levelled.levels, levelled.scene.colour
@@ -93,7 +93,8 @@ def write_folder(
         header |= _shown(opened, time, *_beginning(opened, views))
         parts = block_files(levels, with_rest=colour is None)
     else:
-        header, parts = _header(opened, time, views, lists), iter(())
+        header = _header(opened, time, views, lists)
+        parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
     text = _assembled(header | {"layout": lists.layout}, lists.text(), _title(opened, title))
     with new_folder(folder) as started:
         write_text(started / PAGE, text)
@@ -214,6 +215,7 @@ def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
     fixed |= {"header": script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
     kind = "triangle" if "texture" in header else "Gaussian"
-    fixed["about"] = counted(header["count"], kind) + ("" if "levels" in header else f", {size / 1e6:.1f} MB")
-    fixed["fetched"] = " connect-src 'self';" if "levels" in header else ""  # nothing, but for blocks
+    fetches = "levels" in header or "chunk" in header.get("curves", {})
+    fixed["about"] = counted(header["count"], kind) + ("" if fetches else f", {size / 1e6:.1f} MB")
+    fixed["fetched"] = " connect-src 'self';" if fetches else ""  # nothing, but for its parts
     return filled(page, fixed)

@@ -23,6 +23,7 @@ from small_triangles import camera as before_triangles
 from dyngs.camera import Cameras
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
+from dyngs.export.html import numbers
 from dyngs.export.html.element import SCRIPTS, SHADERS
 from dyngs.export.html.page import MOST_VIEWS, PAGE, write_folder, write_page
 from dyngs.gaussians import Gaussians
@@ -305,3 +306,36 @@ def settled(page: Page) -> NDArray[np.uint8]:
 
 def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
     return a.shape != b.shape or bool(np.abs(a.astype(int) - b).max() > 40)
+
+
+@needs_browser
+def test_a_long_clip_is_fetched_as_it_is_played(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, view = scene_of_kind("hexplane"), large(onlooker())
+    monkeypatch.setattr(numbers, "CHUNK_BYTES", 60)
+    scene = replace(scene, background=torch.ones(3))
+    written = write_folder(replace(opened_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,))
+    curves = written.header["curves"]
+    count = -(-(curves["points"] - 3) // curves["chunk"])
+    assert count == 8
+    assert len(list((tmp_path / "clip").glob("*.bin"))) == count
+    with served(tmp_path / "clip") as server:
+        server.failing |= {"7.bin": ["503"], "6.bin": ["silent"]}
+        page = browser.open(None, 320, 240)
+        page.driven.emulate_media(reduced_motion="reduce")  # it does not play by itself
+        page.driven.goto(server.address)
+        page.wait_for("window.dyngs !== undefined")
+        page.wait_for("dyngs.renderer.motion.drivers.chunks.held.size === 3")
+        assert not page.evaluate("dyngs.player.playing")
+        assert sorted(name for name in server.asked if name.endswith(".bin")) == ["0.bin", "1.bin", "2.bin"]
+        assert_alike(page, scene, view, scene.options)
+        assert server.asked.count("7.bin") == 2
+        assert page.evaluate("dyngs.renderer.motion.drivers.chunks.held.size") == 6
+        # the picture stands while a part is fetched, and the clock with it
+        page.evaluate("dyngs.release(), dyngs.player.seek(6.5 / 8), dyngs.play()")
+        page.driven.wait_for_timeout(300)
+        assert page.evaluate("dyngs.player.time") == pytest.approx(6.5 / 8)
+        page.wait_for("dyngs.player.time !== 6.5 / 8")
+        assert "6.bin" in server.asked
+        page.close()
