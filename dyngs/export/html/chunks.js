@@ -15,7 +15,8 @@ class Chunks {
   at(number) {
     const lists = this.held.get(number);
     if (lists) this.keep(number, lists);
-    const soon = Array.from({ length: Math.min(AHEAD + 1, this.count) }, (_, i) => (number + i) % this.count);
+    const length = lists ? Math.min(AHEAD + 1, this.count) : 1; // what is played first has the line for itself
+    const soon = Array.from({ length }, (_, i) => (number + i) % this.count);
     this.parts.want(soon.filter((one) => !this.held.has(one)).map((one) => `${one}.bin`));
     return lists;
   }
