@@ -2,8 +2,8 @@
 // or one of their own; then, on a person, the bones of a body. A driver is an affine map for places, and changes of
 // all else.
 
-// Values at `x` of a piece of uniform cubic B-splines: `curves` has `points` control points of `size` values for each of
-// `count`.
+// Values at `x` of a piece of uniform cubic B-splines: `curves` has `points` control points of `size` values for each
+// of `count`.
 function splinesAt(curves, count, points, size, piece, x, values) {
   const y = 1 - x;
   const a = y ** 3 / 6, b = (3 * x ** 3 - 6 * x * x + 4) / 6, c = (3 * y ** 3 - 6 * y * y + 4) / 6, d = x ** 3 / 6;
@@ -49,7 +49,8 @@ class Drivers {
   at(time) {
     const { pieces, chunk } = this, place = Math.min(Math.max(time, 0), 1) * pieces;
     const piece = Math.min(Math.floor(place), pieces - 1), number = Math.floor(piece / chunk);
-    return { piece: piece - number * chunk, x: place - piece, lists: this.chunks ? this.chunks.at(number) : this.lists };
+    const lists = this.chunks ? this.chunks.at(number) : this.lists;
+    return { piece: piece - number * chunk, x: place - piece, lists };
   }
 
   update(time) {
