@@ -446,7 +446,7 @@ def _export_page(arguments: argparse.Namespace) -> int:
     from dyngs.runs.opened import open_scene
 
     source: Path = arguments.run_dir
-    most, folder = arguments.max_gaussians_drawn, arguments.folder
+    most, folder, time = arguments.max_gaussians_drawn, arguments.folder, arguments.time or 0.0
     if most is not None and not folder:
         raise DyngsError("--max-gaussians-drawn goes with --folder")
     if arguments.out is None and not source.is_dir():
@@ -459,11 +459,10 @@ def _export_page(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
     opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
-    time = arguments.time or 0.0
     written = write_folder(opened, out, most=most, time=time) if folder else write_page(opened, out, time=time)
-    where = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
-    where = where if folder else "it plays in any browser with WebGL 2, offline"
+    served = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
     args.print_notes(written.notes)
+    where = served if folder else "it plays in any browser with WebGL 2, offline"
     print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); {where}")
     return 0
 
