@@ -242,7 +242,7 @@ def write_fitted_capture(
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
-    Files: ``transforms_SPLIT.json``, ``images/`` and found ``masks/`` (else it is for ``data.body``), ``body_train.npz``,
+    Files: ``transforms_SPLIT.json``, ``images/`` and found ``masks/`` (else for ``data.body``), ``body_train.npz``,
     ``body_pose.npz`` for another clip, ``fit_report.json``, and ``fit_overlays.png`` to look at. Raises DyngsError: see
     ``fit_capture``; ``out`` is not empty.
     """
