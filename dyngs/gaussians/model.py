@@ -24,7 +24,7 @@ from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_option
 from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rates_of
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.model import Drawn, Loss, Model, Updated
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.adam import Count
@@ -38,9 +38,11 @@ class SceneTraining(Generic[S]):
 
     Attributes:
         moves_by: name of what moves the Gaussians and the configuration section of its learning rates, for messages.
+        colour_loss: how colours are compared with true ones; None: by L1 and D-SSIM.
     """
 
     moves_by: tuple[str, str] = ("", "")
+    colour_loss: Loss | None = None
 
     def trains_on(self, time: float | None, step: int) -> bool:
         return True
@@ -181,6 +183,10 @@ class GaussianModel(Model[GaussianScene]):
 
         moved = now.gaussians.tensors() if scene.num_moving else {}
         return Drawn(rendering, now.penalties, moved, after_backward)
+
+    @property
+    def colour_loss(self) -> Loss | None:
+        return self.training.colour_loss
 
     def regularizers(self) -> Mapping[str, Tensor]:
         now = self._scene.gaussians

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.data.capture import Lens, PointCloud, Split, VideoFrame, View
+from dyngs.data.capture import Lens, PointCloud, Silhouette, Split, VideoFrame, View
 from dyngs.data.geometry import (
     MAX_SIDE,
     cam_from_opengl,
@@ -158,6 +158,7 @@ def _view(
     matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
     pose, error = checked_pose(matrix, frame.where)
     masks = [_named_file(root, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
+    silhouette = _named_file(root, frame, "silhouette_path")
     camera = frame.integer("camera")
     view = View(
         name=view_name(path, root),
@@ -172,6 +173,7 @@ def _view(
         time=_number(frame.own.get("time"), "time", frame.where),
         frame=frame.integer("frame"),
         video=frame.video,
+        silhouette=None if silhouette is None else Silhouette(silhouette, "white"),
         depth_path=_named_file(root, frame, "depth_file_path"),
         motion_mask_path=masks[0] or masks[1],
         motion_mask_labels=masks[0] is None and masks[1] is not None,

@@ -14,6 +14,7 @@ from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of
 from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_texels
 from dyngs.human.avatar.observations import Subject, in_colours_of
+from dyngs.human.avatar.outlines import outline_loss
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
@@ -46,7 +47,8 @@ def start(run: RunStart) -> GaussianModel:
     filmed = run.capture.splits["train"]
     cameras = training_cameras(filmed, config.data)
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
-    training = HumanTraining(model, subject.motion.frames, rates_of(config), views)
+    outlines = None if colours.network is not None else outline_loss(run)
+    training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines)
     lit = model.light and model.refine and colours.network is None
     scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
     return GaussianModel(run, scene, training, densifier_of(run), colours)

@@ -138,10 +138,8 @@ def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: floa
     neighbours. ``weights`` (N, J) are the template's; ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) in
     [0, 1].
     """
-    other, is_image = mirror_images(anchors, middle)
-    borrowed = (1 - trust) * trust[other] * is_image * MIRRORED
-    known = trust + borrowed
-    fraction = (borrowed / known.clamp_min(_OWN))[:, None]
+    other, mixed, known = mirrored_trust(anchors, middle, trust)
+    fraction = mixed[:, None]
     away = gaussians.means - anchors.points
     flipped = away[other] * away.new_tensor([-1.0, 1.0, 1.0])
     opacity = gaussians.logit_opacities[:, None]
@@ -154,6 +152,17 @@ def filled(gaussians: Gaussians, anchors: Anchors, weights: Tensor, middle: floa
         "means": anchors.points + torch.lerp(away, flipped, fraction),
         "logit_opacities": torch.lerp(opacity, opacity[other], fraction)[:, 0],
     }
+
+
+def mirrored_trust(anchors: Anchors, middle: float, trust: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return rows (N,) of the mirror images, the fractions (N,) to mix of their values, and trust (N,) in the mixture.
+
+    ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) is that in own values.
+    """
+    other, is_image = mirror_images(anchors, middle)
+    borrowed = (1 - trust) * trust[other] * is_image * MIRRORED
+    known = trust + borrowed
+    return other, borrowed / known.clamp_min(_OWN), known
 
 
 def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from dyngs.conventions import SH_C0
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors, skinning_weights
+from dyngs.human.avatar.neighbours import mirrored_trust, smoothed, trust_in
 from dyngs.human.avatar.posing import BodyPose, PoseBlendShapes, Skeleton, frame_pose, rest_offsets
 from dyngs.human.motion.motion import CapturedMotion
 from dyngs.human.pose.skinning import apply_transforms, blend_transforms, joint_transforms
@@ -24,11 +25,11 @@ FACING_EXPONENT = 4
 @torch.no_grad()
 def observed_colours(
     normals: Tensor, weights: Tensor, skeleton: Skeleton, shown: Iterable[tuple[Image, BodyPose, Tensor]]
-) -> Tensor:
-    """Return the mean colours (N, 3) of points of a body in images, weighted to frontal views; grey if none faces it.
+) -> tuple[Tensor, Tensor]:
+    """Return mean colours (N, 3) of points of a body in images, weighted to frontal views, and sums (N,) of weights.
 
-    Occlusion is ignored. ``normals`` (N, 3) are at rest, ``weights`` (N, J) skin; ``shown`` are images, body poses, and
-    the points (N, 3) at rest for each pose.
+    Points that no image faces are grey. Occlusion is ignored. ``normals`` (N, 3) are at rest, ``weights`` (N, J) skin;
+    ``shown`` are images, body poses, and the points (N, 3) at rest for each pose.
     """
     count, device = len(normals), normals.device
     colour, weight = torch.zeros(count, 3, device=device), torch.zeros(count, device=device)
@@ -43,7 +44,7 @@ def observed_colours(
         colour += facing[:, None] * in_frame[:, None] * image.rgb_premultiplied[row, column]
         weight += facing * covered
     seen = weight > 1e-3
-    return torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5).clamp(0, 1)
+    return torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5).clamp(0, 1), weight
 
 
 def project_points(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
@@ -79,7 +80,8 @@ class Subject:
 def in_colours_of(gaussians: Gaussians, normals: Tensor, subject: Subject, images: Iterable[Image]) -> Gaussians:
     """Return the first Gaussians, on the texels of ``subject``, in the colours of some images.
 
-    ``normals`` (N, 3) are those of the surface at rest.
+    What these do not face gets colours of the other side of the body and from around it. ``normals`` (N, 3) are those
+    of the surface at rest.
     """
     anchors, rows = subject.anchors, subject.motion.rows
 
@@ -91,5 +93,9 @@ def in_colours_of(gaussians: Gaussians, normals: Tensor, subject: Subject, image
 
     sh = gaussians.sh.clone()
     weights = skinning_weights(anchors, len(subject.skeleton.joints))
-    sh[:, 0] = (observed_colours(normals, weights, subject.skeleton, shown()) - 0.5) / SH_C0
+    colours, seen = observed_colours(normals, weights, subject.skeleton, shown())
+    middle, trust = float(subject.skeleton.joints[0, 0]), trust_in(seen)
+    other, fraction, known = mirrored_trust(anchors, middle, trust)
+    colours = smoothed(torch.lerp(colours, colours[other], fraction[:, None]), known, anchors, weights)
+    sh[:, 0] = (colours - 0.5) / SH_C0
     return gaussians.replace(sh=sh)

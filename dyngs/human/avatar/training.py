@@ -20,6 +20,7 @@ from dyngs.gaussians.schedule import Rates
 from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
 from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
 from dyngs.human.avatar.observations import Subject
+from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.ops.adam import Count
@@ -37,15 +38,22 @@ WORTH_TELLING = 0.01  # least fraction of Gaussians that are hardly seen at whic
 class HumanTraining(SceneTraining[HumanScene]):
     """See ``SceneTraining``; ``frames`` are numbers of the rows of the clip of training, ``rates`` say how rates fall.
 
-    ``views`` are camera and frame of the training views; without any, what they do not show is not filled.
+    ``views`` are camera and frame of the training views; without any, what they do not show is not filled. ``outlines``
+    is how colours are compared near the outlines of found masks.
     """
 
     moves_by = ("pose", "model")
 
     def __init__(
-        self, options: HumanModel, frames: Sequence[int], rates: Rates, views: Sequence[tuple[Cameras, int]] = ()
+        self,
+        options: HumanModel,
+        frames: Sequence[int],
+        rates: Rates,
+        views: Sequence[tuple[Cameras, int]] = (),
+        outlines: OutlineLoss | None = None,
     ) -> None:
-        self.options, self.rates, self.views = options, rates, views
+        self.options, self.rates, self.views, self.colour_loss = options, rates, views, outlines
+        self._finding = None if outlines is None else outlines.finding
         self.refines_from = round(options.refine_from * rates.steps)
         self.frames_from = round(FRAMES_FROM * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
@@ -101,7 +109,12 @@ class HumanTraining(SceneTraining[HumanScene]):
         return scene.learned.leaves
 
     def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
-        """Return the scene as it is, and after the last step new values for what the images hardly show."""
+        """Return the scene as it is, and after the last step new values for what the images hardly show.
+
+        After the first step with a line about outlines, if there is one.
+        """
+        if step == 1 and self._finding is not None:
+            return scene, EditResult(None, finding=self._finding)
         if step != self.rates.steps or not self.options.fill_unseen or not self.views or not len(scene):
             return None
         shown = [self.views[i] for i in evenly_spaced(len(self.views), LOOKS)]

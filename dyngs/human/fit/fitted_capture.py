@@ -143,23 +143,32 @@ def write_body(
 
 
 def write_split(
-    out: Path, split: Split, shown: Iterator[tuple[View, Image]], rows: Mapping[int, int], world_offset: np.ndarray
+    out: Path, split: Split, shown: Iterator[tuple[View, Image, Image]], rows: Mapping[int, int], offset: np.ndarray
 ) -> None:
     """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
 
-    ``rows`` maps frame numbers to rows of the body parameters; ``world_offset`` (3,) is added to all positions.
+    Where masks are files beside the images, they stay so (``silhouette_path``).
+
+    Args:
+        shown: views with their images, and with these as they are without such masks.
+        rows: frame numbers to rows of the body parameters.
+        offset: (3,) added to all positions.
     """
     frames: list[dict[str, object]] = []
-    for view, image in shown:
+    for view, image, photo in shown:
         row = rows[-1 if view.frame is None else view.frame]
-        name = f"images/{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
-        parts = [image.rgb_premultiplied] + ([] if image.alpha is None else [image.alpha[..., None]])
+        stem = f"{split}/f{row:04d}_c{view.camera_id:02d}_{len(frames):05d}.png"
+        name, mask = f"images/{stem}", f"masks/{stem}"
+        parts = [photo.rgb_premultiplied] + ([] if photo.alpha is None else [photo.alpha[..., None]])
         write_image(out / name, straight_uint8(torch.cat(parts, dim=-1)).numpy())
+        if view.silhouette is not None and image.alpha is not None:
+            write_image(out / mask, straight_uint8(image.alpha[..., None]).numpy())
         camera = image.cameras
         intrinsics = camera.intrinsics[0].double().numpy()
         pose = opengl_from_cam(view.cam_from_world).copy()
-        pose[:3, 3] += world_offset
+        pose[:3, 3] += offset
         entry: dict[str, object] = {"file_path": name, "frame": row, "camera": view.camera_id}
+        entry |= {} if view.silhouette is None else {"silhouette_path": mask}
         entry |= {} if view.time is None else {"time": view.time}
         entry |= {"w": camera.width, "h": camera.height, "fl_x": intrinsics[0, 0], "fl_y": intrinsics[1, 1]}
         frames.append(entry | {"cx": intrinsics[0, 2], "cy": intrinsics[1, 2], "transform_matrix": pose.tolist()})
@@ -233,7 +242,7 @@ def write_fitted_capture(
 ) -> FittedCapture:
     """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
-    Files: ``transforms_SPLIT.json`` and ``images/`` (without both it is for ``data.body``), ``body_train.npz``,
+    Files: ``transforms_SPLIT.json``, ``images/`` and found ``masks/`` (else for ``data.body``), ``body_train.npz``,
     ``body_pose.npz`` for another clip, ``fit_report.json``, and ``fit_overlays.png`` to look at. Raises DyngsError: see
     ``fit_capture``; ``out`` is not empty.
     """
@@ -265,8 +274,8 @@ def write_fitted_capture(
             for split, views in capture.splits.items():
                 if not views:
                     continue
-                images, rows = ImageLoader(views, full), clips.get(split, clips["train"]).rows
-                shown = ((view, images[i]) for i, view in enumerate(views))
+                rows, photos = clips.get(split, clips["train"]).rows, [replace(x, silhouette=None) for x in views]
+                shown = zip(views, _in_order(views, full), _in_order(photos, full), strict=True)
                 write_split(folder, split, shown, rows, capture.world_offset)
             clips = {split: replace(clip, frames=tuple(range(len(clip.frames)))) for split, clip in clips.items()}
         for split, clip in clips.items():
@@ -280,6 +289,11 @@ def write_fitted_capture(
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return FittedCapture(out, found, new_poses, tuple(by_avatar.values()))
+
+
+def _in_order(views: Sequence[View], options: DataConfig) -> Iterator[Image]:
+    images = ImageLoader(views, options.model_copy(update={"cache_mb": 0}))
+    return (images[i] for i in range(len(images)))
 
 
 def _overlays(capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit) -> np.ndarray:

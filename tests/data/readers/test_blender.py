@@ -12,7 +12,7 @@ from tiny_captures import edit_json, opengl_pose, pixel_of, random_pixels, write
 
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
-from dyngs.data.capture import BodyFrames, Capture, Lens, View
+from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.readers.blender import BODY_FORMAT, FORMAT, read_blender, read_body_json, read_nerfstudio
@@ -232,11 +232,12 @@ def test_val_list_alone_is_what_is_held_out(nerfstudio_root: Path) -> None:
 
 
 def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
-    change = {"file_path": "images\\03.jpg", "mask_path": "masks/03.png"}
+    change = {"file_path": "images\\03.jpg", "mask_path": "masks/03.png", "silhouette_path": "masks/a.png"}
     edit_json(nerfstudio_root / "transforms.json", lambda c: c["frames"][3].update(change))
     view = read_nerfstudio(nerfstudio_root).splits["train"][3]
     assert view.name == "images/03"
     assert view.mask_path == nerfstudio_root / "masks/03.png"
+    assert view.silhouette == Silhouette(nerfstudio_root / "masks/a.png", "white")
 
 
 @pytest.mark.parametrize("width", [24, 6])

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dyngs.config import DataConfig
+from dyngs.data.images.images import read_image
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.data.readers.transforms import read_frame_file, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
 from dyngs.human.fit import fitted_capture
@@ -19,6 +24,7 @@ from dyngs.human.fit.fitted_capture import (
     with_fitted_body,
     with_lens,
     write_fitted_capture,
+    write_split,
 )
 from dyngs.human.fit.solve import LensFit
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -107,6 +113,24 @@ def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
     assert capture.has_alpha
     assert [view.name for view in capture.splits["train"]] == [f"f{i:02d}" for i in range(2, 12)]
     assert any("2 frames in which hardly anybody is seen are left out, first f00" in line for line in said)
+
+
+def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
+    capture = read_person(DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", lambda _: None)
+    views = capture.splits["train"]
+    images, photos = ImageLoader(views), ImageLoader([replace(view, silhouette=None) for view in views])
+    shown = ((view, images[i], photos[i]) for i, view in enumerate(views))
+    rows = {view.frame: row for row, view in enumerate(views) if view.frame is not None}
+    write_split(tmp_path / "out", "train", shown, rows, np.zeros(3))
+    found, _ = read_views(read_frame_file(tmp_path / "out/transforms_train.json"))
+    assert len(found) == len(views)
+    for i, view in enumerate(found.values()):
+        assert np.array_equal(read_image(view.image_path), read_image(views[i].image_path))
+        alpha, before = ImageLoader([view])[0].alpha, images[i].alpha
+        assert alpha is not None
+        assert before is not None
+        assert torch.equal(alpha, before)
+        assert 0 < float(alpha.mean()) < 0.5
 
 
 def test_a_refined_lens_moves_the_cameras(tmp_path: Path) -> None:

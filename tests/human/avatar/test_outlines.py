@@ -1,0 +1,114 @@
+"""Colours near the outlines of found masks: what is behind the person is found, and decides instead of the mask."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dyngs.config import Config, DataConfig, HumanModel, TrainConfig
+from dyngs.data.capture import Capture, Silhouette, View
+from dyngs.data.loader import ImageLoader
+from dyngs.files.write import write_image
+from dyngs.human.avatar.outlines import OutlineLoss, outline_loss
+from dyngs.models.kind import RunStart
+from dyngs.models.model import Drawn, Look
+from dyngs.models.renderable import Rendering
+
+SIDE, FRAMES, RED = 40, 9, (200.0, 20.0, 20.0)
+GENERATOR = torch.Generator()
+
+
+def behind() -> np.ndarray:
+    """What stands behind the person (H, W, 3), grey levels."""
+    return np.random.default_rng(3).integers(40, 160, (SIDE, SIDE, 3)).astype(np.float64)
+
+
+def person(frame: int, grown: int = 0) -> np.ndarray:
+    """Return where (H, W) a red square is in a frame, larger by ``grown`` px on all sides."""
+    inside = np.zeros((SIDE, SIDE), bool)
+    left = 4 + 3 * frame
+    inside[10 - grown : 26 + grown, left - grown : left + 8 + grown] = True
+    return inside
+
+
+def views(folder: Path, grown: int, light: float = 0.0) -> list[View]:
+    """Return views of the square, whose masks are too large by ``grown`` px; ``light`` grey levels come every frame."""
+    found = []
+    for frame in range(FRAMES):
+        photo = np.where(person(frame)[..., None], RED, behind() + light * frame)
+        image, mask = folder / f"{frame}.png", folder / f"m{frame}.png"
+        write_image(image, photo.clip(0, 255).round().astype(np.uint8))
+        write_image(mask, (255 * person(frame, grown)).astype(np.uint8))
+        pose, intrinsics = np.eye(4), np.array([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
+        view = View(f"{frame}", image, pose, intrinsics, SIDE, SIDE, time=frame / 8, frame=frame)
+        found.append(replace(view, silhouette=Silhouette(mask, "white")))
+    return found
+
+
+def run(seen: list[View], background: str = "white", **train: Any) -> RunStart:
+    config = Config(data=DataConfig(root=Path()), model=HumanModel(), train=TrainConfig(**train))
+    capture, images = Capture(Path(), "body_json", {"train": tuple(seen)}, has_alpha=True), ImageLoader(seen)
+    return RunStart(config, config, capture, images, background, 1.0, GENERATOR)
+
+
+def loss_of(loss: OutlineLoss, seen: list[View], frame: int, alpha: Tensor, rgb: Tensor) -> Tensor:
+    """Return the loss of a render with opacity (H, W) and colours (H, W, 3) before white."""
+    image = ImageLoader(seen)[frame]
+    rendered = alpha[..., None] * rgb + 1 - alpha[..., None]
+    drawn = Drawn(Rendering(rendered[None], 1 - alpha[None], None), {}, {}, lambda: None)
+    look = Look(frame, 1, image, drawn, rendered, image.composite(torch.ones(3)), cast(Any, None), GENERATOR)
+    return loss(look)["image"]
+
+
+@pytest.mark.parametrize("grown", [-1, 1])
+def test_the_true_person_costs_least_though_the_mask_is_wrong(tmp_path: Path, grown: int) -> None:
+    seen = views(tmp_path, grown)
+    loss = outline_loss(run(seen))
+    assert loss is not None
+    alpha, rgb = torch.from_numpy(person(2)).float(), torch.tensor(RED).expand(SIDE, SIDE, 3) / 255
+    assert float(loss_of(loss, seen, 2, alpha, rgb)) < 1e-3
+    cut_out = torch.from_numpy(person(2, grown)).float()
+    assert float(loss_of(loss, seen, 2, cut_out, rgb)) > 5e-3
+
+
+def test_the_opacity_is_moved_towards_the_true_one(tmp_path: Path) -> None:
+    """Of a pixel that the mask has and the person does not, opacity falls; far from the mask nothing is asked."""
+    seen = views(tmp_path, 1)
+    loss = outline_loss(run(seen))
+    assert loss is not None
+    alpha = (torch.from_numpy(person(2, 1)).float() * 0.9).requires_grad_()
+    loss_of(loss, seen, 2, alpha, torch.tensor(RED).expand(SIDE, SIDE, 3) / 255).backward()
+    assert alpha.grad is not None
+    rim = torch.from_numpy(person(2, 1) & ~person(2))
+    assert float(alpha.grad[rim].mean()) > 0 > float(alpha.grad[torch.from_numpy(person(2, -2))].mean())
+
+
+def test_a_line_says_how_much_is_known(tmp_path: Path) -> None:
+    loss = outline_loss(run(views(tmp_path, 1)))
+    assert loss is not None
+    assert "100% of the pixels at their outlines" in loss.finding
+
+
+@pytest.mark.parametrize("case", ["moving camera", "one frame", "alpha", "light", "random", "exposure", "no mask"])
+def test_masks_decide_where_nothing_is_known_behind_them(tmp_path: Path, case: str) -> None:
+    seen, background, train = views(tmp_path, 1, light=20.0 if case == "light" else 0.0), "white", {}
+    if case == "moving camera":
+        seen = [replace(x, cam_from_world=x.cam_from_world + 0.01 * i * np.eye(4)[3]) for i, x in enumerate(seen)]
+    elif case == "one frame":
+        seen = seen[:1]
+    elif case == "alpha":
+        for view in seen:
+            write_image(view.image_path, np.full((SIDE, SIDE, 4), 128, np.uint8))
+    elif case == "random":
+        background = "random"
+    elif case == "exposure":
+        train = {"exposure": "always"}
+    elif case == "no mask":
+        seen[0] = replace(seen[0], silhouette=None)
+    assert outline_loss(run(seen, background, **train)) is None
