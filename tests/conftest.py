@@ -11,6 +11,7 @@ What it finds becomes an ``@example`` of its test.
 
 from __future__ import annotations
 
+import gc
 import os
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # `pytest -n 2`: processes share the cores, their threads would fight for them
@@ -19,6 +20,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # `pytest -n 2`: processes share the co
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
+from itertools import count as numbers
 from pathlib import Path
 
 import pytest
@@ -69,12 +71,47 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             test._hypothesis_internal_use_settings = settings(own, max_examples=factor * own.max_examples)
 
 
+def pytest_collection() -> None:
+    """Modules and tests are no garbage: to look for it among them takes a third of the collection."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is looked for, among what the tests make."""
+    gc.freeze()
+    gc.enable()
+
+
+def pytest_sessionfinish() -> None:
+    """Compiled modules complain of what is left at the exit."""
+    gc.unfreeze()
+
+
+@pytest.fixture(scope="session")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Empty folders. (Each numbered folder of pytest lists all before it: a minute, for those of all tests.)"""
+    base = tmp_path_factory.mktemp("tests")
+
+    def made(number: int) -> Path:
+        folder = base / f"t{number}"
+        folder.mkdir()
+        return folder
+
+    return map(made, numbers())
+
+
+@pytest.fixture
+def tmp_path(folders: Iterator[Path]) -> Path:
+    """A folder of this test alone."""
+    return next(folders)
+
+
 @pytest.fixture(autouse=True)
-def empty_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+def empty_folder(folders: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test runs in an empty folder, as a user would: nothing is left in the checkout, and processes that a test
     starts import the installed package, not the sources beside them. The user's cache is another empty folder."""
-    monkeypatch.chdir(tmp_path_factory.mktemp("empty"))
-    monkeypatch.setenv("DYNGS_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+    monkeypatch.chdir(next(folders))
+    monkeypatch.setenv("DYNGS_CACHE_DIR", str(next(folders)))
 
 
 @pytest.fixture(autouse=True)

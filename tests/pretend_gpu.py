@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
-from torch.utils._pytree import tree_flatten, tree_map
 
 aten: Any = torch.ops.aten
 GPU = torch.device("meta")
@@ -67,27 +67,43 @@ class OnGpu(Tensor):
 
 def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) -> Any:
     """The result of an operator, on the device where torch would put it."""
+    each = (y for x in (*args, *kwargs.values()) for y in (x if isinstance(x, list | tuple) else (x,)))
+    given = [x for x in each if isinstance(x, Tensor)]
+    on_gpu, device = any(isinstance(x, OnGpu) for x in given), kwargs.get("device")
+    to_gpu = on_gpu if device is None else torch.device(device) == GPU
+    if not on_gpu and not to_gpu:
+        return func(*args, **kwargs)
     packet = func.overloadpacket
-    given = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
-    on_gpu = any(isinstance(x, OnGpu) for x in given)
     both = on_gpu and any(not isinstance(x, OnGpu) and x.ndim > 0 for x in given)
     if both and (packet not in TAKES_BOTH or not (isinstance(args[0], OnGpu) or packet is aten.copy_)):
-        shapes = [(str(x.device), tuple(x.shape)) for x in given]
-        raise MixedDevices(f"{func}: {shapes}")
-    device = kwargs.get("device")
-    if device is not None:
-        kwargs = {**kwargs, "device": torch.device("cpu")}
-    to_gpu = on_gpu if device is None else torch.device(device) == GPU
+        raise MixedDevices(f"{func}: {[(str(x.device), tuple(x.shape)) for x in given]}")
     note(packet, args, kwargs, on_gpu, to_gpu, waits)
-
-    def taken(x: Any) -> Any:
-        return x.held if isinstance(x, OnGpu) else x
-
-    result = func(*tree_map(taken, args), **tree_map(taken, kwargs))
+    options = {name: torch.device("cpu") if name == "device" else held(x) for name, x in kwargs.items()}
+    result = func(*map(held, args), **options)
     if not to_gpu:
         return result
-    wrapped = tree_map(lambda x: OnGpu(x) if isinstance(x, Tensor) and not isinstance(x, OnGpu) else x, result)
-    return return_and_correct_aliasing(func, args, kwargs, wrapped) if on_gpu else wrapped
+    there = lies_there(result)
+    return return_and_correct_aliasing(func, args, kwargs, there) if on_gpu and returns_given(func) else there
+
+
+def lies_there(x: Any) -> Any:
+    """A result of an operator, with tensors of the GPU in place of those of the CPU."""
+    if isinstance(x, list | tuple):
+        return type(x)(map(lies_there, x))
+    return OnGpu(x) if isinstance(x, Tensor) and not isinstance(x, OnGpu) else x
+
+
+@cache
+def returns_given(func: Any) -> bool:
+    """Whether what an operator returns is, or lies in, what it was given."""
+    return any(x.alias_info is not None for x in func._schema.returns)
+
+
+def held(x: Any) -> Any:
+    """An argument of an operator, with tensors of the CPU in place of those of the GPU."""
+    if isinstance(x, OnGpu):
+        return x.held
+    return [held(y) for y in x] if isinstance(x, list | tuple) else x
 
 
 def note(packet: Any, args: Any, kwargs: dict[str, Any], on_gpu: bool, to_gpu: bool, waits: Counter[str]) -> None:

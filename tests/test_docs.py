@@ -13,6 +13,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,7 @@ from dyngs.errors import DyngsError
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"`([^`\n]*)`")
 SHELL, PYTHON, OUTLINE = ("bash", "sh"), ("python",), ("", "text")
 
 RUN_PAGES = (
@@ -145,7 +147,8 @@ def parsed(monkeypatch: pytest.MonkeyPatch) -> list[argparse.Namespace]:
     return found
 
 
-def require_overrides(overrides: list[str]) -> None:
+@cache
+def require_overrides(*overrides: str) -> None:
     """Nothing, if some kind of run takes these ``key=value``. Raises DyngsError otherwise."""
     errors = []
     for preset in PRESETS:
@@ -180,20 +183,22 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
         if is_config:
             load_config(Path(arguments.target), overrides)
     elif overrides:
-        require_overrides(overrides)
+        require_overrides(*overrides)
     if getattr(arguments, "times", None) is not None:
         parse_times(arguments.times)
     if getattr(arguments, "path", None) is not None and command.verb == "render":
         path_file(arguments.path)
 
 
-@pytest.mark.parametrize("command", commands(), ids=str)
 def test_every_command_is_parsed_with_its_configuration(
-    command: Command, parsed: list[argparse.Namespace], capsys: pytest.CaptureFixture[str]
+    parsed: list[argparse.Namespace], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code = main(list(command.words))
-    assert code == 0, capsys.readouterr().err
-    require_sound(command, parsed[0])
+    for command in {x.words: x for x in commands()}.values():
+        assert main(list(command.words)) == 0, f"{command}\n{capsys.readouterr().err}"
+        try:
+            require_sound(command, parsed[-1])
+        except DyngsError as error:
+            pytest.fail(f"{command}\n{error}")
 
 
 @pytest.mark.parametrize(
@@ -229,7 +234,8 @@ def test_other_programs_are_known_and_their_options_there() -> None:
 # ------------------------------------------------------------------------------------------ in sentences and outlines
 
 
-def options_of(verb: list[str]) -> set[str]:
+@cache
+def options_of(*verb: str) -> set[str]:
     """The options of a command and of the commands below it."""
     parser: argparse.ArgumentParser = make_parser()
     found: set[str] = set()
@@ -250,43 +256,49 @@ def mentions(page: Path) -> Iterator[str]:
         yield from (line.lstrip("$ ") for line in block.splitlines() if re.match(r"(\$ )?dyngs ", line))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_in_sentences_have_the_options_that_they_name(page: Path) -> None:
+def test_commands_in_sentences_have_the_options_that_they_name() -> None:
     verbs = next(a.choices for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
     assert verbs is not None
-    for mention in mentions(page):
+    for page, mention in ((x, mention) for x in PAGES for mention in mentions(x)):
         words = mention.split()
         if mention in NOT_COMMANDS or words[1].startswith("-"):
             continue
         assert words[1] in verbs, f"{page.name}: `{mention}`: no such command"
         for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", mention):
-            assert option in options_of(words[1:3]), f"{page.name}: `{mention}`: no option {option}"
+            assert option in options_of(*words[1:3]), f"{page.name}: `{mention}`: no option {option}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_keys_in_sentences_are_keys_of_the_configuration(page: Path) -> None:
+def test_keys_in_sentences_are_keys_of_the_configuration() -> None:
     keys = {key.name for key in config_keys()}
-    for code in re.findall(r"`([^`\n]*)`", BLOCK.sub("", page.read_text(encoding="utf-8"))):
+    found = [(x.name, code) for x in PAGES for code in CODE.findall(BLOCK.sub("", x.read_text(encoding="utf-8")))]
+    for page, code in found:
         words = [word for word in code.split() if re.fullmatch(r"[a-z]\w*(\.[a-z]\w*)+=\S+", word)]
         for word in words:
             name = word.partition("=")[0]
-            assert name in keys or name == "section.key", f"{page.name}: `{code}`: no key {name}"
+            assert name in keys or name == "section.key", f"{page}: `{code}`: no key {name}"
         whole = [word for word in words if not PLACEHOLDER.search(word.partition("=")[2])]
-        if whole:
-            require_overrides(whole)
+        try:
+            require_overrides(*whole)
+        except DyngsError as error:
+            pytest.fail(f"{page}: `{code}`: {error}")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_files_and_places_that_a_page_names_are_there(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    for name in re.findall(r"`((?:dyngs|tests|csrc|benchmarks|examples)/[\w/.]+)`", text):
-        assert (ROOT / name).exists(), f"{page.name}: there is no {name}"
-    for file, place in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
-        target = page.parent / file if file else page
-        assert target.exists(), f"{page.name}: there is no {file}"
-        titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE) if place else []
-        places = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
-        assert not place or place in places, f"{page.name}: {file} has no section {place}"
+def test_files_and_places_that_a_page_names_are_there() -> None:
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for name in re.findall(r"`((?:dyngs|tests|csrc|benchmarks|examples)/[\w/.]+)`", text):
+            assert (ROOT / name).exists(), f"{page.name}: there is no {name}"
+        for file, place in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
+            target = page.parent / file if file else page
+            assert target.exists(), f"{page.name}: there is no {file}"
+            assert not place or place in places_of(target), f"{page.name}: {file} has no section {place}"
+
+
+@cache
+def places_of(page: Path) -> set[str]:
+    """What a link to a section of the page may name."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 # ------------------------------------------------------------------------------------------------------- really run

@@ -193,15 +193,44 @@ def test_every_tensor_is_made_on_a_named_device(nodes: dict[str, list[ast.AST]])
     assert found == []
 
 
-@pytest.mark.parametrize("path", TEST_FILES, ids=relative)
-def test_every_test_file_mirrors_a_source_file(path: Path) -> None:
-    if path.name in WITHOUT_MIRROR:
-        return
-    below = path.relative_to(ROOT / "tests")
-    name = path.stem.removeprefix("test_")
-    folder = ROOT / "dyngs" / below.parent
-    candidates = [folder / f"{name}.py", folder / name / "__init__.py"]
-    assert any(f.is_file() for f in candidates), f"no {candidates[0].relative_to(ROOT)} beside {below}"
+def test_what_other_systems_lack_is_not_relied_on(
+    nodes: dict[str, list[ast.AST]], trees: dict[str, ast.Module]
+) -> None:
+    """Windows: modules of POSIX are imported where they may be missing, names below a folder are written with slashes,
+    and only where /proc is a process forks; nothing makes symbolic links, for which a user needs rights there."""
+    found = []
+    for file, tree in trees.items():
+        imported = [y.name for x in tree.body if isinstance(x, ast.Import) for y in x.names]
+        found += [f"{file}: {name}" for name in ({"fcntl", "resource", "pwd", "grp", "termios"} & {*imported})]
+        for node in (x for x in nodes[file] if isinstance(x, ast.Call)):
+            call = ast.unparse(node)
+            if re.match(r"(os\.(fork|symlink)|multiprocessing\.)\b|.*\.(symlink_to|hardlink_to)\(", call):
+                found += [f"{file}:{node.lineno}: {call}"] if (file, call) not in FORKS else []
+            if re.match(r"str\(.*\brelative_to\(", call):
+                found.append(f"{file}:{node.lineno}: {call}: use as_posix()")
+    assert found == []
+
+
+FORKS = {("dyngs/tradeoff/memory.py", "os.fork()")}
+"""Begun only where there is /proc/self/status."""
+
+
+def test_every_file_can_lie_on_every_system() -> None:
+    """Names that differ by more than case, that Windows has no devices of, and no links."""
+    folders = ("dyngs", "configs", "docs", "csrc", "tests", "benchmarks", "examples", "fuzz", "packaging", ".github")
+    files = [x for folder in folders for x in (ROOT / folder).rglob("*") if "__pycache__" not in x.parts]
+    assert len(files) > 800
+    assert len({relative(file).casefold() for file in files}) == len(files)
+    device = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)|.*[<>:\"|?*\\]|.*[. ]$", re.IGNORECASE)
+    assert [relative(file) for file in files if device.match(file.name) or file.is_symlink()] == []
+
+
+def test_every_test_file_mirrors_a_source_file() -> None:
+    for path in TEST_FILES:
+        below = path.relative_to(ROOT / "tests")
+        source = ROOT / "dyngs" / below.parent / path.stem.removeprefix("test_")
+        found = [file for file in (source.with_suffix(".py"), source / "__init__.py") if file.is_file()]
+        assert found or path.name in WITHOUT_MIRROR, f"no {relative(source)}.py beside {below}"
 
 
 def run_python(code: str) -> str:

@@ -159,14 +159,15 @@ def _is_converted(photo: Path, header: ImageHeader | None) -> bool:
 
 
 def _stored_names(converted: dict[Path, bool]) -> dict[Path, Path]:
-    """Return where each photo is stored; no two differ in the suffix alone, because views are named without it."""
-    taken: set[Path] = set()
+    """Return where each photo is stored; no two differ in the suffix alone, because views are named without it, nor in
+    upper and lower case, which are one file to Windows and macOS."""
+    taken: set[str] = set()
     names = {}
     for name, is_png in sorted(converted.items(), key=lambda item: (item[1], item[0])):
         view, count = name.with_suffix(""), 1
-        while view in taken:
+        while view.as_posix().casefold() in taken:
             view, count = name.with_name(name.name if count == 1 else f"{name.name}_{count}"), count + 1
-        taken.add(view)
+        taken.add(view.as_posix().casefold())
         names[name] = view.with_name(view.name + (".png" if is_png else name.suffix))
     return names
 

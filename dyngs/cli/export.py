@@ -46,7 +46,7 @@ _UNFIT: dict[str, dict[str, str]] = {
 }
 """Options that do not go with a format, and why."""
 _ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of a person"))
-_ONLY |= {"levels": ("html", "html"), "max_gaussians_drawn": ("html", "html --levels")}
+_ONLY |= {"folder": ("html", "html"), "max_gaussians_drawn": ("html", "html --folder")}
 """Options that go with one format, and how it is asked for."""
 
 _EPILOG = """\
@@ -68,7 +68,7 @@ examples:
   dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
   dyngs export runs/stereo --format network --out net.safetensors   the weights of a network, for `dyngs predict`
   dyngs export runs/dance --out dance.html                        a page that plays in any browser, offline
-  dyngs export town.ply --format html --levels --out town         a large scene, fetched as it is looked at
+  dyngs export town.ply --format html --folder --out town         a large scene, fetched as it is looked at
 """
 
 
@@ -103,9 +103,9 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--cells", type=int, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
     parser.add_argument("--segments", type=int, metavar="N", help=about)
-    about = "--format html of a still scene: a folder for a web server, fetched coarse first, in levels of detail"
-    parser.add_argument("--levels", action="store_true", help=about)
-    args.add_most_drawn(parser, "--levels: so many Gaussians of an image are drawn at most, as on phones")
+    about = "--format html: a folder for a web server, of which the page fetches what is seen; for other pages, too"
+    parser.add_argument("--folder", action="store_true", help=about)
+    args.add_most_drawn(parser, "--folder: so many Gaussians of an image are drawn at most, as on phones")
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "what moves rigidly as animated nodes of a .glb; the rest stands as at --time"
@@ -441,28 +441,28 @@ def _export_surface(arguments: argparse.Namespace) -> int:
 
 
 def _export_page(arguments: argparse.Namespace) -> int:
-    """Write a page that plays in a browser by itself, or a folder whose page fetches a scene in levels of detail."""
-    from dyngs.export.html.page import write_levels, write_page
+    """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it is seen."""
+    from dyngs.export.html.page import write_folder, write_page
     from dyngs.runs.opened import open_scene
 
     source: Path = arguments.run_dir
-    most, levels = arguments.max_gaussians_drawn, arguments.levels
-    if most is not None and not levels:
-        raise DyngsError("--max-gaussians-drawn goes with --levels")
+    most, folder, time = arguments.max_gaussians_drawn, arguments.folder, arguments.time or 0.0
+    if most is not None and not folder:
+        raise DyngsError("--max-gaussians-drawn goes with --folder")
     if arguments.out is None and not source.is_dir():
-        raise DyngsError(f"{source}: where to? Give --out {'FOLDER' if levels else 'FILE.html'}")
-    out: Path = arguments.out or source / ("scene" if levels else "scene.html")
+        raise DyngsError(f"{source}: where to? Give --out {'FOLDER' if folder else 'FILE.html'}")
+    out: Path = arguments.out or source / ("scene" if folder else "scene.html")
     is_page = out.suffix.lower() in (".html", ".htm")
-    if levels and is_page:
-        raise DyngsError(f"{out}: --levels writes a folder; give --out {out.with_suffix('')}")
-    if not levels and (not is_page or out.is_dir()):
+    if folder and is_page:
+        raise DyngsError(f"{out}: --folder writes a folder; give --out {out.with_suffix('')}")
+    if not folder and (not is_page or out.is_dir()):
         raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
     opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
-    written = write_levels(opened, out, most=most) if levels else write_page(opened, out, time=arguments.time or 0.0)
-    where = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
-    where = where if levels else "it plays in any browser with WebGL 2, offline"
+    written = write_folder(opened, out, most=most, time=time) if folder else write_page(opened, out, time=time)
+    served = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
     args.print_notes(written.notes)
+    where = served if folder else "it plays in any browser with WebGL 2, offline"
     print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); {where}")
     return 0
 

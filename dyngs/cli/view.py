@@ -31,6 +31,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
     about = "for a network of people: whom to predict, or a folder of people"
     parser.add_argument("--capture", type=args.input_path, metavar="PATH", help=about)
+    args.add_most_drawn(parser, "of a large still scene: so many are drawn at most while anything moves")
     args.add_up(parser)
     args.add_threads(parser)
     args.add_device(parser)
@@ -61,7 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
         torch.set_num_threads(arguments.threads)
     motions = motion_files(arguments.motion)
     device = args.computing_device(arguments.device)
-    source = open_source(arguments.source, arguments.up, arguments.capture, device, args.data_root(arguments))
+    root, most = args.data_root(arguments), arguments.max_gaussians_drawn
+    source = open_source(arguments.source, arguments.up, arguments.capture, device, root, most)
     first = first_of(source)
     if motions and first.person is None:
         raise DyngsError(f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out")

@@ -18,6 +18,7 @@ from dyngs.files.write import to_uint8
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
+from dyngs.static.levels import LevelScene
 from dyngs.view.captured_views import views_of
 
 Layer = Literal["colour", "depth", "alpha", "motion", "error"]
@@ -28,6 +29,7 @@ PARTS: tuple[Part, ...] = get_args(Part)
 ERROR_GAIN = 4.0
 """Factor of the mean absolute error before it is coloured, as in contact sheets."""
 _MOTION_TIMES = 12
+_LEVELS = "levels"
 _LINE = (255, 200, 0)
 """Colour of the line between render and truth."""
 
@@ -41,6 +43,7 @@ class Shot:
         layer: what is shown; "error" needs ``view``.
         view: the view of the capture whose camera, time and truth are shown instead; None: no truth.
         divide: fraction of the width that shows the render; the truth is on the right of it.
+        is_moving: it is one of many, and drawn in levels of detail where ``coarser`` has made them.
     """
 
     camera: Cameras
@@ -49,6 +52,7 @@ class Shot:
     part: Part = "all"
     view: int | None = None
     divide: float = 1.0
+    is_moving: bool = False
 
 
 def draw(opened: Opened, shot: Shot) -> np.ndarray:
@@ -102,14 +106,27 @@ def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> n
     """Return one layer (H, W, 3) uint8; for the error it is the colours."""
     match shot.layer:
         case "colour" | "error":
-            return to_uint8(_rendering(opened, shot.part, camera, time).rgb[0].clamp(0, 1).numpy())
+            return to_uint8(_coarser_or_whole(opened, shot, camera, time).rgb[0].clamp(0, 1).numpy())
         case "alpha":
-            alpha = to_uint8(_rendering(opened, shot.part, camera, time).alpha[0].clamp(0, 1).numpy())
+            alpha = to_uint8(_coarser_or_whole(opened, shot, camera, time).alpha[0].clamp(0, 1).numpy())
             return np.repeat(alpha[..., None], 3, axis=2)
         case "depth":
             return depth_to_rgb(*depth_of(opened, shot.part, camera, time))
         case "motion":
             return _motion(opened, shot.part, camera, time)
+
+
+def coarser(opened: Opened, most: int) -> Opened:
+    """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves. Raises DyngsError."""
+    opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
+    opened.once(_LEVELS, lambda: [LevelScene.of(opened.renderable, most)])
+    return opened
+
+
+def _coarser_or_whole(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> Rendering:
+    may_be_coarser = shot.is_moving and shot.part == "all" and shot.layer != "error"
+    levels: list[LevelScene] = opened.once(_LEVELS, list) if may_be_coarser else []
+    return levels[0].render(camera).to(device="cpu") if levels else _rendering(opened, shot.part, camera, time)
 
 
 def _rendering(opened: Opened, part: Part, camera: Cameras, time: float | None, with_depth: bool = False) -> Rendering:

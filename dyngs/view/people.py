@@ -37,7 +37,7 @@ def motion_files(path: Path | None) -> dict[str, Path]:
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in MOTION_SUFFIXES and file.is_file())
     if not found:
         raise DyngsError(f"--motion {path}: no motion files there ({', '.join(MOTION_SUFFIXES)})")
-    return {str(file.relative_to(path)): file for file in found[:_MOST_MOTIONS]}
+    return {file.relative_to(path).as_posix(): file for file in found[:_MOST_MOTIONS]}
 
 
 def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles) -> Opened:

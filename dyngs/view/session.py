@@ -250,7 +250,7 @@ class Session:
             self._is_stale = False
             self._drawn_area, self._is_refined = self._full_area, True  # if it fails, it is not tried again
             self._drawn_at = start = self._clock()
-            shot = self.shot(size_within(self._full_size, area))
+            shot = replace(self.shot(size_within(self._full_size, area)), is_moving=is_moving)
         image = draw(opened, shot)
         pixels = image.shape[0] * image.shape[1]
         if not self.closed:

@@ -19,6 +19,7 @@ from dyngs.files.wrong_place import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import Opened, open_scene
+from dyngs.view.layers import coarser
 
 _DEEPEST = 3
 """Folders below that which was given in which runs are looked for."""
@@ -96,6 +97,7 @@ def open_source(
     capture: Path | None = None,
     device: torch.device = CPU,
     data_root: Path | None = None,
+    most: int | None = None,
 ) -> Source:
     """Return what is to be seen of a run, a file, a folder of runs or a network; the first scene is not loaded yet.
 
@@ -103,6 +105,7 @@ def open_source(
         up, data_root: as in ``open_to_view``.
         capture: for a network: a person, or a folder of people.
         device: draws the scenes.
+        most: Gaussians of a still scene that are drawn at most while anything moves; None: all.
 
     Raises:
         DyngsError: nothing is there, a folder without runs, or a ``capture`` without a network.
@@ -111,12 +114,18 @@ def open_source(
         raise DyngsError(f"{path}: no such run, file or folder; give what `dyngs train` or `dyngs export` wrote")
     if is_network(path):
         network = open_network(path, capture)
+        if most is not None:
+            raise DyngsError(f"{path} is a network of people; levels of detail are for still scenes")
         return Source(tuple(network.people), lambda name: network.predict(name, up=up).to(device), network)
     if capture is not None:
         raise DyngsError(f"--capture goes with the run of a network of people, {path} is none; leave it out")
+
+    def shown(opened: Opened) -> Opened:
+        return opened.to(device) if most is None else coarser(opened.to(device), most)
+
     if not path.is_dir() or _is_run(path):
         name = path.name or str(path)
-        return Source((name,), lambda _: open_to_view(path, name, up, data_root).to(device))
+        return Source((name,), lambda _: shown(open_to_view(path, name, up, data_root)))
     if data_root is not None:
         raise DyngsError(f"data.root= goes with one run, {path} is none; leave it out")
     runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
@@ -124,7 +133,7 @@ def open_source(
         known = command_for(path)
         instead = f"{known}; then " if known else ""
         raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
-    return Source(tuple(runs), lambda name: open_to_view(runs[name], name, up).to(device))
+    return Source(tuple(runs), lambda name: shown(open_to_view(runs[name], name, up)))
 
 
 def open_to_view(path: Path, name: str, up: str | None = None, data_root: Path | None = None) -> Opened:

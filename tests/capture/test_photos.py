@@ -94,16 +94,19 @@ def test_a_damaged_heic_is_one_line(tmp_path: Path) -> None:
 
 
 def test_photos_that_differ_in_the_suffix_get_names_that_do_not(tmp_path: Path) -> None:
-    """Views are named without the suffix, and a capture with one name for two images is refused."""
-    for name in ("a.TIF", "a.png", "a.jpg", "a.gif", "sub/a.png", "a.png.bmp"):
+    """Views are named without the suffix, and a capture with one name for two images is refused; names that differ in
+    upper and lower case are one name to Windows and macOS."""
+    for name in ("a.TIF", "a.png", "a.jpg", "a.gif", "sub/a.png", "a.png.bmp", "B.gif", "b.png"):
         _save(tmp_path / "photos" / name)
     names, _ = _gather(tmp_path)
     assert names == {
         "a.TIF": "a.TIF",
+        "B.gif": "B.gif.png",
         "a.gif": "a.gif.png",
         "a.jpg": "a.jpg.jpg",
         "a.png": "a.png.png",
         "a.png.bmp": "a.png.bmp.bmp",
+        "b.png": "b.png",
         "sub/a.png": "sub/a.png",
     }
     assert len({Path(name).with_suffix("") for name in names.values()}) == len(names)

@@ -101,12 +101,12 @@ def test_a_page_is_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert (run / "scene.html").is_file()
 
 
-def test_a_page_in_levels_is_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_page_as_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     still = write_moving_run(tmp_path / "still", moves=False)
-    assert main(["export", str(still), "--format", "html", "--levels", "--max-gaussians-drawn", "9000"]) == 0
-    assert sorted(path.name for path in (still / "scene").iterdir()) == ["0-0.bin", "index.html"]
+    assert main(["export", str(still), "--format", "html", "--folder", "--max-gaussians-drawn", "9000"]) == 0
+    assert sorted(path.name for path in (still / "scene").iterdir()) == ["0-0.bin", "dyngs-scene.js", "index.html"]
     assert "python -m http.server -d" in capsys.readouterr().out
-    assert main(["export", str(still), "--format", "html", "--levels"]) == 2
+    assert main(["export", str(still), "--format", "html", "--folder"]) == 2
     assert "exists already" in capsys.readouterr().err
 
 
@@ -126,10 +126,10 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
         ("--format html --max-change 3", "goes with --format dyngs"),
         ("--format html --out page.pdf", "give --out page.html"),
         ("--format html --motion walk.bvh", "needs the run of a person"),
-        ("--format html --levels", "for still scenes"),
-        ("--format html --levels --out page.html", "writes a folder; give --out page"),
-        ("--format html --max-gaussians-drawn 9", "goes with --levels"),
-        ("--levels", "--levels goes with --format html"),
+        ("--format html --folder --max-gaussians-drawn 9", "for still scenes"),
+        ("--format html --folder --out page.html", "writes a folder; give --out page"),
+        ("--format html --max-gaussians-drawn 9", "goes with --folder"),
+        ("--folder", "--folder goes with --format html"),
     ],
 )
 def test_what_does_not_go_with_a_page_is_one_line(

@@ -8,6 +8,7 @@ from view_sessions import opened_at
 
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened
+from dyngs.view import session
 from dyngs.view.cameras import camera_at, pose_of
 from dyngs.view.layers import Shot, draw
 from dyngs.view.pace import STILL_AFTER
@@ -69,6 +70,18 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     assert looked.session.due() is None
     looked.session.change(layer="alpha")
     assert looked.session.due() == 0.0
+
+
+def test_only_what_moves_may_be_coarser(monkeypatch: pytest.MonkeyPatch) -> None:
+    shots: list[Shot] = []
+    monkeypatch.setattr(session, "draw", lambda opened, shot: shots.append(shot) or draw(opened, shot))
+    looked = Looked()
+    looked.session.move(eye())
+    looked.after(0)
+    looked.after(1)
+    looked.after(1)
+    assert [shot.is_moving for shot in shots] == [not sent.is_refined for sent in looked.sent]
+    assert {shot.is_moving for shot in shots} == {True, False}
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,13 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     assert not is_network(tmp_path / "b" / "run")
 
 
+def test_levels_are_for_still_scenes(tmp_path: Path) -> None:
+    still, moving = (write_moving_run(tmp_path / name, moves=name == "moving") for name in ("still", "moving"))
+    assert "at most 9 Gaussians" in first_of(open_source(still, most=9)).notes[-1]
+    with pytest.raises(DyngsError, match="for still scenes"):
+        first_of(open_source(moving, most=9))
+
+
 def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no runs there"):
         open_source(tmp_path)

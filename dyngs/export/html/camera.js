@@ -74,7 +74,8 @@ class OrbitCamera {
 }
 
 // Mouse, touch and wheel: one finger turns, two shift and zoom; so does the right button, and the wheel.
-function steer(element, camera, changed) {
+// `wheels()`: whether the wheel is for the scene now.
+function steer(element, camera, changed, wheels) {
   const fingers = new Map();
   const middle = () => {
     const places = [...fingers.values()];
@@ -101,6 +102,7 @@ function steer(element, camera, changed) {
     element.addEventListener(name, (event) => fingers.delete(event.pointerId));
   element.addEventListener("contextmenu", (event) => event.preventDefault());
   element.addEventListener("wheel", (event) => {
+    if (!wheels()) return;
     event.preventDefault();
     camera.zoom(Math.exp(Math.min(Math.max(event.deltaY, -200), 200) / 600));
     changed();

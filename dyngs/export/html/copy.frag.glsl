@@ -5,4 +5,4 @@ in vec2 vAt;
 uniform sampler2D uImage;
 out vec4 color;
 
-void main() { color = vec4(texture(uImage, vAt).rgb, 1.0); }
+void main() { color = texture(uImage, vAt); }

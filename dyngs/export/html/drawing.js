@@ -5,7 +5,7 @@ const ROW = 2048; // texels of a texture that holds a list
 class Drawing {
   constructor(canvas, scene) {
     const gl = canvas.getContext("webgl2", {
-      antialias: false, depth: false, alpha: false, powerPreference: "high-performance",
+      antialias: false, depth: false, alpha: scene.opacity < 1, powerPreference: "high-performance",
     });
     if (!gl) throw new Error("it needs WebGL 2, which this browser does not offer (is hardware acceleration off?)");
     Object.assign(this, { canvas, gl, scene, textures: [], size: [0, 0] });
@@ -13,16 +13,23 @@ class Drawing {
     this.harmonicTexels = Math.ceil((3 * ((scene.degree + 1) ** 2 - 1)) / 4);
   }
 
-  // A program of the shaders in the page; `captured`: what transform feedback takes, with nothing drawn.
+  // Fills the image with the background, premultiplied.
+  clear(bits) {
+    const { gl, scene: { background, opacity } } = this;
+    gl.clearColor(...background.map((x) => x * opacity), opacity);
+    gl.clear(bits);
+  }
+
+  // A program of the shaders here; `captured`: what transform feedback takes, with nothing drawn.
   program(vertex, fragment, captured, definitions = {}) {
     const { gl } = this, program = gl.createProgram();
     const lines = Object.entries(definitions).map(([name, value]) => `#define ${name} ${value}\n`).join("");
     const nothing = "#version 300 es\nprecision lowp float;\nout vec4 color;\nvoid main() { color = vec4(0.0); }";
-    const texts = [textOf(vertex).trim(), fragment ? textOf(fragment).trim() : nothing];
+    const texts = [SHADERS[vertex].trim(), fragment ? SHADERS[fragment].trim() : nothing];
     [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((kind, i) => {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, texts[i].replace("#version 300 es\n", "#version 300 es\n" + lines)
-        .replace('#include "harmonics.glsl"', () => textOf("harmonics.glsl").trim()));
+        .replace('#include "harmonics.glsl"', () => SHADERS["harmonics.glsl"].trim()));
       gl.compileShader(shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS))
         throw new Error(`${i ? fragment : vertex}: ${gl.getShaderInfoLog(shader)}`);

@@ -1,9 +1,6 @@
 // A still scene in levels of detail, whose blocks are fetched when they are seen, the largest on the screen first.
 // The tree, and what a camera needs of it, are those of dyngs/gaussians/levels.py.
 
-const AT_ONCE = 6; // requests
-const PATIENCE_LOST = 2000; // ms until a block that did not arrive is asked for again
-
 class Tree {
   constructor({ levels, lists }) {
     const { sizes, block, merged } = levels;
@@ -12,6 +9,8 @@ class Tree {
     this.counts.reduce((sum, n) => (this.first.push(sum), sum + n), 0);
     this.size = lists.blocks.length / 5;
     this.root = this.size - 1;
+    const sound = sizes.every((n) => n > 0) && block > 0 && this.counts.reduce((sum, n) => sum + n, 0) === this.size;
+    if (!sound) throw new Error("its levels are damaged");
   }
 
   levelOf(row) {
@@ -87,6 +86,10 @@ class Slots {
     return changed;
   }
 
+  has() {
+    return true;
+  }
+
   seen() {
     return null;
   }
@@ -126,13 +129,16 @@ class Slots {
 }
 
 class LevelRenderer extends Renderer {
-  constructor(canvas, scene, changed) {
+  constructor(canvas, scene, source, changed) {
     const tree = new Tree(scene), probe = new OffscreenCanvas(1, 1).getContext("webgl2");
     const limit = probe ? probe.getParameter(probe.MAX_TEXTURE_SIZE) : 2048;
+    probe?.getExtension("WEBGL_lose_context")?.loseContext(); // browsers keep few
     const texels = Math.max(4, Math.ceil((3 * ((scene.degree + 1) ** 2 - 1)) / 4));
     const slots = Math.min(tree.size, Math.floor((limit * ROW) / (texels * tree.block)));
     super(canvas, { ...scene, count: slots * tree.block }, new Slots(slots, tree.block));
-    Object.assign(this, { tree, changed, asked: new Set(), lost: 0 });
+    this.tree = tree;
+    this.rows = new Map(Array.from({ length: tree.size }, (_, row) => [tree.nameOf(row), row]));
+    this.parts = new Parts(source, (name, blob) => this.fill(this.rows.get(name), blob), changed);
     // Where not all blocks have a slot, some are left for those that arrive.
     const room = slots === tree.size ? Infinity : Math.max(slots - 4 * tree.merged, 1) * tree.block;
     this.most = Math.min(scene.levels.most ?? Infinity, room);
@@ -146,12 +152,13 @@ class LevelRenderer extends Renderer {
 
   // Returns once the coarsest block is here.
   async begun() {
-    while (!this.motion.held.has(this.tree.root)) await this.fetchOne(this.tree.root);
+    const { tree, motion, parts } = this;
+    for (; !motion.held.has(tree.root) && !parts.signal.aborted; await aMoment()) parts.want([tree.nameOf(tree.root)]);
   }
 
   // Returns once all is here that a view needs.
   async arrived(view) {
-    while (this.choose(view)) await new Promise((resolve) => setTimeout(resolve, 20));
+    while (this.choose(view)) await aMoment();
   }
 
   draw(view) {
@@ -165,37 +172,12 @@ class LevelRenderer extends Renderer {
     if (!motion.held.has(tree.root)) return 1;
     const { cut, wanted } = tree.cut(view, motion.held, this.most, scene.levels.pixels);
     motion.show(cut);
-    this.fetchSome(wanted);
+    this.parts.want(wanted.map((row) => tree.nameOf(row)));
     return wanted.length;
   }
 
-  fetchSome(rows) {
-    for (const row of rows) {
-      if (this.asked.size >= AT_ONCE) return;
-      if (!this.asked.has(row)) this.fetchOne(row);
-    }
-  }
-
-  async fetchOne(row) {
-    this.asked.add(row);
-    try {
-      const answer = await fetch(this.tree.nameOf(row));
-      if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
-      this.fill(row, await inflatedStream(answer.body));
-      if (this.lost) tell("");
-      this.lost = 0;
-    } catch (error) {
-      ++this.lost;
-      tell(`A part of the scene has not arrived (${error.message}); trying again …`);
-      await new Promise((resolve) => setTimeout(resolve, PATIENCE_LOST * Math.min(this.lost, 15)));
-    }
-    this.asked.delete(row);
-    this.changed();
-  }
-
-  fill(row, bytes) {
-    const { layout, block } = this.scene.levels, { degree } = this.scene, lists = {};
-    for (const [name, list] of Object.entries(layout)) lists[name] = numbersOf(list, bytes);
+  async fill(row, blob) {
+    const { layout, block } = this.scene.levels, { degree } = this.scene, lists = await listsOf(layout, blob);
     const slot = this.motion.take(row, this.tree.root);
     if (slot < 0) return;
     this.motion.means.set(lists.means, 3 * block * slot);

@@ -2,13 +2,10 @@
 // or one of their own; then, on a person, the bones of a body. A driver is an affine map for places, and changes of
 // all else.
 
-// Values at `time` of uniform cubic B-splines: `curves` has `points` control points of `size` values for each of
-// `count`.
-function splinesAt(curves, count, points, size, time, values) {
-  const pieces = points - 3;
-  const place = Math.min(Math.max(time, 0), 1) * pieces;
-  const piece = Math.min(Math.floor(place), pieces - 1);
-  const x = place - piece, y = 1 - x;
+// Values at `x` of a piece of uniform cubic B-splines: `curves` has `points` control points of `size` values for each
+// of `count`.
+function splinesAt(curves, count, points, size, piece, x, values) {
+  const y = 1 - x;
   const a = y ** 3 / 6, b = (3 * x ** 3 - 6 * x * x + 4) / 6, c = (3 * y ** 3 - 6 * y * y + 4) / 6, d = x ** 3 / 6;
   for (let i = 0; i < count; ++i) {
     const first = (i * points + piece) * size;
@@ -34,23 +31,34 @@ const HEADS = [["means", 3, 0], ["quats", 4, 12], ["log_scales", 3, 16], ["logit
 
 // Drivers at a time, 24 numbers each: three rows of the affine map, the quaternion, log scales and logit, the colour.
 class Drivers {
-  constructor(scene) {
+  constructor(scene, chunks) {
     const { curves, lists } = scene;
     this.count = curves.count;
-    this.points = curves.points;
+    this.pieces = curves.points - 3;
+    this.chunk = curves.chunk ?? this.pieces; // pieces of a chunk of time
+    Object.assign(this, { lists, chunks });
     this.pivots = lists.pivots; // absent where each Gaussian has a driver of its own, which turns it about itself
-    this.heads = HEADS.filter(([name]) => lists["curve_" + name])
-      .map(([name, size, at]) => {
-        return { size, at, curves: lists["curve_" + name], now: new Float32Array(curves.count * size) };
-      });
+    this.heads = HEADS.map(([name, size, at]) => ({ name: "curve_" + name, size, at }))
+      .filter(({ name }) => (curves.layout ?? lists)[name])
+      .map((head) => ({ ...head, now: new Float32Array(curves.count * head.size) }));
     this.values = new Float32Array(24 * this.count);
     this.turn = new Float64Array(9);
   }
 
+  // The piece of the splines at a time, the place in it, and the lists that hold it: none while they are fetched.
+  at(time) {
+    const { pieces, chunk } = this, place = Math.min(Math.max(time, 0), 1) * pieces;
+    const piece = Math.min(Math.floor(place), pieces - 1), number = Math.floor(piece / chunk);
+    const lists = this.chunks ? this.chunks.at(number) : this.lists;
+    return { piece: piece - number * chunk, x: place - piece, lists };
+  }
+
   update(time) {
-    const { values, pivots, turn } = this;
+    const { values, pivots, turn } = this, { piece, x, lists } = this.at(time);
+    if (!lists) return false;
     values.fill(0);
-    for (const head of this.heads) splinesAt(head.curves, this.count, this.points, head.size, time, head.now);
+    for (const { name, size, now } of this.heads)
+      splinesAt(lists[name], this.count, this.chunk + 3, size, piece, x, now);
     for (let i = 0; i < this.count; ++i) {
       const at = 24 * i;
       values[at + 12] = 1;
@@ -68,6 +76,7 @@ class Drivers {
         values[at + 4 * row + 3] = moved;
       }
     }
+    return true;
   }
 }
 
@@ -144,11 +153,11 @@ function wholeShares(bytes, count) {
 
 // All that moves, and how far from a camera it is.
 class Motion {
-  constructor(scene) {
+  constructor(scene, chunks) {
     const { lists } = scene;
     this.count = scene.count;
     this.moving = scene.curves ? scene.curves.moving : 0;
-    this.drivers = scene.curves ? new Drivers(scene) : null;
+    this.drivers = scene.curves ? new Drivers(scene, chunks) : null;
     this.bones = scene.bones ? new Bones(scene) : null;
     this.means = lists.means;
     this.windows = lists.windows; // when each Gaussian that moves is there: from, to
@@ -168,10 +177,15 @@ class Motion {
     return Boolean(this.drivers || this.bones);
   }
 
+  // Whether all is here that it needs at a time.
+  has(time) {
+    return time === this.time || !this.drivers || Boolean(this.drivers.at(time).lists);
+  }
+
+  // Returns whether anything has moved: not while what it needs is fetched.
   update(time) {
-    if (time === this.time) return false;
+    if (time === this.time || (this.drivers && !this.drivers.update(time))) return false;
     this.time = time;
-    if (this.drivers) this.drivers.update(time);
     if (this.bones) this.bones.update(time);
     return true;
   }

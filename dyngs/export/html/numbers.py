@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import zlib
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
@@ -25,22 +26,26 @@ from dyngs.gaussians.order import storage_order
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, rest_offsets
 from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.ops.nodes import SPAN
 from dyngs.triangles.patches import CORNERS
 from dyngs.triangles.scene import TriangleScene
 
 BONES = 8  # bones that a Gaussian follows on the page
 FINE = ("means", "quats")  # splines of nodes that are stored in 16 bits
 MOST_LOGIT = 15.0  # opacities beyond that of this logit are 1 to seven digits
+CHUNK_BYTES = 1 << 19  # of splines that are fetched at once, before they are deflated
 CHUNK = 256  # rows of a list that share a range for each column: neighbours in space are alike
 
 
 class Lists:
     """A block of bytes to which lists are added, and where they lie in it.
 
-    ``layout``: by name what ``data.js`` needs to know.
+    ``layout``: by name what ``data.js`` needs to know. ``chunks``: splines that are fetched when they are played, all
+    of one layout; None: everything is in the block.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, chunked: bool = False) -> None:
+        self.chunks: list[Lists] | None = [] if chunked else None
         self.layout: dict[str, dict[str, Any]] = {}
         self._parts: list[bytes] = []
         self._size = 0
@@ -139,6 +144,13 @@ def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> Lists:
     return lists
 
 
+def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes]]:
+    """Yield names and bytes of the files of all blocks, as ``levels.js`` asks for them."""
+    for level, balls in enumerate(levels.blocks):
+        for place in range(len(balls)):
+            yield f"{level}-{place}.bin", block_numbers(levels, (level, place), with_rest=with_rest).deflated()
+
+
 def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
     """Add the numbers of curved triangles to ``lists`` and return what the page needs to know about them."""
     patches = scene.patches
@@ -187,23 +199,47 @@ def _add_motion(scene: DynamicScene, order: Tensor, lists: Lists, tolerance: flo
 
 def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
     """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order`` (M,)."""
-    for name, points in curves.heads.items():
-        has_nodes = curves.pivots is not None  # few, each of which moves many
-        own = points if has_nodes else points[order]
-        if curves.is_steep:
-            lists.exact(f"curve_{name}", _numpy(own.flatten(1)))
-        else:
-            lists.quantised(f"curve_{name}", _numpy(own.flatten(1)), 16 if has_nodes and name in FINE else 8)
+    count, points, _ = curves.heads["means"].shape
+    told: dict[str, Any] = {"count": count, "points": points, "moving": len(order), "error": curves.error}
+    pieces, chunk, chunks = points - SPAN + 1, _pieces_of_chunk(curves), lists.chunks
+    if chunks is None or chunk >= pieces:
+        _add_splines(curves, slice(None), order, lists)
+    else:
+        for first in range(0, pieces, chunk):
+            rows = torch.arange(first, first + chunk + SPAN - 1, device="cpu").clamp_max(points - 1)
+            chunks.append(Lists())
+            _add_splines(curves, rows, order, chunks[-1])
+        told |= {"chunk": chunk, "layout": chunks[0].layout}
     if curves.pivots is not None and curves.followed is not None and curves.fractions is not None:
         lists.exact("pivots", _numpy(curves.pivots))
         lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
         lists.exact("shares", _fractions(curves.fractions[order]))
-    count, points, _ = curves.heads["means"].shape
-    told = {"count": count, "points": points, "moving": len(order), "error": curves.error}
     if curves.windows is not None:
         lists.quantised("windows", _numpy(curves.windows[order]), 16)
         told |= {"edge": EDGE, "open": OPEN}
     return told
+
+
+def _add_splines(curves: Curves, rows: Tensor | slice, order: Tensor, lists: Lists) -> None:
+    """Add the control points ``rows`` of all splines."""
+    has_nodes = curves.pivots is not None  # few, each of which moves many
+    for name, points in curves.heads.items():
+        own = _numpy((points if has_nodes else points[order])[:, rows].flatten(1))
+        if curves.is_steep:
+            lists.exact(f"curve_{name}", own)
+        else:
+            lists.quantised(f"curve_{name}", own, _bits(curves, name))
+
+
+def _bits(curves: Curves, name: str) -> Literal[8, 16]:
+    return 16 if curves.pivots is not None and name in FINE else 8
+
+
+def _pieces_of_chunk(curves: Curves) -> int:
+    """Return the pieces of a chunk of time of some ``CHUNK_BYTES``."""
+    wide = 32 if curves.is_steep else 0
+    sizes = (x.shape[0] * x.shape[2] * (wide or _bits(curves, name)) for name, x in curves.heads.items())
+    return max(CHUNK_BYTES * 8 // max(sum(sizes), 1), 1)
 
 
 def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:

@@ -18,7 +18,8 @@ from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.errors import counted
 from dyngs.export.chosen_path import front_of, orbit_around, points_at, view_to_show
-from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_numbers
+from dyngs.export.html.element import element_script, text_of
+from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
 from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.files.outputs import new_folder, require_new_folder
 from dyngs.files.write import write_text
@@ -29,14 +30,10 @@ from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.rotation import AXES
 from dyngs.static.levels import LevelScene
+from dyngs.static.scene import StaticScene
 from dyngs.triangles.scene import TriangleScene
 
-HERE = Path(__file__).parent
-SCRIPTS = ("data.js", "motion.js", "sort.js", "drawing.js", "renderer.js", "levels.js", "triangles.js", "camera.js")
-SCRIPTS += ("player.js", "main.js")
-SHADERS = ("project.glsl", "splat.vert.glsl", "splat.frag.glsl", "copy.vert.glsl", "copy.frag.glsl")
-SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
-PAGE = "index.html"  # in the folder of a scene in levels
+PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # in a folder for a web server
 TOLERANCE = 0.25  # pixels of the first view that a place at its target may be off where motion is fitted
 
 
@@ -50,7 +47,7 @@ class WrittenPage:
     """A page on disk."""
 
     path: Path  # of it
-    num_bytes: int  # its size, with that of the blocks that it fetches
+    num_bytes: int  # its size, with those of all files of its folder
     header: dict[str, Any]  # what it says except for the layout
     notes: tuple[str, ...]  # lines about what was chosen or left out
 
@@ -71,30 +68,40 @@ def write_page(
     return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
 
 
-def write_levels(
-    opened: Opened, folder: Path, *, most: int | None = None, title: str | None = None, views: Sequence[Cameras] = ()
+def write_folder(
+    opened: Opened,
+    folder: Path,
+    *,
+    most: int | None = None,
+    title: str | None = None,
+    time: float = 0.0,
+    views: Sequence[Cameras] = (),
 ) -> WrittenPage:
-    """Write the page of a still scene in levels of detail: a new folder of ``PAGE`` and the blocks that it fetches.
+    """Write a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and what is fetched when it is seen.
 
-    ``most``: Gaussians that the page draws at most. Others as of ``write_page``. Raises DyngsError: a scene that moves
-    or is not made of Gaussians, or a folder that exists already.
+    That is a still scene in blocks of its levels of detail, and a long motion in chunks of time. ``most``: Gaussians of
+    a still scene that are drawn at most. Others as of ``write_page``. Raises DyngsError: ``most`` of another scene, or
+    a folder that exists already.
     """
     require_new_folder(folder)
-    levelled = LevelScene.of(opened.renderable, most)
-    levels, colour = levelled.levels, levelled.scene.colour
-    lists = Lists()
-    told = add_levels(levels, colour, lists) | _drawn(levelled.options)
-    told["levels"]["most"] = most
-    header = told | _shown(opened, 0.0, *_beginning(opened, views))
+    lists = Lists(chunked=True)
+    if most is not None or isinstance(opened.renderable, StaticScene):
+        levelled = LevelScene.of(opened.renderable, most)
+        levels, colour = levelled.levels, levelled.scene.colour
+        header = add_levels(levels, colour, lists) | _drawn(levelled.options)
+        header["levels"]["most"] = most
+        header |= _shown(opened, time, *_beginning(opened, views))
+        parts = block_files(levels, with_rest=colour is None)
+    else:
+        header = _header(opened, time, views, lists)
+        parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
     text = _assembled(header | {"layout": lists.layout}, lists.text(), _title(opened, title))
-    size = len(text.encode())
     with new_folder(folder) as started:
         write_text(started / PAGE, text)
-        for level, balls in enumerate(levels.blocks):
-            for place in range(len(balls)):
-                data = block_numbers(levels, (level, place), with_rest=colour is None).deflated()
-                (started / f"{level}-{place}.bin").write_bytes(data)
-                size += len(data)
+        write_text(started / ELEMENT, element_script())
+        for name, data in parts:
+            (started / name).write_bytes(data)
+        size = sum(file.stat().st_size for file in started.iterdir())
     return WrittenPage(folder / PAGE, size, header, _notes(opened, header))
 
 
@@ -201,19 +208,14 @@ def _view(camera: Cameras) -> dict[str, Any]:
 def _assembled(header: dict[str, Any], numbers: str, title: str) -> str:
     """Return the text of the page. All that stems from a run is escaped; scripts are allowed by their hash alone."""
     red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in header["background"])
-    style = _file("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
-    script = '"use strict";\n' + "\n".join(_file(name) for name in SCRIPTS)
-    shaders = "\n".join(f'<script type="text/plain" id="{name}">\n{_file(name)}</script>' for name in SHADERS)
-    page = _file("page.html")
-    fixed = {"style": style, "script": script, "shaders": shaders}
+    style, script = text_of("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})"), element_script()
+    page = text_of("page.html")
+    fixed = {"style": style, "script": script}
     fixed |= {"style_hash": source_hash(style), "script_hash": source_hash(script), "title": html.escape(title)}
     fixed |= {"header": script_safe(header), "numbers": numbers}
     size = len(page) + sum(len(x) for x in fixed.values())
     kind = "triangle" if "texture" in header else "Gaussian"
-    fixed["about"] = counted(header["count"], kind) + ("" if "levels" in header else f", {size / 1e6:.1f} MB")
-    fixed["fetched"] = " connect-src 'self';" if "levels" in header else ""  # nothing, but for blocks
+    fetches = "levels" in header or "chunk" in header.get("curves", {})
+    fixed["about"] = counted(header["count"], kind) + ("" if fetches else f", {size / 1e6:.1f} MB")
+    fixed["fetched"] = " connect-src 'self';" if fetches else ""  # nothing, but for its parts
     return filled(page, fixed)
-
-
-def _file(name: str) -> str:
-    return (HERE / name).read_text(encoding="utf-8")

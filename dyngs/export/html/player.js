@@ -1,11 +1,9 @@
 // Time: a slider, play and pause, loop and speed.
 
 class Player {
-  constructor(scene, changed) {
-    const part = (id) => document.getElementById(id);
-    Object.assign(this, { scene, changed, time: scene.time || 0, playing: false, bar: part("bar") });
-    Object.assign(this, { slider: part("time"), button: part("play"), shown: part("seconds") });
-    Object.assign(this, { loop: part("loop"), speed: part("speed") });
+  constructor(scene, { bar, time, play, seconds, loop, speed }, changed) {
+    Object.assign(this, { scene, changed, time: scene.time || 0, playing: false });
+    Object.assign(this, { bar, slider: time, button: play, shown: seconds, loop, speed });
     this.bar.hidden = !scene.moves;
     this.step = 1 / Math.max(scene.frames - 1, 1);
     this.slider.step = "any";

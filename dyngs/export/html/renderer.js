@@ -120,6 +120,20 @@ class Renderer extends Drawing {
     if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) this.deep = false;
   }
 
+  // Returns once its first picture can be drawn, or that of a view.
+  async begun() {
+    await this.arrived({ time: this.scene.time || 0 });
+  }
+
+  async arrived({ time }) {
+    while (this.waits(time) && !this.motion.drivers.chunks.parts.signal.aborted) await aMoment();
+  }
+
+  // Whether a time cannot be drawn yet.
+  waits(time) {
+    return !this.motion.has(time);
+  }
+
   // Draws the scene at `time` from a camera: camFromWorld (16 numbers, row by row), intrinsics [fx, fy, cx, cy] px.
   draw({ camFromWorld, intrinsics, width, height, time }) {
     const { gl, scene, motion, order } = this;
@@ -171,8 +185,7 @@ class Renderer extends Drawing {
     const { gl, scene } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.deep ? this.target : null);
     gl.viewport(0, 0, ...this.size);
-    gl.clearColor(...scene.background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
+    this.clear(gl.COLOR_BUFFER_BIT);
     gl.useProgram(this.splat.program);
     gl.uniform1f(this.splat.at("uLeast"), scene.alphaMin);
     gl.enable(gl.BLEND);

@@ -94,11 +94,10 @@ class TriangleRenderer extends Drawing {
   }
 
   blendAll() {
-    const { gl, scene, drawn } = this;
+    const { gl, drawn } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.fine);
     gl.viewport(0, 0, ...drawn);
-    gl.clearColor(...scene.background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    this.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.useProgram(this.faces.program);
     gl.bindVertexArray(this.mesh);

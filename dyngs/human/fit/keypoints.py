@@ -117,7 +117,7 @@ def _openpose(folder: Path, stems: Mapping[str, str]) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     for file in files:
         stem = file.name.removesuffix(".json").removesuffix("_keypoints")
-        name = stems.get(str(file.relative_to(folder).with_name(stem)), stems.get(stem))
+        name = stems.get(file.relative_to(folder).with_name(stem).as_posix(), stems.get(stem))
         if name is None:
             continue
         people = read_json_object(file).get("people")

@@ -2,42 +2,35 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
-from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
 from browser import Browser, Page, needs_browser
-from moving_scene import camera, moving_scene, sliding_nodes, still_scene, write_moving_run
+from moving_scene import camera, still_scene, write_moving_run
 from numpy.typing import NDArray
-from PIL import Image
 from scene_kinds import KINDS, onlooker, scene_of_kind
+from scene_pages import from_afar, large, levels_of_a_cloud, served, shown, sliding_scene, wait_for_line, write
 from small_triangles import bent
 from small_triangles import camera as before_triangles
-from splat_scenes import cloud
 
 from dyngs.camera import Cameras
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
-from dyngs.export.html.page import MOST_VIEWS, PAGE, SCRIPTS, SHADERS, WrittenPage, write_levels, write_page
+from dyngs.export.html import numbers
+from dyngs.export.html.element import SCRIPTS, SHADERS
+from dyngs.export.html.page import MOST_VIEWS, PAGE, write_folder, write_page
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.metrics import psnr, ssim
 from dyngs.runs.opened import Opened, open_run, opened_scene
-from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
 from dyngs.triangles.scene import TriangleOptions, TriangleScene
 
@@ -48,28 +41,11 @@ def browser() -> Iterator[Browser]:
         yield started
 
 
-def write(
-    scene: GaussianScene, path: Path, view: Cameras, title: str = "a scene", options: RenderOptions | None = None
-) -> WrittenPage:
-    scene = replace(scene, options=options or scene.options, background=torch.ones(3))
-    return write_page(replace(opened_scene(scene), stated_up="-y"), path, title=title, views=(view,))
-
-
 def opened(browser: Browser, path: Path, width: int = 320, height: int = 240) -> Page:
     page = browser.open(path.as_uri(), width, height)
     page.wait_for("window.dyngs !== undefined")
     page.evaluate("dyngs.player.toggle(false)")
     return page
-
-
-def shown(page: Page, view: Cameras, time: float) -> torch.Tensor:
-    """What the page draws, (H, W, 3)."""
-    ((fx, _, cx), (_, fy, cy), _) = view.intrinsics[0].tolist()
-    asked = {"camFromWorld": view.cam_from_world[0].flatten().tolist(), "intrinsics": [fx, fy, cx, cy]}
-    asked |= {"width": view.width, "height": view.height, "time": time}
-    address: str = page.evaluate("view => dyngs.show(view)", asked)
-    image = Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB")
-    return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
 
 
 def assert_alike(page: Page, scene: GaussianScene, view: Cameras, options: RenderOptions, least: float = 38.0) -> None:
@@ -78,12 +54,6 @@ def assert_alike(page: Page, scene: GaussianScene, view: Cameras, options: Rende
         found = shown(page, view, time)
         assert ssim(found, truth) > 0.95
         assert psnr(found, truth) > least
-
-
-def large(view: Cameras, factor: int = 4) -> Cameras:
-    """The same view with more pixels."""
-    scale = torch.tensor([factor, factor, 1.0])[:, None]
-    return Cameras(view.cam_from_world, view.intrinsics * scale, view.width * factor, view.height * factor)
 
 
 @needs_browser
@@ -143,7 +113,6 @@ def test_harmonics_and_modes(mode: RasterizeMode, browser: Browser, tmp_path: Pa
 
 
 @needs_browser
-@needs_browser
 def test_time_and_camera_obey(browser: Browser, tmp_path: Path) -> None:
     scene, path = sliding_scene(), tmp_path / "page.html"
     write(scene, path, large(camera(), 6), title="</script><b>& a 'scene' \"")
@@ -179,7 +148,7 @@ def test_fingers_turn_and_zoom(browser: Browser, tmp_path: Path) -> None:
     write(still_scene(), tmp_path / "page.html", large(camera(), 6))
     page = browser.open((tmp_path / "page.html").as_uri(), 320, 240, touch=True)
     page.wait_for("window.dyngs !== undefined")
-    assert page.evaluate("document.getElementById('bar').hidden")
+    assert page.evaluate("dyngs.parts.bar.hidden")
     before = page.evaluate("[dyngs.camera.yaw, dyngs.camera.distance]")
     session = page.driven.context.new_cdp_session(page.driven)
 
@@ -222,59 +191,16 @@ def test_a_browser_without_webgl_is_told(tmp_path: Path, browser: Browser) -> No
     page = browser.open(None)
     page.driven.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.driven.goto((tmp_path / "page.html").as_uri())
-    page.wait_for("document.getElementById('message').textContent.includes('WebGL 2')")
+    wait_for_line(page, "WebGL 2")
     page.close()
-
-
-class Served(SimpleHTTPRequestHandler):
-    """A folder on a web server, of which the blocks in ``cut_off`` arrive in part, once."""
-
-    cut_off: ClassVar[set[str]] = set()
-
-    def send_head(self) -> Any:
-        name = self.path.strip("/")
-        if name not in self.cut_off:
-            return super().send_head()
-        self.cut_off.remove(name)
-        self.send_response(200)
-        self.send_header("Content-Length", "99999")
-        self.end_headers()
-        return io.BytesIO(b"x")
-
-    def log_message(self, format: str, *args: Any) -> None: ...
-
-
-@contextmanager
-def served(folder: Path) -> Iterator[str]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Served, directory=str(folder))) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
-
-
-def levels_of_a_cloud(folder: Path, most: int | None = None) -> tuple[LevelScene, Cameras]:
-    """Five blocks of ``BLOCK`` Gaussians or fewer."""
-    gaussians = cloud(14_000, degree=1)
-    still = StaticScene(gaussians=gaussians.replace(log_scales=gaussians.log_scales - 1), background=torch.ones(3))
-    view = large(camera(), 6)
-    written = write_levels(replace(opened_scene(still), stated_up="-y"), folder, most=most, views=(view,))
-    assert written.num_bytes == sum(file.stat().st_size for file in folder.iterdir())
-    assert sorted(file.name for file in folder.iterdir()) == [*(f"0-{i}.bin" for i in range(4)), "1-0.bin", PAGE]
-    return LevelScene.of(still, most), view
-
-
-def from_afar(view: Cameras, factor: float) -> Cameras:
-    pose = view.cam_from_world.clone()
-    pose[0, 2, 3] *= factor
-    return replace(view, cam_from_world=pose)
 
 
 @needs_browser
 @pytest.mark.parametrize("most", [None, 9000])
 def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_path: Path) -> None:
     scene, view = levels_of_a_cloud(tmp_path / "page", most)
-    with served(tmp_path / "page") as address:
-        page = browser.open(address, 320, 240)
+    with served(tmp_path / "page") as server:
+        page = browser.open(server.address, 320, 240)
         page.wait_for("window.dyngs !== undefined")
         for factor in (1.0, 30.0):
             one = from_afar(view, factor)
@@ -284,21 +210,8 @@ def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_pa
             cut = page.evaluate("[...dyngs.renderer.motion.drawn].map((row) => dyngs.renderer.tree.countOf(row))")
             assert sum(cut) == drawn
         assert page.errors == []
-        assert all(request.startswith(address) for request in page.requests)
+        assert all(request.startswith(server.address) for request in page.requests)
         assert len(page.requests) == (6 if most is None else 2)
-        page.close()
-
-
-@needs_browser
-def test_what_a_server_cut_off_is_asked_for_again(browser: Browser, tmp_path: Path) -> None:
-    scene, view = levels_of_a_cloud(tmp_path / "page")
-    Served.cut_off |= {"1-0.bin", "0-2.bin"}
-    with served(tmp_path / "page") as address:
-        page = browser.open(address, 320, 240)
-        page.wait_for("document.getElementById('message').textContent.includes('trying again')")
-        page.wait_for("window.dyngs !== undefined")
-        assert psnr(shown(page, view, 0.0), scene.render(view).rgb[0]) > 38
-        assert page.evaluate("document.getElementById('message').hidden")
         page.close()
 
 
@@ -306,7 +219,7 @@ def test_what_a_server_cut_off_is_asked_for_again(browser: Browser, tmp_path: Pa
 def test_a_page_of_levels_from_a_disk_says_what_it_needs(browser: Browser, tmp_path: Path) -> None:
     levels_of_a_cloud(tmp_path / "page")
     page = browser.open((tmp_path / "page" / PAGE).as_uri(), 320, 240)
-    page.wait_for("document.getElementById('message').textContent.includes('http.server')")
+    wait_for_line(page, "http.server")
     page.close()
 
 
@@ -315,16 +228,16 @@ def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> Non
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").touch()
     with pytest.raises(DyngsError, match="exists already"):
-        write_levels(still, tmp_path / "full")
+        write_folder(still, tmp_path / "full")
     with pytest.raises(DyngsError, match="for still scenes"):
-        write_levels(opened_scene(sliding_scene()), tmp_path / "new")
+        write_folder(opened_scene(sliding_scene()), tmp_path / "new", most=9)
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine"]
 
 
 def test_a_page_names_no_host_and_allows_none(tmp_path: Path) -> None:
     write(still_scene(), tmp_path / "page.html", camera())
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert not re.findall(r"(?:https?:)?//[\w.-]+\.\w+|\bsrc=|@import|\burl\(", text)
+    assert not re.findall(r"(?:https?:)?//[\w.-]+\.\w+|<(?!dyngs-scene )\w+[^<>]*\bsrc=|@import|\burl\(", text)
     policy = re.findall(r'Content-Security-Policy" content="([^"]+)"', text)[0]
     assert policy.startswith("default-src 'none'; script-src 'sha256-")
     assert "unsafe" not in policy
@@ -395,6 +308,35 @@ def changed(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
     return a.shape != b.shape or bool(np.abs(a.astype(int) - b).max() > 40)
 
 
-def sliding_scene() -> GaussianScene:
-    """Five balls of which two go along x."""
-    return moving_scene(sliding_nodes())
+@needs_browser
+def test_a_long_clip_is_fetched_as_it_is_played(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, view = scene_of_kind("hexplane"), large(onlooker())
+    monkeypatch.setattr(numbers, "CHUNK_BYTES", 60)
+    scene = replace(scene, background=torch.ones(3))
+    written = write_folder(replace(opened_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,))
+    curves = written.header["curves"]
+    count = -(-(curves["points"] - 3) // curves["chunk"])
+    assert count == 8
+    assert len(list((tmp_path / "clip").glob("*.bin"))) == count
+    with served(tmp_path / "clip") as server:
+        server.failing |= {"7.bin": ["503"], "6.bin": ["silent"]}
+        page = browser.open(None, 320, 240)
+        page.driven.emulate_media(reduced_motion="reduce")  # it does not play by itself
+        page.driven.goto(server.address)
+        page.wait_for("window.dyngs !== undefined")
+        page.wait_for("dyngs.renderer.motion.drivers.chunks.held.size === 3")
+        assert not page.evaluate("dyngs.player.playing")
+        asked = [name for name in server.asked if name.endswith(".bin")]
+        assert (asked[0], sorted(asked)) == ("0.bin", ["0.bin", "1.bin", "2.bin"])
+        assert_alike(page, scene, view, scene.options)
+        assert server.asked.count("7.bin") == 2
+        assert page.evaluate("dyngs.renderer.motion.drivers.chunks.held.size") == 6
+        # the picture stands while a part is fetched, and the clock with it
+        page.evaluate("dyngs.release(), dyngs.player.seek(6.5 / 8), dyngs.play()")
+        page.driven.wait_for_timeout(300)
+        assert page.evaluate("dyngs.player.time") == pytest.approx(6.5 / 8)
+        page.wait_for("dyngs.player.time !== 6.5 / 8")
+        assert "6.bin" in server.asked
+        page.close()
