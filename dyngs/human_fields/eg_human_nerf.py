@@ -41,6 +41,7 @@ from dyngs.ops.rays import Rays
 
 OFFSETS = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01)  # Of guided samples from where the surface is expected, m
 LIMIT = 0.05  # Signed ray distances are learned up to here, m
+CLEAR = 0.01  # Signed ray distances from which a ray that misses the person is learned no more, m
 HIDDEN_BY = 0.03  # What lies so far behind the body is hidden by it, m
 SHARPNESS = 200.0  # Of the first surfaces, per m
 AROUND = 0.5  # Half of where rays are looked at without boundaries, m before and behind the middle of the key points
@@ -213,9 +214,12 @@ class EgHumanNerf(FieldNetwork):
         for samples in picture.samples:
             truth, alpha = (x.flatten()[samples.rays][:, None] for x in (image.depth, image.alpha))
             surface = truth / (scale * z[samples.rays][:, None])
-            wanted = torch.where(alpha > 0.5, surface - samples.at, LIMIT).clamp(-LIMIT, LIMIT)
-            counts = (alpha <= 0.5) | (truth > 0)
-            error = (samples.signed - wanted).abs() * counts
+            meets = alpha > 0.5
+            off = (samples.signed - (surface - samples.at).clamp(-LIMIT, LIMIT)).abs()
+            # a ray that misses has no distance: one that is large would outweigh those of rays that just meet a limb
+            error = torch.where(meets, off, (CLEAR - samples.signed).relu())
+            counts = ~meets | (truth > 0)
+            error = torch.where(counts, error, 0.0)
             total = total + error.sum() / (LIMIT * samples.at.shape[1] * counts.sum().clamp_min(1))
         return self.model.srdf_weight * total
 
