@@ -41,11 +41,12 @@ from dyngs.ops.rays import Rays
 
 OFFSETS = (-0.02, -0.01, -0.005, 0.0, 0.005, 0.01)  # Of guided samples from where the surface is expected, m
 LIMIT = 0.05  # Signed ray distances are learned up to here, m
+CLEAR = 0.01  # Signed ray distances from which a ray that misses the person is learned no more, m
 HIDDEN_BY = 0.03  # What lies so far behind the body is hidden by it, m
 SHARPNESS = 200.0  # Of the first surfaces, per m
 AROUND = 0.5  # Half of where rays are looked at without boundaries, m before and behind the middle of the key points
 GEOMETRY = 16  # Features of what is known about the surface at a sample
-HINTS = 6  # What is known of a sample from the body and the silhouettes
+HINTS = 8  # What is known of a sample and its ray from the body and the silhouettes
 _FAR = 1e3  # Stands for no depth, m
 
 
@@ -56,6 +57,17 @@ class Guided:
     rays: Tensor  # (R,) index of the pixel
     at: Tensor  # (R, K) distances along the ray, m
     signed: Tensor  # (R, K) m
+
+
+@dataclass(frozen=True)
+class Ray:
+    """What is known of R rays, (R, 1) each, lengths in m."""
+
+    begin: Tensor  # where they are looked at from
+    end: Tensor  # to where
+    body: Tensor  # where they meet the body
+    closest: Tensor  # least height above the body, which says whether clothes are met beside it
+    held: Tensor  # largest alpha that all images show of a sample: how far they are within the visual hull
 
 
 @dataclass(frozen=True)
@@ -137,11 +149,13 @@ class EgHumanNerf(FieldNetwork):
         at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
         points = (rays.origins[:, None] + rays.directions[:, None] * at[..., None]).flatten(0, 1)
         looked, prior = known.seen.look(points), self._prior(known, points, at, body)
-        hints = self._hints(looked, prior, body - at, (at - first) / (last - first))
+        closest, held = prior.amin(1, keepdim=True), looked.alpha.amin(0).view(at.shape).amax(1, keepdim=True)
+        whole = Ray(first, last, body, closest, held)
+        hints = self._hints(looked, prior, at, whole)
         guide = self.guide(torch.cat([mean_and_variance(looked.features), hints], -1))
         signed = prior + LIMIT * guide.view(at.shape)
         near = expected_surface(at.detach(), signed.detach())[:, None] + at.new_tensor(OFFSETS)
-        closer, colours = self._surface(known, rays, near, (at, signed, body, first, last))
+        closer, colours = self._surface(known, rays, near, (at, signed), whole)
         opacity = opacities(near, closer, self.sharpness.exp())
         through = torch.cumprod(torch.cat([torch.ones_like(opacity[:, :1]), 1 - opacity], 1), 1)
         weights = opacity * through[:, :-1]
@@ -149,10 +163,9 @@ class EgHumanNerf(FieldNetwork):
         return colour, through[:, -1], (weights * near).sum(1), [(at, signed), (near, closer)]
 
     def _surface(
-        self, known: Known, rays: Rays, at: Tensor, guide: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+        self, known: Known, rays: Rays, at: Tensor, guide: tuple[Tensor, Tensor], whole: Ray
     ) -> tuple[Tensor, Tensor]:
         """Return signed ray distances (R, K), m, and colours (R, K, 3) of samples at distances (R, K)."""
-        own_at, own_signed, body, first, last = guide
         seen, centers = known.seen, known.seen.sources.centers
         points = (rays.origins[:, None] + rays.directions[:, None] * at[..., None]).flatten(0, 1)
         looked = seen.look(points)
@@ -162,10 +175,9 @@ class EgHumanNerf(FieldNetwork):
         facts = torch.cat([hidden[..., None].to(apart), apart], -1)
         logits = self.attention(torch.cat([looked.features, facts], -1))[..., 0]
         weights = (logits - 1e4 * (hidden & ~hidden.all(0))).softmax(0)
-        prior = self._prior(known, points, at, body)
-        hints = self._hints(looked, prior, body - at, (at - first) / (last - first))
+        hints = self._hints(looked, self._prior(known, points, at, whole.body), at, whole)
         found = self.surface(torch.cat([mean_and_variance(looked.features, weights), hints], -1))
-        signed = interpolated(own_at, own_signed, at) + LIMIT * found[:, 0].view(at.shape)
+        signed = interpolated(*guide, at) + LIMIT * found[:, 0].view(at.shape)
         own = torch.cat([looked.rgb, looked.features[..., -FINE:]], -1)
         both = torch.cat([mean_and_variance(own, weights), found[:, 1:]], -1).expand(len(own), -1, -1)
         colours = blended(self.blend(torch.cat([own, both, facts], -1))[..., 0], looked.rgb, hidden)
@@ -181,12 +193,14 @@ class EgHumanNerf(FieldNetwork):
             return (body - at).clamp(-AROUND, AROUND)
         return known.own.boundaries.height(points).view(at.shape).clamp(-LIMIT, LIMIT)
 
-    def _hints(self, looked: Look, prior: Tensor, ahead: Tensor, place: Tensor) -> Tensor:
-        """Return (R K, 6): the distance to the body in any direction and along the ray (R, K), m, where in its interval
-        a sample is, and if silhouettes hold it."""
+    def _hints(self, looked: Look, prior: Tensor, at: Tensor, ray: Ray) -> Tensor:
+        """Return (R K, HINTS): the distance to the body in any direction and along the ray, where in its interval a
+        sample is, how near the ray comes to the body, and if silhouettes hold the sample, and any of the ray."""
         limit = OUTWARDS if self.model.boundaries else AROUND
-        along = ahead.clamp(-limit, limit) / OUTWARDS
-        known = torch.stack([prior / LIMIT, prior.abs() / LIMIT, along, place], -1).flatten(0, 1)
+        along = (ray.body - at).clamp(-limit, limit) / OUTWARDS
+        place = (at - ray.begin) / (ray.end - ray.begin)
+        parts = [prior / LIMIT, prior.abs() / LIMIT, along, place, ray.closest / LIMIT, ray.held]
+        known = torch.stack([x.expand_as(at) for x in parts], -1).flatten(0, 1)
         return torch.cat([known, looked.alpha.amin(0)[:, None], looked.alpha.mean(0)[:, None]], -1)
 
     def penalty(self, picture: Picture, image: Image, scale: float) -> Tensor:
@@ -200,9 +214,12 @@ class EgHumanNerf(FieldNetwork):
         for samples in picture.samples:
             truth, alpha = (x.flatten()[samples.rays][:, None] for x in (image.depth, image.alpha))
             surface = truth / (scale * z[samples.rays][:, None])
-            wanted = torch.where(alpha > 0.5, surface - samples.at, LIMIT).clamp(-LIMIT, LIMIT)
-            counts = (alpha <= 0.5) | (truth > 0)
-            error = (samples.signed - wanted).abs() * counts
+            meets = alpha > 0.5
+            off = (samples.signed - (surface - samples.at).clamp(-LIMIT, LIMIT)).abs()
+            # a ray that misses has no distance: one that is large would outweigh those of rays that just meet a limb
+            error = torch.where(meets, off, (CLEAR - samples.signed).relu())
+            counts = ~meets | (truth > 0)
+            error = torch.where(counts, error, 0.0)
             total = total + error.sum() / (LIMIT * samples.at.shape[1] * counts.sum().clamp_min(1))
         return self.model.srdf_weight * total
 
