@@ -88,7 +88,7 @@ def pytest_sessionfinish() -> None:
 
 
 @pytest.fixture(scope="session")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def numbered_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Empty folders. (Each numbered folder of pytest lists all before it: a minute, for those of all tests.)"""
     base = tmp_path_factory.mktemp("tests")
 
@@ -101,17 +101,17 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture
-def tmp_path(folders: Iterator[Path]) -> Path:
+def tmp_path(numbered_folders: Iterator[Path]) -> Path:
     """A folder of this test alone."""
-    return next(folders)
+    return next(numbered_folders)
 
 
 @pytest.fixture(autouse=True)
-def empty_folder(folders: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def empty_folder(numbered_folders: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test runs in an empty folder, as a user would: nothing is left in the checkout, and processes that a test
     starts import the installed package, not the sources beside them. The user's cache is another empty folder."""
-    monkeypatch.chdir(next(folders))
-    monkeypatch.setenv("DYNGS_CACHE_DIR", str(next(folders)))
+    monkeypatch.chdir(next(numbered_folders))
+    monkeypatch.setenv("DYNGS_CACHE_DIR", str(next(numbered_folders)))
 
 
 @pytest.fixture(autouse=True)

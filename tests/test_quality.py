@@ -61,31 +61,33 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
     That learns at the same rates: its own, for so short a run, would favour it.
     """
     captured = Captured.of(tmp_path, "wave", "--size", "32", "--views", "32")
-    keys = ("train.steps=400", "init.num_random=1000", "strategy.max_gaussians=1500", "train.initial_downscale=1")
+    keys = ("train.steps=600", "init.num_random=1000", "strategy.max_gaussians=1500", "train.initial_downscale=1")
     moving, static = (captured.report(preset, *keys, "optim.rate_factor=1") for preset in ("dynamic", "static"))
     assert moving.moving_fraction > 0.9
-    assert moving.psnr > 21.0  # 21.30
-    assert moving.psnr > static.psnr  # 20.43
+    assert moving.psnr > 21.9  # 22.23 to 22.33 by instruction set; after 400 steps too little is learned to tell
+    assert moving.psnr > static.psnr  # 21.78 to 22.09
     assert moving.psnr_moving is not None
     assert static.psnr_moving is not None
-    assert moving.psnr_moving > max(16.5, static.psnr_moving + 1)  # 16.83, 15.09
+    assert moving.psnr_moving > max(17.4, static.psnr_moving + 1)  # 17.71 to 17.98, 15.96 to 16.07
     assert moving.track_error_px is not None
     assert moving.track_motion_px is not None
-    assert moving.track_error_px < 0.75 * moving.track_motion_px  # 0.707, 0.972
+    assert moving.track_error_px < 0.7 * moving.track_motion_px  # 0.593 to 0.629, 0.972
 
 
 def test_a_ball_that_rolls_is_followed_as_a_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It turns almost three times in 40 images; control nodes alone have 20.59 dB, and 11.33 on what moves.
 
-    So short a run would look for it in six of them.
+    So short a run would look for it in six of them. Of twelve seeds ten find it; seed 0 does with all instruction sets.
     """
     monkeypatch.setattr("dyngs.deform.kind.STEPS_PER_SHOT", 1)
     captured = Captured.of(tmp_path, "roll", "--size", "64", "--views", "40")
     few = ("init.num_random=1500", "strategy.max_gaussians=3000", "model.num_random_moving=400")
-    report = captured.report("dynamic", *few, "train.steps=300", "model.choose=false", "train.initial_downscale=1")
-    assert report.psnr > 21.4  # 21.78
+    report = captured.report(
+        "dynamic", *few, "train.steps=300", "model.choose=false", "train.initial_downscale=1", "run.seed=0"
+    )
+    assert report.psnr > 22.1  # 22.46 to 22.61
     assert report.psnr_moving is not None
-    assert report.psnr_moving > 15.1  # 15.46
+    assert report.psnr_moving > 17.6  # 17.98 to 18.72
 
 
 def test_a_person(tmp_path: Path) -> None:
