@@ -73,6 +73,8 @@ def settle(page: Page, browsing: Browsing) -> None:
     until(lambda: browsing.session.eye is not None and browsing.session.eye.size[0] < SIZE[0], page)
     until(lambda: browsing.num_sent > 0 and browsing.session.due() is None, page)
     page.driven.wait_for_timeout(600)
+    for close in page.driven.locator(".mantine-Notification-closeButton").all():
+        close.click()  # viser says, before the image, that there is no GPU
     until(lambda: browsing.session.due() is None, page)
     until(lambda: bool((page.screenshot()[-5, 300] >= 254).all()), page)  # no longer dimmed, as before it is connected
 
