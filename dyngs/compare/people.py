@@ -105,6 +105,10 @@ def compare_people(
         DyngsError: no such networks or people, ``out`` is not empty, or nothing could be predicted.
     """
     require_empty(out)
+    names = [network.stem for network in bench.networks]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise DyngsError(f"two networks are named {twice}; the table needs one name each: rename a run")
     loaded = [(network.stem, *trained_network(network)) for network in bench.networks]
     given = DataConfig.model_validate({"root": bench.people})
     if bench.data:
@@ -120,14 +124,14 @@ def compare_people(
                 make = partial(
                     kind_of(config.model).predictor, config, checkpoint, data, say=say, report=report_nothing
                 )
-                methods = [*_methods(make, name, config)]
+                views, methods = make().views, [*_methods(make, name, config)]
                 if bench.avatar_minutes is not None and name == loaded[0][0]:
-                    methods.append(_avatar(data, make().views, 60 * bench.avatar_minutes))
+                    methods.append(_avatar(data, views, 60 * bench.avatar_minutes))
                 tests = read_capture(data).splits.get("test", ())
                 for method in methods:
                     try:
                         for count in bench.counts:
-                            task = task_of(make().views, tests, count, number, bench.spread)
+                            task = task_of(views, tests, count, number, bench.spread)
                             found += _scores(method, task, data, folder / "pictures")
                     except DyngsError as error:
                         say(f"{method.name} left out: {error}")

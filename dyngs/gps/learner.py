@@ -85,9 +85,13 @@ class GpsPredictor:
             both = images[pair.left], images[pair.right]
             found.append(self._seen_in(*both))
             centers.append(torch.cat([image.cameras.centers for image in both]).mean(0))
-        background = evaluation_background(self.config.data.background, True)[1]
+        gaussians, background = Gaussians.joined(found), evaluation_background(self.config.data.background, True)[1]
+        if not len(gaussians):
+            raise DyngsError(
+                f"{self.name}: no surface is found inside the silhouettes; is a mask or the calibration wrong?"
+            )
         return StaticScene(
-            gaussians=Gaussians.joined(found),
+            gaussians=gaussians,
             sides=Sides.joined(found, centers) if len(pairs) > 1 else None,
             options=render_options(self.model),
             background=background,

@@ -58,3 +58,9 @@ def test_a_table_scores_and_pictures(network: Path, folder: Path, tmp_path: Path
     assert all("net left out: " in line and "degrees apart" in line for line in said)
     assert len(said) == PEOPLE.people
     assert not (tmp_path / "other").exists()
+
+
+def test_networks_of_the_same_name_are_not_mixed(network: Path, folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match="two networks are named net"):
+        compare_people(PeopleBench(folder, [network, tmp_path / "other" / "net"], (2,)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -179,3 +179,12 @@ def test_published_weights_predict_somebody_unknown(tmp_path: Path) -> None:
     rows, columns = (slice(int(x.min()), int(x.max()) + 1) for x in image.alpha.nonzero(as_tuple=True))
     found = psnr(drawn[rows, columns].clamp(0, 1), truth[rows, columns])
     assert found > 24.5
+
+
+def test_a_surface_that_no_silhouette_holds_is_one_line(
+    run: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dyngs.gps.learner._FAINT", 2.0)
+    with pytest.raises(DyngsError, match="no surface is found inside the silhouettes"):
+        predict(run, person_of(folder), tmp_path / "out", ("f000_c03.png", "f000_c05.png"))
+    assert not (tmp_path / "out").exists()
