@@ -15,16 +15,18 @@ def test_the_collector_rests_during_imports_and_forgets_what_they_made(monkeypat
     frozen = gc.get_freeze_count()
     with heavy_imports():
         assert not gc.isenabled()
-        kept = [[] for _ in range(1000)]
+        kept = [[] for _ in range(100_000)]
     assert gc.isenabled()
-    assert gc.get_freeze_count() >= frozen + len(kept)
+    assert gc.get_freeze_count() > frozen + len(kept) // 2  # half, as what was frozen before may be freed meanwhile
 
 
 def test_the_collector_stays_as_it_is_where_torch_is_there_already() -> None:
     frozen = gc.get_freeze_count()
     with heavy_imports():
         assert gc.isenabled()
-    assert gc.get_freeze_count() == frozen
+        kept = [[] for _ in range(1000)]
+    # What was frozen before can be freed at any moment, so the count may fall; it must not take up what is new.
+    assert gc.get_freeze_count() < frozen + len(kept)
 
 
 def test_the_collector_goes_on_after_an_import_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
