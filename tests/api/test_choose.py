@@ -17,7 +17,7 @@ from two_balls import two_balls
 from dyngs.api import choose as module
 from dyngs.api.choose import Choice, OpenSetting, _Plan, as_static, choose, write_choices
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, DynamicModel, StaticModel
+from dyngs.config import Config, DataConfig, DynamicModel
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
@@ -208,7 +208,7 @@ def test_as_static_has_the_static_preset_and_what_was_requested(moving: Path) ->
     assert plain.model_copy(update={"run": static.run}) == static
     keys = ("model.sh_degree=2", "train.ssim_weight=0.5", "optim.lr_means=1e-3", "strategy.kind=mcmc")
     found = as_static(preset(moving, *keys, "strategy.max_gaussians=77"))
-    assert found.model == StaticModel(sh_degree=2)
+    assert found.model == static.model.model_copy(update={"sh_degree": 2})
     assert (found.train.ssim_weight, found.optim.lr_means) == (0.5, 1e-3)
     assert (found.strategy.kind, found.strategy.growth_limit) == ("mcmc", 77)
 
