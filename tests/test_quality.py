@@ -61,33 +61,33 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
     That learns at the same rates: its own, for so short a run, would favour it.
     """
     captured = Captured.of(tmp_path, "wave", "--size", "32", "--views", "32")
-    keys = ("train.steps=600", "init.num_random=1000", "strategy.max_gaussians=1500", "train.initial_downscale=1")
+    keys = ("train.steps=800", "init.num_random=1000", "strategy.max_gaussians=1500", "train.initial_downscale=1")
     moving, static = (captured.report(preset, *keys, "optim.rate_factor=1") for preset in ("dynamic", "static"))
     assert moving.moving_fraction > 0.9
-    assert moving.psnr > 21.9  # 22.23 to 22.33 by instruction set; after 400 steps too little is learned to tell
-    assert moving.psnr > static.psnr  # 21.78 to 22.09
+    assert moving.psnr > 22.5  # 22.86 to 23.06 by instruction set; after 600 steps too little is learned to tell
+    assert moving.psnr > static.psnr  # 22.37 to 22.42
     assert moving.psnr_moving is not None
     assert static.psnr_moving is not None
-    assert moving.psnr_moving > max(17.4, static.psnr_moving + 1)  # 17.71 to 17.98, 15.96 to 16.07
+    assert moving.psnr_moving > max(17.0, static.psnr_moving + 1)  # 17.34 to 17.80, 15.90 to 15.94
     assert moving.track_error_px is not None
     assert moving.track_motion_px is not None
-    assert moving.track_error_px < 0.7 * moving.track_motion_px  # 0.593 to 0.629, 0.972
+    assert moving.track_error_px < 0.7 * moving.track_motion_px  # 0.541 to 0.586, 0.972
 
 
 def test_a_ball_that_rolls_is_followed_as_a_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It turns almost three times in 40 images; control nodes alone have 20.59 dB, and 11.33 on what moves.
+    """It turns almost three times in 40 images; control nodes alone have 21.1 dB, and 11.6 on what moves.
 
-    So short a run would look for it in six of them. Of twelve seeds ten find it; seed 0 does with all instruction sets.
+    So short a run would look for it in six of them. Two of three runs find it; seeds 2 and 4 do with all instruction sets.
     """
     monkeypatch.setattr("dyngs.deform.kind.STEPS_PER_SHOT", 1)
     captured = Captured.of(tmp_path, "roll", "--size", "64", "--views", "40")
     few = ("init.num_random=1500", "strategy.max_gaussians=3000", "model.num_random_moving=400")
     report = captured.report(
-        "dynamic", *few, "train.steps=300", "model.choose=false", "train.initial_downscale=1", "run.seed=0"
+        "dynamic", *few, "train.steps=300", "model.choose=false", "train.initial_downscale=1", "run.seed=4"
     )
-    assert report.psnr > 22.1  # 22.46 to 22.61
+    assert report.psnr > 22.8  # 23.19 to 23.28
     assert report.psnr_moving is not None
-    assert report.psnr_moving > 17.6  # 17.98 to 18.72
+    assert report.psnr_moving > 18.7  # 19.10 to 19.70
 
 
 def test_a_person(tmp_path: Path) -> None:
