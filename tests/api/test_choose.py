@@ -126,6 +126,19 @@ def test_what_is_requested_for_what_moves_is_used(tmp_path: Path) -> None:
         assert requested.model.deform.kind == ("hexplane" if "hex" in key else "control_nodes")
 
 
+def test_before_fixed_cameras_nothing_is_thinner_than_they_show(
+    moving: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = DynamicOptions(size=24, num_times=8, num_cameras=3, samples=1)
+    fixed = write_dynamic_capture("room", tmp_path / "room", options)
+    short = "train.steps=400"
+    assert decided(preset(fixed, short))[0].model.filter_3d
+    assert "fixed cameras, 3 at a time: nothing is drawn thinner than they show" in capsys.readouterr().out
+    assert not decided(preset(fixed, short, "model.filter_3d=false"))[0].model.filter_3d
+    assert not decided(preset(moving, short))[0].model.filter_3d
+    assert "thinner" not in capsys.readouterr().out
+
+
 def test_settings_of_a_static_scene_are_asked_only_where_they_are_auto(
     still: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
