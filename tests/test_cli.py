@@ -190,7 +190,7 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("export nowhere --time inf", "'inf' is not a time"),
         ("export nowhere --time 0 --times 0:1:2", "not allowed with"),
         ("export nowhere --static --dynamic", "not allowed with"),
-        ("export nowhere --format tracks --static", "--static goes with --format ply"),
+        ("export nowhere --format tracks --static", "--static does not go with --format tracks"),
         ("export nowhere --format xyz", "invalid choice: 'xyz'"),
         ("data", "COMMAND"),
         ("data inspect nowhere", "nowhere"),

@@ -249,6 +249,7 @@ def print_notes(notes: tuple[str, ...], warnings: tuple[str, ...] = ()) -> None:
 
 
 def print_written(*paths: Path) -> None:
-    """Print where files are and how large."""
+    """Print where files, or a folder of them, are and how large."""
+    files = [file for path in paths for file in ((path,) if path.is_file() else path.rglob("*"))]
     where = paths[0] if len(paths) == 1 else f"{len(paths)} files, {paths[0]} to {paths[-1].name}"
-    print(f"written: {where} ({sum(path.stat().st_size for path in paths) / 1e6:.1f} MB)")
+    print(f"written: {where} ({sum(file.stat().st_size for file in files) / 1e6:.1f} MB)")

@@ -23,31 +23,30 @@ _OTHER_SUFFIXES |= {".html": "html", ".json": "cameras"}
 
 _TIMES, _PARTS, _AXES = ("time", "times"), ("static", "dynamic"), ("up", "from_up", "sh_degree")
 _SHOWN = {"surface": "mesh"}  # Names of --format, where these are others
-_FOR_DYNGS = {"max_change": "it goes with --format dyngs"}
 _FOR_SPLATS = dict.fromkeys(_AXES, "it goes with files of Gaussians")
 _UNFIT: dict[str, dict[str, str]] = {
-    "cameras": dict.fromkeys((*_TIMES, "motion", "max_change", *_PARTS, *_AXES), ""),
+    "cameras": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
     "html": {
         "times": "the page plays the whole clip",
         **dict.fromkeys(_PARTS, "the page shows the whole scene"),
-        **_FOR_DYNGS,
         "up": "the page turns with the scene; --from-up names its axis",
         "sh_degree": "the page has the colours of the run",
     },
-    "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up") | _FOR_DYNGS,
-    "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface at its time") | _FOR_DYNGS,
+    "mesh": dict.fromkeys((*_TIMES, *_PARTS, *_AXES), "the file has the rest pose, y up"),
+    "surface": dict.fromkeys(("motion", *_PARTS, *_AXES), "the file has the surface at its time"),
     "dyngs": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it stores the full run") | _FOR_SPLATS,
     "avatar": dict.fromkeys((*_TIMES, "motion", *_PARTS), "it is the same in all poses") | _FOR_SPLATS,
-    "network": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), "") | _FOR_DYNGS,
-    "tracks": _FOR_SPLATS,
-    "bodies": dict.fromkeys(("times", "motion", "joints", *_PARTS), "the file has the whole clip")
-    | {"sh_degree": "the file has the colours of the run"}
-    | _FOR_DYNGS,
+    "network": dict.fromkeys((*_TIMES, "motion", *_PARTS, *_AXES), ""),
+    "tracks": _FOR_SPLATS | {"static": "Gaussians that never move have none"},
+    "bodies": dict.fromkeys(
+        ("times", "motion", "joints", "folder", "sh_degree", *_PARTS), "the file has the whole clip"
+    ),
 }
 """Options that do not go with a format, and why."""
 _ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of a person"))
-_ONLY |= {"folder": ("html", "html"), "max_gaussians_drawn": ("html", "html --folder")}
-"""Options that go with one format, and how it is asked for."""
+_ONLY |= {"folder": ("html sog", "html or sog"), "max_gaussians_drawn": ("html", "html --folder")}
+_ONLY |= {"max_change": ("dyngs", "dyngs")}
+"""Options, the formats that they go with, and how these are asked for."""
 
 _EPILOG = """\
 examples:
@@ -57,7 +56,6 @@ examples:
   dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
   dyngs export runs/dance --out dance.4dgs                        all training times in one file
   dyngs export runs/balls --bodies --out balls.glb                balls that roll as animated nodes
-  dyngs export runs/dance --static --out stage.ply                only the Gaussians that never move
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
   dyngs export runs/ann --format mesh --motion walk.npz --out ann.glb   skinned and textured, for Blender, three.js ...
@@ -69,6 +67,7 @@ examples:
   dyngs export runs/stereo --format network --out net.safetensors   the weights of a network, for `dyngs predict`
   dyngs export runs/dance --out dance.html                        a page that plays in any browser, offline
   dyngs export town.ply --format html --folder --out town         a large scene, fetched as it is looked at
+  dyngs export town.ply --format sog --folder --out town_sog      the same for PlayCanvas and SuperSplat
 """
 
 
@@ -93,8 +92,8 @@ def add_parser(commands: args.Commands) -> None:
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
     args.add_motion(parser)
     about = (
-        "--format dyngs: largest root-mean-square change of the images, in grey levels of 255 (default: what lowers "
-        "the PSNR of training views by 0.025 dB)"
+        "--format dyngs: largest root-mean-square change of the images, in grey levels of 255 (default: what costs "
+        "0.025 dB on training views)"
     )
     parser.add_argument("--max-change", type=float, metavar="X", help=about)
     about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
@@ -103,7 +102,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--cells", type=int, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
     parser.add_argument("--segments", type=int, metavar="N", help=about)
-    about = "--format html: a folder for a web server, of which the page fetches what is seen; for other pages, too"
+    about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
     args.add_most_drawn(parser, "--folder: so many Gaussians of an image are drawn at most, as on phones")
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
@@ -130,9 +129,6 @@ def run(arguments: argparse.Namespace) -> int:
     writers |= {"surface": _export_surface, "network": _export_network}
     if arguments.bodies:
         return _export_bodies(arguments)
-    for option, (only, asked) in _ONLY.items():
-        if kind != only and getattr(arguments, option) not in (None, False):
-            raise DyngsError(f"--{option.replace('_', '-')} goes with --format {asked}")
     if kind == "mesh" or arguments.joints:
         return _export_rigged(arguments, kind)
     is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
@@ -140,14 +136,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH")
     if kind in writers:
         return writers[kind](arguments)
-    if arguments.max_change is not None:
-        raise DyngsError("--max-change goes with --format dyngs")
-    if kind == "tracks" and arguments.static:
-        raise DyngsError("--static goes with --format ply; Gaussians that never move have no tracks")
     times = _times(arguments)
     opened = _moved(arguments, open_scene(arguments.run_dir, data_root=args.data_root(arguments)))
-    if arguments.motion is not None:
-        times = opened.scene.times if times is None else times
+    times = opened.scene.times if arguments.motion is not None and times is None else times
     if opened.scene.is_static and times is not None:
         args.print_notes(("nothing moves in this run: it is the same at all times",))
     if kind == "tracks":
@@ -170,6 +161,9 @@ def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
         passed = getattr(arguments, name)
         if passed is not None and passed is not False:  # a time may be 0
             raise DyngsError(f"--{name.replace('_', '-')} does not go with {format}{reason and f': {reason}'}")
+    for name, (only, asked) in _ONLY.items():
+        if kind not in only.split() and getattr(arguments, name) not in (None, False):
+            raise DyngsError(f"--{name.replace('_', '-')} goes with --format {asked}")
 
 
 def _kind(arguments: argparse.Namespace) -> str:
@@ -232,7 +226,7 @@ def _export_splats(
 ) -> list[Path]:
     """Write a sequence if several times of a moving scene are requested, else one file; return the paths."""
     from dyngs.export.redrawn import compare_run
-    from dyngs.export.splat_files import scene_part, write_run_sequence, write_run_splats, writing_of
+    from dyngs.export.splat_files import scene_part, write_run_levels, write_run_sequence, write_run_splats, writing_of
     from dyngs.splats.formats import format_named, known_format, read_splats
 
     own, part = format_named(kind), _part(arguments)
@@ -247,6 +241,14 @@ def _export_splats(
     if is_sequence and is_file and not arguments.static:
         raise DyngsError(f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file")
     args.print_notes((line,))
+    if arguments.folder:
+        if is_file or is_sequence:
+            raise DyngsError(f"{out}: --folder writes a folder of one time; give --out FOLDER, and --time T")
+        path = out or arguments.run_dir / "sog"
+        counts, notes = write_run_levels(opened, path, (times or (0.0,))[0], part, how)
+        levels = f"levels of {', '.join(f'{count:,}' for count in counts)} Gaussians"
+        args.print_notes((*notes, f"{levels}; viewers open its lod-meta.json"))
+        return [path]
     if is_sequence and not arguments.static:
         moments = times or ()
         written = write_run_sequence(opened, out or arguments.run_dir / stem, moments, part, how, suffix)
@@ -254,9 +256,8 @@ def _export_splats(
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
-            args.print_notes(
-                ("this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence",)
-            )
+            line = "this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence"
+            args.print_notes((line,))
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
         written = [write_run_splats(opened, path, moments[0], part, how)]
@@ -453,10 +454,9 @@ def _export_page(arguments: argparse.Namespace) -> int:
         raise DyngsError(f"{source}: where to? Give --out {'FOLDER' if folder else 'FILE.html'}")
     out: Path = arguments.out or source / ("scene" if folder else "scene.html")
     is_page = out.suffix.lower() in (".html", ".htm")
-    if folder and is_page:
-        raise DyngsError(f"{out}: --folder writes a folder; give --out {out.with_suffix('')}")
-    if not folder and (not is_page or out.is_dir()):
-        raise DyngsError(f"{out}: --format html writes one file; give --out {out.with_suffix('.html')}")
+    if folder == is_page or (not folder and out.is_dir()):
+        what, suffix = ("--folder writes a folder", "") if folder else ("--format html writes one file", ".html")
+        raise DyngsError(f"{out}: {what}; give --out {out.with_suffix(suffix)}")
     opened = _moved(arguments, open_scene(source, data_root=args.data_root(arguments)))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     written = write_folder(opened, out, most=most, time=time) if folder else write_page(opened, out, time=time)

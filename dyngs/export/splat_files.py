@@ -22,9 +22,10 @@ from dyngs.gaussians.colour.bake import with_harmonics
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
-from dyngs.splats.formats import Written, moved_file, turned_file, write_splats
+from dyngs.splats.formats import Written, fitted, format_named, moved_file, turned_file, write_splats
 from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
 from dyngs.splats.similarity import UNMOVED, Similarity
+from dyngs.splats.sog_levels import write_sog_levels
 from dyngs.splats.splat_file import SplatFile, drawable, from_linear, geo_comment, unit_rotations
 
 Part = Literal["all", "moving", "still"]
@@ -133,6 +134,19 @@ def write_run_sequence(
             with suppress(OSError):
                 folder.rmdir()  # only succeeds while it is empty
     return [replace(one, path=folder / name) for one, name in zip(written, names, strict=True)]
+
+
+def write_run_levels(
+    opened: Opened, folder: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level, and notes.
+
+    Raises DyngsError: the part is empty, or the folder holds something.
+    """
+    inputs_of(opened).require_output(folder)
+    splat = splats_at(opened, scene_part(opened.scene, part), time, how)
+    whole, notes = fitted(folder, format_named("sog"), splat, how.sh_degree)
+    return write_sog_levels(folder, whole), notes
 
 
 def frame_names(count: int, suffix: str = ".ply") -> list[str]:

@@ -137,6 +137,24 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
     """
     path = Path(path)
     own = format_of(path)
+    whole, notes = fitted(path, own, splat, sh_degree)
+    with atomic_file(path) as temporary:
+        try:
+            own.writer(temporary, whole)
+        except DyngsError as error:
+            reason = str(error).removeprefix(f"{temporary}: ")
+            raise DyngsError(f"{path}: not written: {reason}") from error
+    if not own.holds_comments and splat.edited != UNMOVED:
+        write_note(path, splat.edited)
+        notes += (f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does",)
+    return Written(path, whole, notes)
+
+
+def fitted(path: Path, own: Format, splat: SplatFile, sh_degree: int | None) -> tuple[SplatFile, tuple[str, ...]]:
+    """Return what a format can hold of a scene, on the CPU, and a line about each thing that it cannot.
+
+    ``path``: for messages. ``sh_degree`` and errors: as of ``write_splats``.
+    """
     gaussians, notes = splat.gaussians.detach().to(device="cpu", dtype=torch.float32), []
     require_writable(path, gaussians)
     if sh_degree is not None and sh_degree > own.max_degree:
@@ -147,17 +165,7 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
         notes.append(f"harmonics above degree {degree} are left out: {why}")
     if splat.mode is RasterizeMode.ANTIALIASED and not own.states_mode:
         notes.append(f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker")
-    whole = replace(splat, gaussians=_unit(with_degree(gaussians, degree)))
-    with atomic_file(path) as temporary:
-        try:
-            own.writer(temporary, whole)
-        except DyngsError as error:
-            reason = str(error).removeprefix(f"{temporary}: ")
-            raise DyngsError(f"{path}: not written: {reason}") from error
-    if not own.holds_comments and splat.edited != UNMOVED:
-        write_note(path, splat.edited)
-        notes.append(f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does")
-    return Written(path, whole, tuple(notes))
+    return replace(splat, gaussians=_unit(with_degree(gaussians, degree))), tuple(notes)
 
 
 def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:

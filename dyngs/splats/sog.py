@@ -9,6 +9,8 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -85,6 +87,14 @@ def read_sog(path: Path) -> SplatFile:
 def write_sog(path: Path, splat: SplatFile) -> None:
     """Write a .sog of version 2, harmonics up to degree 3."""
     gaussians = splat.gaussians.select(torch.from_numpy(morton_order(splat.gaussians.means.numpy())))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in sog_parts(replace(splat, gaussians=gaussians)):
+            archive.writestr(zipfile.ZipInfo(name), data)  # without the time of day: equal scenes, equal bytes
+
+
+def sog_parts(splat: SplatFile) -> Iterator[tuple[str, bytes]]:
+    """Yield the names and contents of the files that a .sog holds; Gaussians stay in their order."""
+    gaussians = splat.gaussians
     n = len(gaussians)
     width = 4 * int(np.ceil(np.sqrt(n) / 4))
     height = int(np.ceil(n / width))
@@ -128,9 +138,9 @@ def write_sog(path: Path, splat: SplatFile) -> None:
         images["shN_centroids.webp"] = _palette_image(nearest_entries(values, rows))
         files = ["shN_centroids.webp", labelled]
         meta["shN"] = {"count": len(rows), "bands": gaussians.sh_degree, "codebook": values.tolist(), "files": files}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in (("meta.json", json.dumps(meta).encode()), *((n, _encoded(x)) for n, x in images.items())):
-            archive.writestr(zipfile.ZipInfo(name), data)  # without the time of day: equal scenes, equal bytes
+    yield "meta.json", json.dumps(meta).encode()
+    for name, image in images.items():
+        yield name, _encoded(image)
 
 
 def _palette_image(indices: np.ndarray) -> np.ndarray:

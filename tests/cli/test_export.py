@@ -110,6 +110,20 @@ def test_a_page_as_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "exists already" in capsys.readouterr().err
 
 
+def test_sog_in_levels_is_a_folder(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["export", str(run), "--format", "sog", "--folder", "--out"]
+    assert main([*words, str(tmp_path / "town"), "--time", "0.5"]) == 0
+    assert (tmp_path / "town" / "lod-meta.json").is_file()
+    said = capsys.readouterr()
+    assert "written" in said.out and "(0.0 MB)" in said.out
+    for more, part in (("town.sog", "writes a folder"), ("town", "exists already")):
+        assert main([*words, str(tmp_path / more), "--time", "0.5"]) == 2
+        assert part in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "several"), "--times", "0:1:3"]) == 2
+    assert "of one time" in capsys.readouterr().err
+    assert not (tmp_path / "several").exists()
+
+
 def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
     dotted = shutil.copytree(run, tmp_path / "rc_0.2")
     assert main(["export", str(dotted), "--format", "html"]) == 0
