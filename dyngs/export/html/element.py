@@ -13,11 +13,12 @@ SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 
 
 def element_script() -> str:
-    """Return the script: it needs nothing else and leaves no other name behind."""
+    """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages may be of any."""
     texts = {"STYLE": text_of("scene.css"), "SHADERS": {name: text_of(name) for name in SHADERS}}
     constants = [f"const {name} = {script_safe(value)};" for name, value in texts.items()]
     parts = "\n".join([*constants, *map(text_of, SCRIPTS)])
-    return f'// <dyngs-scene src="PAGE">: a scene of dyngs (Apache-2.0).\n(() => {{\n"use strict";\n{parts}}})();\n'
+    script = f'// <dyngs-scene src="PAGE">: a scene of dyngs (Apache-2.0).\n(() => {{\n"use strict";\n{parts}}})();\n'
+    return script.encode("ascii", "backslashreplace").decode("ascii")
 
 
 def text_of(name: str) -> str:

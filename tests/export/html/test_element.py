@@ -207,6 +207,22 @@ def test_a_scene_out_of_sight_is_not_asked_for(browser: Browser, site: Path) -> 
         page.close()
 
 
+@needs_browser
+def test_a_page_need_not_say_that_it_is_utf_8(browser: Browser, site: Path) -> None:
+    write(sliding_scene(), site / "moving.html", large(camera()))
+    element = '<dyngs-scene src="moving.html" style="width: 320px; height: 200px"></dyngs-scene>'
+    (site / "old.html").write_bytes(f'<!DOCTYPE html><script src="{ELEMENT}"></script>{element}'.encode("ascii"))
+    with served(site) as server:
+        page = browser.open(server.address + "old.html", 400, 300)
+        wait_for_scene(page)
+        root = "document.querySelector('dyngs-scene').root"
+        assert page.evaluate("document.characterSet") != "UTF-8"
+        assert page.evaluate(f"{root}.getElementById('play').textContent") == "\u25b6"
+        tops = f"[...{root}.querySelectorAll('#play, #seconds, #bar label, #bar select')].map((x) => x.offsetTop)"
+        assert max(page.evaluate(tops)) - min(page.evaluate(tops)) < 8
+        page.close()
+
+
 def test_the_script_stands_alone() -> None:
     script = element_script()
     assert "</script" not in script
