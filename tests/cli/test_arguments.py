@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.cli import main, make_parser
-from dyngs.cli.arguments import input_path, input_word, output_path
+from dyngs.cli.arguments import input_path, input_word, output_path, print_written
 from dyngs.config.io import RESOLVED_NAME, load_config, load_resolved, packaged_preset, save_config
 from dyngs.view.source import open_source
 
@@ -247,3 +247,13 @@ def test_resuming_notes_it_for_later_commands(
     assert main(["train", "--resume", str(run), "train.steps=12"]) == 0
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["step"] == 12
+
+
+def test_the_size_of_a_folder_is_that_of_all_that_lies_in_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    for name in ("a", "in/b"):
+        (tmp_path / name).write_bytes(bytes(300_000))
+    print_written(tmp_path)
+    assert capsys.readouterr().out == f"written: {tmp_path} (0.6 MB)\n"
