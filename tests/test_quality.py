@@ -77,7 +77,7 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
 def test_a_ball_that_rolls_is_followed_as_a_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It turns almost three times in 40 images; control nodes alone have 21.1 dB, and 11.6 on what moves.
 
-    So short a run would look for it in six of them. Two of three runs find it; seeds 2 and 4 do with all instruction sets.
+    So short a run would look for it in six of them. Two of three runs find it; seeds 2 and 4 do with all instructions.
     """
     monkeypatch.setattr("dyngs.deform.kind.STEPS_PER_SHOT", 1)
     captured = Captured.of(tmp_path, "roll", "--size", "64", "--views", "40")
@@ -129,9 +129,9 @@ def test_what_moves_before_fixed_cameras_is_trained_as_moving(
 
 
 def test_the_command_trains_the_same_bytes_as_python(still_life: Captured) -> None:
-    keys = still_life.keys("by_command", "train.steps=100")
+    keys = still_life.keys("by_command", "train.steps=20")
     assert main(["train", "static", *keys]) == 0
-    by_python = dyngs.train(dyngs.load_config("static", still_life.keys("by_python", "train.steps=100")))
+    by_python = dyngs.train(dyngs.load_config("static", still_life.keys("by_python", "train.steps=20")))
     assert checkpoint_bytes(still_life.root / "by_command") == checkpoint_bytes(by_python)
 
 
