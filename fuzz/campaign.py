@@ -22,7 +22,6 @@ from fuzz.verdict import Outcome, Verdict
 from fuzz.worker import STANDARD, Limits, run_child
 
 CORPUS = Path(__file__).resolve().parent / "corpus"
-KEPT_PER_REASON = 1
 MOST_PER_PROCESS = 2000
 """Cases after which a worker is replaced, which bounds its leaks."""
 

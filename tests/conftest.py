@@ -16,6 +16,8 @@ import os
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # `pytest -n 2`: processes share the cores, their threads would fight for them
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # Commands and runs that name no number of threads take all cores; where these wait for work they must not spin.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from collections.abc import Callable, Iterator
 from functools import partial

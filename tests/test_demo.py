@@ -4,23 +4,40 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dyngs.cli import main
-from dyngs.demo import DemoOptions, claimed_folder, demo_config, run_demo
+from dyngs.demo import DemoOptions, DemoResult, claimed_folder, demo_config, run_demo
 from dyngs.runs.lock import LOCK_NAME
 
 TINY = DemoOptions(steps=30, threads=1, size=24, num_points=300, num_frames=3)
 
 
-def test_everything_that_is_promised_lies_there(tmp_path: Path) -> None:
-    result = run_demo(tmp_path / "demo", TINY)
+def test_everything_that_is_promised_lies_there_and_the_command_prints_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[DemoResult] = []
+
+    def run_tiny(*arguments: Any) -> DemoResult:
+        done.append(run_demo(*arguments))
+        return done[0]
+
+    monkeypatch.setattr("dyngs.demo.DemoOptions", lambda steps, threads: TINY)
+    monkeypatch.setattr("dyngs.demo.run_demo", run_tiny)
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "30", "--threads", "1"]) == 0
+    (result,) = done
     for path in (result.run_dir, result.images, result.images / "sheet.png", result.video, result.ply):
         assert path.exists()
         assert (tmp_path / "demo") in path.parents
     assert json.loads((result.run_dir / "metrics.json").read_text())["psnr"] == result.report.psnr
     assert result.report.step == 30
+    text = capsys.readouterr().out
+    assert "PSNR" in text
+    assert "sheet.png" in text
+    assert "orbit.mp4" in text
+    assert "splats.ply" in text
 
 
 def test_a_second_demo_leaves_the_first_alone(tmp_path: Path) -> None:
@@ -57,15 +74,3 @@ def test_the_demo_trains_the_packaged_preset(tmp_path: Path, monkeypatch: pytest
     config = demo_config(tmp_path / "a: b", tmp_path / "run", TINY)
     assert config.data.root == tmp_path / "a: b"
     assert (config.run.dir, config.train.steps, config.train.ssim_weight) == (tmp_path / "run", 30, 0.2)
-
-
-def test_the_command_prints_the_table_and_the_files(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dyngs.demo.DemoOptions", lambda steps, threads: TINY)
-    assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "30", "--threads", "1"]) == 0
-    text = capsys.readouterr().out
-    assert "PSNR" in text
-    assert "sheet.png" in text
-    assert "orbit.mp4" in text
-    assert "splats.ply" in text

@@ -261,23 +261,20 @@ def test_import_is_cheap_and_leaves_heavy_packages_alone() -> None:
     code = (
         "import sys, time, torch, numpy; before = set(sys.modules); t = time.process_time(); import dyngs\n"
         "print(time.process_time() - t); import dyngs.gaussians.rendering\n"
-        f"print([m for m in {HEAVY!r} if m in sys.modules and m not in before])"
+        f"print([m for m in {HEAVY!r} if m in sys.modules and m not in before])\n"
+        "import dyngs.evaluate.report, dyngs.export.images, dyngs.export.chosen_path\n"
+        f"print([m for m in {FOR_FEW_SCENES!r} if m in sys.modules])"
     )
     for _ in range(3):
-        seconds, heavy = run_python(code).splitlines()
+        seconds, heavy, for_few = run_python(code).splitlines()
         assert heavy == "[]"
+        assert for_few == "[]", "drawing and evaluating import what few scenes need"
         if float(seconds) < 1.0:
             return
     pytest.fail(f"dyngs takes {seconds} s to import")
 
 
-def test_drawing_and_evaluating_leave_packages_alone_that_few_scenes_need() -> None:
-    absent = ("scipy", "skimage", "trimesh", "av", "pycolmap", "kornia", "sympy", "torch._dynamo")
-    code = (
-        "import sys, dyngs.evaluate.report, dyngs.export.images, dyngs.export.chosen_path\n"
-        f"print([m for m in {absent!r} if m in sys.modules])"
-    )
-    assert run_python(code).strip() == "[]"
+FOR_FEW_SCENES = ("scipy", "skimage", "trimesh", "av", "pycolmap", "kornia", "sympy", "torch._dynamo")
 
 
 def test_the_conda_recipe_needs_what_pip_does() -> None:

@@ -64,7 +64,7 @@ def fused(seen: Sequence[Seen], low: Tensor, high: Tensor, cells: int, *, unseen
     if not looked_at.size or not looked_at.min() < 0 < looked_at.max():
         return None
     vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=mask)
-    return Mesh(vertices * size + low.numpy(), faces)
+    return Mesh(vertices * size + low.numpy(), np.ascontiguousarray(faces))  # its rows are stored backwards
 
 
 def _averages(seen: Sequence[Seen], points: Tensor, size: float) -> tuple[Tensor, Tensor]:

@@ -83,11 +83,13 @@ def most_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
 def outlines(places: Places) -> Tensor:
     """Return (N,) bool: which places lie within two drawn pixels of an outline, see ``blend_patches``."""
     rows = places.rows[0]
-    ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1)
+    drawn = rows >= 0
+    ids = torch.full(rows.shape, -1, dtype=places.ids.dtype, device="cpu")
+    ids[drawn] = places.ids[rows[drawn].long()]
     differs = torch.zeros(rows.shape, device="cpu")
     differs[:, :-1] += ids[:, 1:] != ids[:, :-1]
     differs[:-1] += ids[1:] != ids[:-1]
-    return max_pool2d(differs[None, None], 3, 1, 1)[0, 0][rows >= 0] > 0
+    return max_pool2d(differs[None, None], 3, 1, 1)[0, 0][drawn] > 0
 
 
 def slopes_of(image: Tensor) -> Tensor:

@@ -345,12 +345,12 @@ def test_a_moving_run_goes_through_its_phases(whole_run: Path) -> None:
     assert len(scene.times) == 16
 
 
-def test_a_moving_run_repeats_its_bytes(whole_run: Path, moving_capture: Path, tmp_path: Path) -> None:
-    again = train(busy_config(moving_capture, tmp_path / "run", _kind_of(whole_run)))
-    assert _final_bytes(again) == _final_bytes(whole_run)
-
-
-@pytest.mark.parametrize("stop_at", [2, 8, 11, 18], ids=["coarse", "begin", "fine", "split"])
+@pytest.mark.parametrize(
+    ("whole_run", "stop_at"),
+    [*((kind, 11) for kind in ALL_KINDS), *((kind, stop) for kind in ("control_nodes", "mlp") for stop in (2, 8, 18))],
+    indirect=["whole_run"],
+    scope="module",
+)
 def test_a_resumed_moving_run_equals_an_uninterrupted_one(
     whole_run: Path, moving_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: int
 ) -> None:

@@ -15,7 +15,11 @@ from dyngs.runs.lock import LOCK_NAME, writing
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_a_table_files_and_a_chosen_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_files_and_a_chosen_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But for the memory, measured in processes that import the renderer: tests/tradeoff/test_sweep.py."""
+    monkeypatch.setattr("dyngs.tradeoff.memory.MemoryMeter.peak_megabytes", lambda *_: None)
     run = str(write_moving_run(tmp_path))
     out = tmp_path / "out"
     words = ["tradeoff", run, "--out", str(out), "--vary", "scale=0.5", "--vary", "storage=2", "--rounds", "1"]

@@ -50,9 +50,6 @@ ODD = (
 )
 
 
-BYTES = (b"\x00", b"\xff", b"\t", b"*a", b"[", b"{", b": ", b"? ", b"\xe2\x80\xa8", b"")
-
-
 def refused(preset: Path | None, *overrides: str) -> str:
     """What is said about a configuration that must be refused: one short line of printable characters."""
     with pytest.raises(DyngsError) as caught:

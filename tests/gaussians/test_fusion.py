@@ -35,6 +35,7 @@ def test_it_has_as_few_triangles_as_asked_for(most: int) -> None:
     assert min(most, len(ball().faces)) / 3 < len(mesh.faces) <= most
     assert np.abs(radii(mesh) - RADIUS).max() < 0.3
     assert (np.diff(np.sort(mesh.faces, axis=1), axis=1) > 0).all()
+    assert len(torch.from_numpy(mesh.faces)) == len(mesh.faces)  # torch takes no arrays that are stored backwards
 
 
 def test_joined_vertices_lie_where_planes_meet() -> None:

@@ -83,7 +83,7 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
 def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, steps = people(tmp_path / "people", (1, 2)), 3
+    folder, steps = people(tmp_path / "people", (1, 2)), 2
 
     def checkpoints(device: torch.device) -> list[Checkpoint]:
         """After the last step but one and the last, which is done on what was stored."""

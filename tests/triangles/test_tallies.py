@@ -57,6 +57,7 @@ def test_outlines_are_where_ids_change() -> None:
     found[places.rows[0] >= 0] = outlines(places)
     assert not found[:4, :4].any()
     assert found.any()
+    assert len(outlines(places_of(BEHIND))) == 0
 
 
 def test_they_are_restored() -> None:

@@ -51,12 +51,12 @@ ODD = (
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Four images with every field that is read."""
-    names = [f"images/{i}.png" for i in range(4)]
+    """Two images with every field that is read."""
+    names = [f"images/{i}.png" for i in range(2)]
     for i, name in enumerate(names):
         write_image(tmp_path / name, random_pixels(8, 12, 3, seed=i))
     lens = {"w": 12, "h": 8, "fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.0, "k1": 0.01, "p1": 0.001}
-    shared = {**lens, "camera_model": "OPENCV", "train_filenames": names[:3], "val_filenames": names[3:], "fps": 30}
+    shared = {**lens, "camera_model": "OPENCV", "train_filenames": names[:1], "val_filenames": names[1:], "fps": 30}
     write_frames(tmp_path / "transforms.json", names, shared)
     content = json.loads((tmp_path / "transforms.json").read_text())
     for i, frame in enumerate(content["frames"]):

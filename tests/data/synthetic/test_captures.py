@@ -84,7 +84,7 @@ def test_cameras_differ_by_seed_only_in_azimuth() -> None:
 # ------------------------------------------------------------------------------------------------ scenes that move
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["spin", "room"])  # a camera per time, and fixed ones
 def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(name: SceneName, tmp_path: Path) -> None:
     first, second = (write_dynamic_capture(name, tmp_path / part, TINY) for part in ("a", "b"))
     assert _files(first) == _files(second)
@@ -190,7 +190,7 @@ def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path) ->
 # ------------------------------------------------------------------------------------------------ dyngs data synth
 
 
-@pytest.mark.parametrize("scene", SYNTHETIC_SCENES)
+@pytest.mark.parametrize("scene", ["still", "polyhedra", "spin", "human", "people"])  # one of each writer
 def test_an_interrupted_command_leaves_nothing_and_may_be_repeated(
     scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
