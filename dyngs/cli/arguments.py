@@ -134,6 +134,17 @@ def add_motion(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--motion", type=input_path, metavar="FILE", help=about)
 
 
+def add_keep_feet(parser: argparse.ArgumentParser) -> None:
+    about = "of --motion: move the person along the floor so that feet that touch it do not slide"
+    parser.add_argument("--keep-feet", action="store_true", help=about)
+
+
+def require_motion_for_feet(arguments: argparse.Namespace) -> None:
+    """Raise DyngsError for ``--keep-feet`` without ``--motion``."""
+    if arguments.keep_feet and arguments.motion is None:
+        raise DyngsError("--keep-feet goes with --motion FILE: it is about feet in a motion; add one, or leave it out")
+
+
 def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:
     parser.add_argument("overrides", nargs="*", default=[], metavar=metavar, help=about)
 

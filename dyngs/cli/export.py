@@ -91,6 +91,7 @@ def add_parser(commands: args.Commands) -> None:
     when.add_argument("--time", type=args.scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
     args.add_motion(parser)
+    args.add_keep_feet(parser)
     about = (
         "--format dyngs: largest root-mean-square change of the images, in grey levels of 255 (default: what costs "
         "0.025 dB on training views)"
@@ -121,6 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     with heavy_imports():
         from dyngs.runs.opened import open_scene
 
+    args.require_motion_for_feet(arguments)
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
     kind = "surface" if kind == "mesh" and _has_surface(arguments) else kind
@@ -202,7 +204,11 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
     if getattr(opened.scene, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
         args.print_notes((line,))
-    return opened if arguments.motion is None else opened.in_motion(arguments.motion)
+    if arguments.motion is None:
+        return opened
+    moved = opened.in_motion(arguments.motion, keep_feet=arguments.keep_feet)
+    args.print_notes(moved.notes[len(opened.notes) :])
+    return moved
 
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:

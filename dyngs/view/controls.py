@@ -187,12 +187,13 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
     gui, session = browsing.client.gui, browsing.session
     angles: dict[str, tuple[float, float, float]] = {}
     motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *motions))
+    feet = gui.add_checkbox("Keep feet", False, hint="in motions of files, feet on the floor do not slide")
     joint = gui.add_dropdown("Joint", MAIN_JOINTS, initial_value="left_shoulder")
     sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0, hint=f"degrees about {axis}") for axis in _AXES]
 
     def play(_: Any = None) -> None:
-        choice, chosen = str(motion.value), dict(angles)
-        session.ask(lambda: session.show(in_motion(browsing.loaded, choice, motions, chosen)), "pose")
+        choice, chosen, keep = str(motion.value), dict(angles), bool(feet.value)
+        session.ask(lambda: session.show(in_motion(browsing.loaded, choice, motions, chosen, keep_feet=keep)), "pose")
 
     def pick(_: Any) -> None:
         for slider, value in zip(sliders, angles.get(str(joint.value), (0.0, 0.0, 0.0)), strict=True):
@@ -214,7 +215,8 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
         if motion.value == BY_SLIDERS:
             play()
 
-    motion.on_update(play)
+    for handle in (motion, feet):
+        handle.on_update(play)
     joint.on_update(pick)
     for slider in sliders:
         slider.on_update(turn)
