@@ -14,7 +14,7 @@ from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import has_timeline, views_of
 from dyngs.view.edit_controls import EditControls, can_be_edited
 from dyngs.view.frusta import Frusta
-from dyngs.view.layers import LAYERS, PARTS, draw
+from dyngs.view.layers import LAYERS, PARTS, draw, shows_filled
 from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion
 from dyngs.view.recording import Keyframe, Recording
 from dyngs.view.source import MOST_IMAGES, PeopleNetwork, Source
@@ -89,6 +89,7 @@ class Controls:
         session = self._browsing.session
         layers = [name for name in LAYERS if len(views_of(opened)) or name != "error"]
         layers = [name for name in layers if isinstance(opened.renderable, GaussianScene) or name != "motion"]
+        layers = [name for name in layers if shows_filled(opened) or name != "filled"]
         if session.look.layer not in layers:
             session.change(layer="colour")
         hint = "error: against the truth, at a camera of the capture"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -133,7 +134,8 @@ class HumanTraining(SceneTraining[HumanScene]):
             changes = filled(scene.gaussians.detach(), scene.anchors, scene.given_weights(), middle, trust)
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
-        return scene, EditResult(None, changes, finding=line if hardly >= WORTH_TELLING else None)
+        finding = line if hardly >= WORTH_TELLING else None
+        return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
 
     def follow(self, edit: TopologyEdit) -> None:
         """Find out anew who the neighbours are, and what they weigh."""

@@ -19,7 +19,10 @@ from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 _SOLES = ("left_ankle", "left_foot", "right_ankle", "right_foot")
 _HEIGHT, _SPEED, _SHORTEST = 0.05, 0.5, 0.1
 """A point touches the floor lower than this, m, and slower, m/s of the person's size, for at least so long, s."""
-_FLOOR = 0.05  # fraction of the frames in which a point may be below its height on the floor
+_AROUND, _SINKS = 1.0, 0.15
+"""Heights are above the lowest within this time, s, as other legs sink or float while they bend; and by no more than
+this, m, above the lowest of all."""
+_FLOOR = 0.05  # fraction of the frames in which a point may be lower than what counts as the lowest of all
 _LASTS = 0.03  # time over which the velocity of the root is made smooth, s
 
 
@@ -48,15 +51,17 @@ class FootContact:
 def foot_contact(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> FootContact:
     """Return where points ``soles`` (F, P, 3), world units, of a person in ``clip`` touch the floor, and slide there.
 
-    The floor is level: each point's height in its lowest frames. ``up`` (3,) is the unit vector; ``fps`` frames per
+    The floor is level: each point's height in the lowest frames around. ``up`` (3,) is the unit vector; ``fps`` frames per
     second.
     """
     unit = float(clip.scale.mean())
     height = soles @ up / unit
     moves = _along_floor(soles, up) / unit
-    low = height < height.quantile(_FLOOR, dim=0) + _HEIGHT
     if len(soles) < 2:
-        return FootContact(torch.zeros_like(low), 0.0)
+        return FootContact(torch.zeros_like(height, dtype=torch.bool), 0.0)
+    reach = round(_AROUND * fps)
+    around = -torch.nn.functional.max_pool1d(-height.T[None], 2 * reach + 1, 1, reach)[0].T
+    low = (height < around + _HEIGHT) & (height < height.quantile(_FLOOR, dim=0) + _SINKS)
     steps = moves.norm(dim=-1) * fps
     speed = (torch.cat([steps[:1], steps]) + torch.cat([steps, steps[-1:]])) / 2
     touching = _long_runs(low & (speed < _SPEED), _SHORTEST * fps)

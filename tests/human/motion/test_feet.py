@@ -124,3 +124,15 @@ def test_the_line_says_how_far_feet_slide() -> None:
     line = before.compared(after)
     assert "20 of 20 frames" in line
     assert "5.0 mm per frame; with the root moved 0.0 mm" in line
+
+
+def test_feet_that_sink_into_the_floor_while_other_legs_bend_still_touch_it() -> None:
+    trans = steps(150, (0.003, 0.0, 0.0))
+    trans[70:110, 1] = -0.1
+    touching = foot_contact(clip_of(trans), soles_of(clip_of(trans)), Y, FPS).touching
+    assert touching[:38].all(), "a second away"
+    assert touching[72:108].all()
+    assert touching[142:].all()
+    lifted = torch.zeros(150, 3)
+    lifted[50:100, 1] = 0.3
+    assert not foot_contact(clip_of(lifted), soles_of(clip_of(lifted)), Y, FPS).touching[51:99].any()
