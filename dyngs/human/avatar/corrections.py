@@ -27,14 +27,14 @@ LR = {
     "turns": 1e-3,  # of all frames, rad
     "joints": 2e-3,  # at rest, m
     "log_scale": 2e-4,
-    "weights": 5e-3,  # logarithms
+    "weights": 2e-2,  # logarithms
     "light": 5e-3,  # fraction of the colour
     "normals": 1e-3,
 }
 """Learning rates."""
 OF_FRAMES = ("poses", "trans")  # what is learned of single frames
 LR_DECAY = 0.1  # last over first learning rate
-POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
+POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-4, 1e-3
 """Of the squared corrections of poses and joints, of skinning weights, and of the light, in the loss."""
 POSE_CM = 0.05  # rotation of a joint, rad, that is penalized as much as a centimetre
 

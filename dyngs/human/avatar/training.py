@@ -24,6 +24,7 @@ from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.weight_field import SurfaceMean, spread, surface_mean
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor
 
@@ -61,14 +62,18 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
+        self._mean: SurfaceMean | None = None
 
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
         clip = subject.motion.clip
-        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
+        anchors = subject.anchors
+        if self.options.refine:
+            anchors = spread(anchors, len(subject.skeleton.joints))
+        learned = new_corrections(clip, subject.skeleton, anchors, normals)
         return HumanScene(
             gaussians=gaussians,
-            anchors=subject.anchors,
+            anchors=anchors,
             skeleton=subject.skeleton,
             clip=clip,
             learned=learned,
@@ -100,6 +105,11 @@ class HumanTraining(SceneTraining[HumanScene]):
             return 0
         progress = self.rates.progress(step, since=self.refines_from)
         share_sides(scene.learned)
+        by_weights = scene.learned["weights"].grad
+        if by_weights is not None:
+            if self._mean is None:
+                self._mean = surface_mean(scene.anchors, len(scene.skeleton.joints))
+            by_weights.copy_(self._mean(by_weights))
         if step <= self.frames_from:
             for name in OF_FRAMES:
                 scene.learned[name].grad = None
@@ -139,10 +149,11 @@ class HumanTraining(SceneTraining[HumanScene]):
 
     def follow(self, edit: TopologyEdit) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
-        self._given_weights = self._near = self._images = None
+        self._given_weights = self._near = self._images = self._mean = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        self._near, self._given_weights, self._images = tensors.get("near"), None, None
+        self._near = tensors.get("near")
+        self._given_weights = self._images = self._mean = None
         return HumanScene.restored(gaussians, tensors)
 
     def state(self) -> State:

@@ -51,8 +51,8 @@ class FootContact:
 def foot_contact(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> FootContact:
     """Return where points ``soles`` (F, P, 3), world units, of a person in ``clip`` touch the floor, and slide there.
 
-    The floor is level: each point's height in the lowest frames around. ``up`` (3,) is the unit vector; ``fps`` frames per
-    second.
+    The floor is level: each point's height in the lowest frames around. ``up`` (3,) is the unit vector, ``fps`` are
+    frames per second.
     """
     unit = float(clip.scale.mean())
     height = soles @ up / unit
