@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     import torch
 
     from dyngs.config import DataConfig
+    from dyngs.runs.opened import Opened
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
@@ -143,6 +145,15 @@ def require_motion_for_feet(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for ``--keep-feet`` without ``--motion``."""
     if arguments.keep_feet and arguments.motion is None:
         raise DyngsError("--keep-feet goes with --motion FILE: it is about feet in a motion; add one, or leave it out")
+
+
+def in_motion(arguments: argparse.Namespace, opened: Opened) -> Opened:
+    """Return the person in ``--motion``, or all as it is without; print what was found of its feet."""
+    if arguments.motion is None:
+        return opened
+    moved = opened.in_motion(arguments.motion, keep_feet=arguments.keep_feet)
+    print_notes(moved.notes[len(opened.notes) :])
+    return replace(moved, notes=opened.notes)
 
 
 def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:

@@ -204,11 +204,7 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
     if getattr(opened.scene, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
         args.print_notes((line,))
-    if arguments.motion is None:
-        return opened
-    moved = opened.in_motion(arguments.motion, keep_feet=arguments.keep_feet)
-    args.print_notes(moved.notes[len(opened.notes) :])
-    return moved
+    return args.in_motion(arguments, opened)
 
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
@@ -262,8 +258,12 @@ def _export_splats(
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
+<<<<<<< HEAD
             line = "this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence"
             args.print_notes((line,))
+=======
+            args.print_notes(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
+>>>>>>> 5bab4ac3 (Skinning weights get as far in long runs as in short ones; export prints what was found of the feet)
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
         written = [write_run_splats(opened, path, moments[0], part, how)]

@@ -153,7 +153,7 @@ def _opened(arguments: argparse.Namespace) -> Opened:
 
     opened = open_scene(arguments.source, nonfinite="skip", data_root=args.data_root(arguments))
     if arguments.motion is not None:
-        opened = opened.in_motion(arguments.motion, keep_feet=arguments.keep_feet)
+        opened = args.in_motion(arguments, opened)
     elif arguments.pose == "rest":
         opened = opened.at_rest()
     elif arguments.split is not None:

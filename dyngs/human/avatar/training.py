@@ -18,7 +18,7 @@ from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
-from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
+from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, paced, share_sides
 from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
@@ -70,7 +70,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         anchors = subject.anchors
         if self.options.refine:
             anchors = spread(anchors, len(subject.skeleton.joints))
-        learned = new_corrections(clip, subject.skeleton, anchors, normals)
+        learned = paced(new_corrections(clip, subject.skeleton, anchors, normals), self.rates.steps - self.refines_from)
         return HumanScene(
             gaussians=gaussians,
             anchors=anchors,
@@ -154,7 +154,8 @@ class HumanTraining(SceneTraining[HumanScene]):
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self._near = tensors.get("near")
         self._given_weights = self._images = self._mean = None
-        return HumanScene.restored(gaussians, tensors)
+        scene = HumanScene.restored(gaussians, tensors)
+        return replace(scene, learned=paced(scene.learned, self.rates.steps - self.refines_from))
 
     def state(self) -> State:
         return {} if self._near is None else {"near": StateTensor(self._near, Role.TRAINING)}
