@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     import torch
 
     from dyngs.config import DataConfig
+    from dyngs.runs.opened import Opened
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
@@ -132,6 +134,26 @@ def add_up(parser: argparse.ArgumentParser, of: str = "") -> None:
 def add_motion(parser: argparse._ActionsContainer) -> None:
     about = "motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma"
     parser.add_argument("--motion", type=input_path, metavar="FILE", help=about)
+
+
+def add_keep_feet(parser: argparse.ArgumentParser) -> None:
+    about = "of --motion: move the person along the floor so that feet that touch it do not slide"
+    parser.add_argument("--keep-feet", action="store_true", help=about)
+
+
+def require_motion_for_feet(arguments: argparse.Namespace) -> None:
+    """Raise DyngsError for ``--keep-feet`` without ``--motion``."""
+    if arguments.keep_feet and arguments.motion is None:
+        raise DyngsError("--keep-feet goes with --motion FILE: it is about feet in a motion; add one, or leave it out")
+
+
+def in_motion(arguments: argparse.Namespace, opened: Opened) -> Opened:
+    """Return the person in ``--motion``, or all as it is without; print what was found of its feet."""
+    if arguments.motion is None:
+        return opened
+    moved = opened.in_motion(arguments.motion, keep_feet=arguments.keep_feet)
+    print_notes(moved.notes[len(opened.notes) :])
+    return replace(moved, notes=opened.notes)
 
 
 def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:

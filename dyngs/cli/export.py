@@ -91,6 +91,7 @@ def add_parser(commands: args.Commands) -> None:
     when.add_argument("--time", type=args.scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)")
     when.add_argument("--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)")
     args.add_motion(parser)
+    args.add_keep_feet(parser)
     about = (
         "--format dyngs: largest root-mean-square change of the images, in grey levels of 255 (default: what costs "
         "0.025 dB on training views)"
@@ -121,6 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     with heavy_imports():
         from dyngs.runs.opened import open_scene
 
+    args.require_motion_for_feet(arguments)
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
     kind = "surface" if kind == "mesh" and _has_surface(arguments) else kind
@@ -202,7 +204,7 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
     if getattr(opened.scene, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
         args.print_notes((line,))
-    return opened if arguments.motion is None else opened.in_motion(arguments.motion)
+    return args.in_motion(arguments, opened)
 
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
@@ -256,8 +258,12 @@ def _export_splats(
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
+<<<<<<< HEAD
             line = "this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence"
             args.print_notes((line,))
+=======
+            args.print_notes(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
+>>>>>>> 5bab4ac3 (Skinning weights get as far in long runs as in short ones; export prints what was found of the feet)
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
         written = [write_run_splats(opened, path, moments[0], part, how)]

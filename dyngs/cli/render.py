@@ -51,6 +51,7 @@ def add_parser(commands: args.Commands) -> None:
     person = parser.add_mutually_exclusive_group()
     args.add_motion(person)
     person.add_argument("--pose", choices=("rest",), help="show a person in the rest pose of the template")
+    args.add_keep_feet(parser)
     parser.add_argument("--video", type=args.output_path, metavar="FILE.mp4", help="write a video as well")
     frames, kind = (
         "number of frames of orbit, spiral and along (default 120)",
@@ -87,6 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for nothing to render, nowhere to write, or an option that does not apply."""
+    args.require_motion_for_feet(arguments)
     known = command_for(arguments.source)
     if known is not None and not (arguments.source / "config.yaml").is_file():
         raise DyngsError(f"{arguments.source}: nothing that can be drawn; {known}")
@@ -151,7 +153,7 @@ def _opened(arguments: argparse.Namespace) -> Opened:
 
     opened = open_scene(arguments.source, nonfinite="skip", data_root=args.data_root(arguments))
     if arguments.motion is not None:
-        opened = opened.in_motion(arguments.motion)
+        opened = args.in_motion(arguments, opened)
     elif arguments.pose == "rest":
         opened = opened.at_rest()
     elif arguments.split is not None:

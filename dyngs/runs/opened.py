@@ -210,11 +210,12 @@ class Opened(LoadedRun):
         """Return the same as the views of ``split`` show it, see ``scene_of_split``."""
         return self.showing(scene_of_split(self, self.capture, split))
 
-    def in_motion(self, path: Path) -> Opened:
+    def in_motion(self, path: Path, *, keep_feet: bool = False) -> Opened:
         """Return the same with its person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM animation).
 
         A file with ``scale`` is a fit to this person in the world of the capture; any other motion is adapted to the
-        size, position and up direction of the person.
+        size, position and up direction of the person. With ``keep_feet`` the root moves so that feet on the floor stay
+        where they are (``dyngs.human.motion.feet``); a note says by how much they slide before and after.
 
         Raises:
             DyngsError: it is no person, or the file cannot be read.
@@ -232,8 +233,17 @@ class Opened(LoadedRun):
             clip = replace(clip, trans=clip.trans - clip.trans.new_tensor(self.info.world_offset))
         else:
             clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-        playing = scene.playing(clip).to(person.gaussians.means.device)
-        return replace(self, renderable=playing, fps=motion.fps, as_captured=False)
+        playing, notes = scene.playing(clip), self.notes
+        if keep_feet:
+            from dyngs.human.motion.feet import feet_kept, sole_points  # late: scipy, as above
+            from dyngs.human.motion.placement import up_direction as up_of_body
+
+            skeleton, floor = playing.learned_skeleton, float(scene.anchors.points[:, 1].min())
+            soles = sole_points(playing.moves_as, skeleton.joints, skeleton.parents, floor)
+            clip, before, after = feet_kept(clip, soles, up_of_body(scene.clip), motion.fps)
+            playing, notes = scene.playing(clip), (*notes, before.compared(after))
+        playing = playing.to(person.gaussians.means.device)
+        return replace(self, renderable=playing, fps=motion.fps, as_captured=False, notes=notes)
 
     def at_rest(self) -> Opened:
         """Return the same with its person in the rest pose of the template, upright on the floor. Raises DyngsError."""

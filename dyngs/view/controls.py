@@ -14,7 +14,7 @@ from dyngs.runs.opened import Opened
 from dyngs.view.captured_views import has_timeline, views_of
 from dyngs.view.edit_controls import EditControls, can_be_edited
 from dyngs.view.frusta import Frusta
-from dyngs.view.layers import LAYERS, PARTS, draw
+from dyngs.view.layers import LAYERS, PARTS, draw, shows_filled
 from dyngs.view.people import AS_CAPTURED, AT_REST, BY_SLIDERS, MAIN_JOINTS, in_motion
 from dyngs.view.recording import Keyframe, Recording
 from dyngs.view.source import MOST_IMAGES, PeopleNetwork, Source
@@ -89,6 +89,7 @@ class Controls:
         session = self._browsing.session
         layers = [name for name in LAYERS if len(views_of(opened)) or name != "error"]
         layers = [name for name in layers if isinstance(opened.renderable, GaussianScene) or name != "motion"]
+        layers = [name for name in layers if shows_filled(opened) or name != "filled"]
         if session.look.layer not in layers:
             session.change(layer="colour")
         hint = "error: against the truth, at a camera of the capture"
@@ -187,12 +188,13 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
     gui, session = browsing.client.gui, browsing.session
     angles: dict[str, tuple[float, float, float]] = {}
     motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *motions))
+    feet = gui.add_checkbox("Keep feet", False, hint="in motions of files, feet on the floor do not slide")
     joint = gui.add_dropdown("Joint", MAIN_JOINTS, initial_value="left_shoulder")
     sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0, hint=f"degrees about {axis}") for axis in _AXES]
 
     def play(_: Any = None) -> None:
-        choice, chosen = str(motion.value), dict(angles)
-        session.ask(lambda: session.show(in_motion(browsing.loaded, choice, motions, chosen)), "pose")
+        choice, chosen, keep = str(motion.value), dict(angles), bool(feet.value)
+        session.ask(lambda: session.show(in_motion(browsing.loaded, choice, motions, chosen, keep_feet=keep)), "pose")
 
     def pick(_: Any) -> None:
         for slider, value in zip(sliders, angles.get(str(joint.value), (0.0, 0.0, 0.0)), strict=True):
@@ -214,7 +216,8 @@ def add_person_controls(browsing: Browsing, motions: Mapping[str, Path]) -> None
         if motion.value == BY_SLIDERS:
             play()
 
-    motion.on_update(play)
+    for handle in (motion, feet):
+        handle.on_update(play)
     joint.on_update(pick)
     for slider in sliders:
         slider.on_update(turn)

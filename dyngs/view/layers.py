@@ -21,7 +21,7 @@ from dyngs.runs.opened import Opened
 from dyngs.static.levels import LevelScene
 from dyngs.view.captured_views import views_of
 
-Layer = Literal["colour", "depth", "alpha", "motion", "error"]
+Layer = Literal["colour", "depth", "alpha", "motion", "filled", "error"]
 Part = Literal["all", "moving", "still"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 PARTS: tuple[Part, ...] = get_args(Part)
@@ -30,6 +30,7 @@ ERROR_GAIN = 4.0
 """Factor of the mean absolute error before it is coloured, as in contact sheets."""
 _MOTION_TIMES = 12
 _LEVELS = "levels"
+_FILLED = (1.0, 0.0, 1.0)  # colour that marks what no training view of a person shows
 _LINE = (255, 200, 0)
 """Colour of the line between render and truth."""
 
@@ -114,6 +115,8 @@ def _layer(opened: Opened, shot: Shot, camera: Cameras, time: float | None) -> n
             return depth_to_rgb(*depth_of(opened, shot.part, camera, time))
         case "motion":
             return _motion(opened, shot.part, camera, time)
+        case "filled":
+            return _filled(opened, camera, time)
 
 
 def coarser(opened: Opened, most: int) -> Opened:
@@ -159,6 +162,24 @@ def _motion(opened: Opened, part: Part, camera: Cameras, time: float | None) -> 
     plain = replace(scene, colour=None, background=None)
     made = plain.render(camera, GaussianTimeStep(coloured, time), options=replace(opened.scene.options, sh_degree=0))
     return to_uint8(made.rgb[0].clamp(0, 1).cpu().numpy())
+
+
+def shows_filled(opened: Opened) -> bool:
+    """Return whether it is known which surface of a person no training view shows."""
+    return opened.person is not None and opened.person.seen is not None and opened.person.colour is None
+
+
+def _filled(opened: Opened, camera: Cameras, time: float | None) -> np.ndarray:
+    """Return the image (H, W, 3) uint8 with marked what is filled in; the plain one where that is not known."""
+    scene, person = opened.scene, opened.person
+    if person is None or person.seen is None or person.colour is not None:
+        return to_uint8(_rendering(opened, "all", camera, time).rgb[0].clamp(0, 1).numpy())
+    now = scene.time_step(time)
+    mark = (now.gaussians.sh.new_tensor(_FILLED) - 0.5) / SH_C0
+    sh = now.gaussians.sh * person.seen[:, None, None]
+    sh[:, 0] += (1 - person.seen)[:, None] * mark
+    marked = replace(now, gaussians=now.gaussians.replace(sh=sh))
+    return to_uint8(scene.render(camera, marked).to(device="cpu").rgb[0].clamp(0, 1).numpy())
 
 
 def _motion_colours(scene: GaussianScene) -> Tensor:

@@ -40,15 +40,19 @@ def motion_files(path: Path | None) -> dict[str, Path]:
     return {file.relative_to(path).as_posix(): file for file in found[:_MOST_MOTIONS]}
 
 
-def in_motion(opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles) -> Opened:
+def in_motion(
+    opened: Opened, choice: str, files: Mapping[str, Path], angles: Angles, *, keep_feet: bool = False
+) -> Opened:
     """Return the person of ``opened`` in a motion: as captured, at rest, by the ``angles`` of sliders, or of a file.
+
+    With ``keep_feet`` feet on the floor do not slide in the motion of a file.
 
     Raises DyngsError: the file cannot be read.
     """
     if choice == AS_CAPTURED:
         return opened
     if choice in files:
-        return opened.in_motion(files[choice])
+        return opened.in_motion(files[choice], keep_feet=keep_feet)
     return posed(opened, angles if choice == BY_SLIDERS else {})
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 from moving_scene import MOVING_ROWS, camera, still_scene, write_moving_run
 from pretend_gpu import GPU, pretend_gpu
+from scene_kinds import scene_of_kind
 from splat_scenes import cloud
 from view_sessions import balls, opened_at
 
@@ -15,7 +16,7 @@ from dyngs.runs.opened import Opened, open_run
 from dyngs.static.levels import LevelScene
 from dyngs.static.scene import StaticScene
 from dyngs.view.captured_views import views_of
-from dyngs.view.layers import LAYERS, PARTS, Shot, coarser, draw, motion_colours, truth_in_window
+from dyngs.view.layers import LAYERS, PARTS, Shot, coarser, draw, motion_colours, shows_filled, truth_in_window
 
 
 @pytest.fixture(scope="module")
@@ -133,3 +134,19 @@ def test_beside_the_true_image_it_is_darker(run: Opened) -> None:
     wide = draw(run, Shot(camera(96, 48), view=0, divide=1.0))
     assert wide[:, :20].mean() <= 128
     assert wide[:, 40:56].mean() > 128
+
+
+def test_what_no_training_view_shows_of_a_person_is_marked() -> None:
+    scene = scene_of_kind("human")
+    opened = opened_at(scene, "person")
+    assert not shows_filled(opened)
+    seen = torch.ones(len(scene))
+    plain = draw(opened_at(replace(scene, seen=seen)), Shot(camera(80, 56), layer="filled"))
+    assert np.array_equal(plain, draw(opened, Shot(camera(80, 56)))), "all was seen"
+    nothing = opened_at(replace(scene, seen=0 * seen))
+    assert shows_filled(nothing)
+    marked = draw(nothing, Shot(camera(80, 56), layer="filled")).astype(int)
+    covered = draw(opened, Shot(camera(80, 56), layer="alpha"))[..., 0] > 250
+    assert covered.any()
+    assert (marked[covered] >= [240, 0, 240]).all()
+    assert (marked[covered][:, 1] < 20).all(), "magenta"

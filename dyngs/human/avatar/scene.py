@@ -50,6 +50,8 @@ class HumanScene(GaussianScene):
     shapes: PoseBlendShapes | None = None  # the template's pose blend shapes, or None
     # another clip to play, given as that of training was; None: that of training, corrected frame by frame
     played: MotionClip | None = None
+    # (N,) in [0, 1] how far colours are what the training views showed, not filled; None: that was not found out
+    seen: Tensor | None = None
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
@@ -74,6 +76,7 @@ class HumanScene(GaussianScene):
             clip=clip,
             learned=learned,
             shapes=shapes,
+            seen=tensors.get("seen"),
         )
 
     @property
@@ -183,6 +186,7 @@ class HumanScene(GaussianScene):
             gaussians=self.gaussians.edited(edit),
             anchors=self.anchors.select(edit.source),
             learned=self.learned.edited(Role.PER_GAUSSIAN, edit),
+            seen=None if self.seen is None else self.seen[edit.source],
         )
 
     def part(self, which: str) -> HumanScene:
@@ -200,6 +204,7 @@ class HumanScene(GaussianScene):
     def drawing_state(self) -> State:
         """Return what drawing needs; learned corrections of skinning weights are applied to them."""
         state = super().drawing_state()
+        state.pop("model.seen", None)
         corrections = state.pop("model.learned.weights").tensor
         if bool(corrections.any()):
             fractions = self.anchors.weights * corrections.exp()
@@ -212,6 +217,8 @@ class HumanScene(GaussianScene):
         clip, skeleton = self.clip, self.skeleton
         state = prefixed("learned", self.learned.state())
         state |= prefixed("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
+        if self.seen is not None:
+            state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
         given = {f"clip.{name}": getattr(clip, name) for name in ("times", "poses", "trans", "scale")}
         given |= {"joints": skeleton.joints, "parents": torch.tensor(skeleton.parents, device="cpu")}
         if self.shapes is not None:
@@ -255,6 +262,8 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         require_tensor("learned.normals", state["learned.normals"], (n, 3))
     if "shapes.directions" in state:
         require_indices("anchors.face", state["anchors.face"], (n,), len(state["shapes.faces"]))
+    if "seen" in state:
+        require_tensor("seen", state["seen"], (n,))
     if "near" in state:
         require_indices("near", state["near"], (n, None), n)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,12 +18,13 @@ from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
-from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
+from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, paced, share_sides
 from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
+from dyngs.human.avatar.weight_field import SurfaceMean, spread, surface_mean
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor
 
@@ -60,14 +62,18 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
+        self._mean: SurfaceMean | None = None
 
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
         clip = subject.motion.clip
-        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
+        anchors = subject.anchors
+        if self.options.refine:
+            anchors = spread(anchors, len(subject.skeleton.joints))
+        learned = paced(new_corrections(clip, subject.skeleton, anchors, normals), self.rates.steps - self.refines_from)
         return HumanScene(
             gaussians=gaussians,
-            anchors=subject.anchors,
+            anchors=anchors,
             skeleton=subject.skeleton,
             clip=clip,
             learned=learned,
@@ -99,6 +105,11 @@ class HumanTraining(SceneTraining[HumanScene]):
             return 0
         progress = self.rates.progress(step, since=self.refines_from)
         share_sides(scene.learned)
+        by_weights = scene.learned["weights"].grad
+        if by_weights is not None:
+            if self._mean is None:
+                self._mean = surface_mean(scene.anchors, len(scene.skeleton.joints))
+            by_weights.copy_(self._mean(by_weights))
         if step <= self.frames_from:
             for name in OF_FRAMES:
                 scene.learned[name].grad = None
@@ -133,15 +144,18 @@ class HumanTraining(SceneTraining[HumanScene]):
             changes = filled(scene.gaussians.detach(), scene.anchors, scene.given_weights(), middle, trust)
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
-        return scene, EditResult(None, changes, finding=line if hardly >= WORTH_TELLING else None)
+        finding = line if hardly >= WORTH_TELLING else None
+        return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
 
     def follow(self, edit: TopologyEdit) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
-        self._given_weights = self._near = self._images = None
+        self._given_weights = self._near = self._images = self._mean = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        self._near, self._given_weights, self._images = tensors.get("near"), None, None
-        return HumanScene.restored(gaussians, tensors)
+        self._near = tensors.get("near")
+        self._given_weights = self._images = self._mean = None
+        scene = HumanScene.restored(gaussians, tensors)
+        return replace(scene, learned=paced(scene.learned, self.rates.steps - self.refines_from))
 
     def state(self) -> State:
         return {} if self._near is None else {"near": StateTensor(self._near, Role.TRAINING)}

@@ -198,6 +198,12 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     assert float(spread[0]) > 1.5, "arms to the sides"
 
 
+def test_skinning_weights_get_no_further_in_long_runs(capture: Path) -> None:
+    short, long, longer = (human(assemble(tiny(capture, steps=n))).learned.rates["weights"] for n in (4, 2000, 8000))
+    assert short > long
+    assert longer == pytest.approx(long / 4)
+
+
 def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_changes(capture: Path) -> None:
     def after(step: int, fill: bool) -> tuple[dict[str, Tensor], str]:
         trainer = assemble(tiny(capture, steps=4, fill_unseen=fill))
@@ -211,3 +217,9 @@ def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_chan
     assert "hardly seen" not in silence
     changed = {name for name in plain if not torch.equal(plain[name], filled[name])}
     assert changed == {"gaussians.sh", "gaussians.means", "gaussians.logit_opacities"}
+    assert set(filled) - set(plain) == {"model.seen"}
+    seen = filled["model.seen"]
+    assert seen.shape == (len(filled["gaussians.means"]),)
+    same_colour = (filled["gaussians.sh"] == plain["gaussians.sh"]).flatten(1).all(1)
+    assert (seen[same_colour] > 0.9).all(), "what was seen keeps its colour, and nothing else does"
+    assert 0 < float(seen[~same_colour].min()) < 0.5 < float(seen.max()) <= 1
