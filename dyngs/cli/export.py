@@ -155,14 +155,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
     """Raise for the first option that does not go with a format, with the reason."""
-    format = (
-        "--bodies" if arguments.bodies else "--joints" if arguments.joints else f"--format {_SHOWN.get(kind, kind)}"
-    )
+    shown = "bodies" if arguments.bodies else "joints" if arguments.joints else f"format {_SHOWN.get(kind, kind)}"
     unfit = "bodies" if arguments.bodies else "mesh" if arguments.joints else kind
     for name, reason in _UNFIT.get(unfit, {}).items():
         passed = getattr(arguments, name)
         if passed is not None and passed is not False:  # a time may be 0
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with {format}{reason and f': {reason}'}")
+            raise DyngsError(f"--{name.replace('_', '-')} does not go with --{shown}{reason and f': {reason}'}")
     for name, (only, asked) in _ONLY.items():
         if kind not in only.split() and getattr(arguments, name) not in (None, False):
             raise DyngsError(f"--{name.replace('_', '-')} goes with --format {asked}")
@@ -258,12 +256,7 @@ def _export_splats(
         if out is not None and not is_file and (out.is_dir() or is_sequence):
             out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
-<<<<<<< HEAD
-            line = "this is time 0 of a moving scene; --time T gives another one, --times 0:1:30 a sequence"
-            args.print_notes((line,))
-=======
             args.print_notes(("this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",))
->>>>>>> 5bab4ac3 (Skinning weights get as far in long runs as in short ones; export prints what was found of the feet)
         moments = (0.0 if times is None else times[0],)
         path = out or arguments.run_dir / f"{stem}{suffix}"
         written = [write_run_splats(opened, path, moments[0], part, how)]
