@@ -27,15 +27,14 @@ LR = {
     "turns": 1e-3,  # of all frames, rad
     "joints": 2e-3,  # at rest, m
     "log_scale": 2e-4,
-    "weights": 2e-2,  # logarithms; less in long runs, see ``paced``
+    "weights": 5e-3,  # logarithms
     "light": 5e-3,  # fraction of the colour
     "normals": 1e-3,
 }
 """Learning rates."""
-WEIGHTS_REACH = 8.0  # learning rate of skinning weights times steps, at most: a limit on how far they get
 OF_FRAMES = ("poses", "trans")  # what is learned of single frames
 LR_DECAY = 0.1  # last over first learning rate
-POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-4, 1e-3
+POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
 """Of the squared corrections of poses and joints, of skinning weights, and of the light, in the loss."""
 POSE_CM = 0.05  # rotation of a joint, rad, that is penalized as much as a centimetre
 
@@ -74,12 +73,6 @@ def new_corrections(
     own = ("weights", "normals")
     roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
     return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
-
-
-def paced(learned: Parameters, steps: int) -> Parameters:
-    """Return the corrections, whose skinning weights get no further in ``steps`` steps than in a short run."""
-    learned.rates["weights"] = min(LR["weights"], WEIGHTS_REACH / max(steps, 1))
-    return learned
 
 
 def correction_penalties(learned: Parameters) -> dict[str, Tensor]:

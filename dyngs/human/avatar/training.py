@@ -18,13 +18,12 @@ from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import Rates
-from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, paced, share_sides
+from dyngs.human.avatar.corrections import OF_FRAMES, correction_penalties, new_corrections, share_sides
 from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.avatar.weight_field import SurfaceMean, spread, surface_mean
 from dyngs.ops.adam import Count
 from dyngs.state import Role, State, StateTensor
 
@@ -62,18 +61,14 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
-        self._mean: SurfaceMean | None = None
 
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
         clip = subject.motion.clip
-        anchors = subject.anchors
-        if self.options.refine:
-            anchors = spread(anchors, len(subject.skeleton.joints))
-        learned = paced(new_corrections(clip, subject.skeleton, anchors, normals), self.rates.steps - self.refines_from)
+        learned = new_corrections(clip, subject.skeleton, subject.anchors, normals)
         return HumanScene(
             gaussians=gaussians,
-            anchors=anchors,
+            anchors=subject.anchors,
             skeleton=subject.skeleton,
             clip=clip,
             learned=learned,
@@ -105,11 +100,6 @@ class HumanTraining(SceneTraining[HumanScene]):
             return 0
         progress = self.rates.progress(step, since=self.refines_from)
         share_sides(scene.learned)
-        by_weights = scene.learned["weights"].grad
-        if by_weights is not None:
-            if self._mean is None:
-                self._mean = surface_mean(scene.anchors, len(scene.skeleton.joints))
-            by_weights.copy_(self._mean(by_weights))
         if step <= self.frames_from:
             for name in OF_FRAMES:
                 scene.learned[name].grad = None
@@ -149,13 +139,11 @@ class HumanTraining(SceneTraining[HumanScene]):
 
     def follow(self, edit: TopologyEdit) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
-        self._given_weights = self._near = self._images = self._mean = None
+        self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        self._near = tensors.get("near")
-        self._given_weights = self._images = self._mean = None
-        scene = HumanScene.restored(gaussians, tensors)
-        return replace(scene, learned=paced(scene.learned, self.rates.steps - self.refines_from))
+        self._near, self._given_weights, self._images = tensors.get("near"), None, None
+        return HumanScene.restored(gaussians, tensors)
 
     def state(self) -> State:
         return {} if self._near is None else {"near": StateTensor(self._near, Role.TRAINING)}

@@ -198,12 +198,6 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     assert float(spread[0]) > 1.5, "arms to the sides"
 
 
-def test_skinning_weights_get_no_further_in_long_runs(capture: Path) -> None:
-    short, long, longer = (human(assemble(tiny(capture, steps=n))).learned.rates["weights"] for n in (4, 2000, 8000))
-    assert short > long
-    assert longer == pytest.approx(long / 4)
-
-
 def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_changes(capture: Path) -> None:
     def after(step: int, fill: bool) -> tuple[dict[str, Tensor], str]:
         trainer = assemble(tiny(capture, steps=4, fill_unseen=fill))
