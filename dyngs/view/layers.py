@@ -172,7 +172,7 @@ def shows_filled(opened: Opened) -> bool:
 def _filled(opened: Opened, camera: Cameras, time: float | None) -> np.ndarray:
     """Return the image (H, W, 3) uint8 with marked what is filled in; the plain one where that is not known."""
     scene, person = opened.scene, opened.person
-    if person is None or person.seen is None or person.colour is not None:
+    if person is None or person.seen is None or not shows_filled(opened):
         return to_uint8(_rendering(opened, "all", camera, time).rgb[0].clamp(0, 1).numpy())
     now = scene.time_step(time)
     mark = (now.gaussians.sh.new_tensor(_FILLED) - 0.5) / SH_C0
