@@ -158,6 +158,8 @@ class ImageLoader:
         self._small: dict[int, Image] = {}
         self._small_by, self._small_bytes = 1, 0
         self._last_map: tuple[object, LensMap] | None = None
+        self._cameras: dict[int, Cameras] = {}
+        self._cameras_there: dict[int, Cameras] = {}  # on the GPU
         self.corrected: Callable[[int, Cameras], Cameras] | None = None
         self._lock = Lock()
         with images_up_to(options.max_megapixels):
@@ -180,6 +182,7 @@ class ImageLoader:
         with self._lock:
             self._on_gpu, self._gpu_bytes, self._small, self._small_bytes = {}, 0, {}, 0
             self._device, self._gpu_room = device, math.inf if memory is None else GPU_FRACTION * memory[0]
+            self._cameras_there = {}
 
     @property
     def times(self) -> tuple[float | None, ...]:
@@ -197,7 +200,11 @@ class ImageLoader:
     def _with_camera(self, index: int, image: Image) -> Image:
         if self.corrected is not None:
             image = replace(image, cameras=self.corrected(index % len(self._views), image.cameras))
-        return image if self.device.type == "cpu" else image.to(self.device)
+        if self.device.type == "cpu":
+            return image
+        if self.corrected is None:
+            image = replace(image, cameras=self._sent(index % len(self._views), image.cameras))
+        return image.to(self.device)
 
     def _as_stored(self, index: int) -> Image:
         view = self._views[index]
@@ -206,7 +213,7 @@ class ImageLoader:
         pixels = premultiplied(decoded.pixels)
         return Image(
             name=view.name,
-            cameras=_camera_of(view, width, height),
+            cameras=self._camera(index % len(self._views), width, height),
             rgb_premultiplied=pixels[..., :3].contiguous(),
             alpha=pixels[..., 3].contiguous() if pixels.shape[-1] == 4 else None,
             mask=None if decoded.mask is None else decoded.mask.float(),
@@ -217,6 +224,20 @@ class ImageLoader:
             depth=decoded.depth,
             flow=decoded.flow,
         )
+
+    def _camera(self, index: int, width: int, height: int) -> Cameras:
+        """Return the camera of a view, on the CPU; it is made once."""
+        found = self._cameras.get(index)
+        if found is None or (found.width, found.height) != (width, height):
+            found = self._cameras[index] = _camera_of(self._views[index], width, height)
+        return found
+
+    def _sent(self, index: int, cameras: Cameras) -> Cameras:
+        """Return the camera of an image on the GPU, to which it is sent once."""
+        found = self._cameras_there.get(index)
+        if found is None or (found.width, found.height) != (cameras.width, cameras.height):
+            found = self._cameras_there[index] = cameras.to(device=self.device)
+        return found
 
     def cameras(self) -> list[Cameras]:
         """Return the cameras of all images as they are by now, one each; no image is read."""

@@ -271,15 +271,16 @@ def _checked(
 
 def _check_views(cameras: Cameras, background: Tensor | None) -> None:
     check_poses(cameras.cam_from_world)
-    check_finite({"intrinsics": cameras.intrinsics})
-    check_focal_lengths(cameras.intrinsics)
+    intrinsics = cameras.intrinsics.detach().cpu()
+    check_finite({"intrinsics": intrinsics})
+    check_focal_lengths(intrinsics)
     if background is not None:
-        check_finite({"background": background.to(cameras.intrinsics.dtype)})
+        check_finite({"background": background.detach().cpu().to(intrinsics.dtype)})
 
 
 def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
     """Raise an error unless fx and fy of all matrices (V, 3, 3) lie within ``FOCAL_LENGTHS``."""
-    focal, (shortest, longest) = intrinsics.detach().diagonal(dim1=1, dim2=2)[:, :2], FOCAL_LENGTHS
+    focal, (shortest, longest) = intrinsics.detach().cpu().diagonal(dim1=1, dim2=2)[:, :2], FOCAL_LENGTHS
     bad = torch.nonzero(~((focal >= shortest) & (focal <= longest)).all(1))[:, 0]
     if len(bad):
         fx, fy = (float(x) for x in focal[bad[0]])
@@ -288,8 +289,11 @@ def check_focal_lengths(intrinsics: Tensor, name: str = "intrinsics") -> None:
 
 
 def check_poses(cam_from_world: Tensor, name: str = "cam_from_world") -> None:
-    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``."""
-    poses = cam_from_world.detach().double()
+    """Raise an error unless all poses (V, 4, 4) are finite and rigid, within ``ROTATION_TOLERANCE``.
+
+    Computed on the CPU: a GPU would take a dozen kernels for a few numbers.
+    """
+    poses = cam_from_world.detach().cpu().double()
     rotations = poses[:, :3, :3]
     unit = torch.eye(3, device=poses.device, dtype=poses.dtype)
     error = (rotations.mT @ rotations - unit).abs().amax((1, 2))

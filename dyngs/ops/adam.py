@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeAlias
 
 import torch
@@ -158,17 +159,18 @@ def _torch_adam_step(
 
 def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
     """(C,) learning rates in the dtype and on the device of ``param``."""
-    is_finite = bool(lr.isfinite().all()) if isinstance(lr, Tensor) else math.isfinite(lr)
-    if not is_finite:
-        raise DyngsError("Adam: lr must be finite")
     if not isinstance(lr, Tensor):
-        return torch.full((row_size,), lr, dtype=param.dtype, device=param.device)
-    rates = sent(lr.detach(), param.device).to(param.dtype)
-    if rates.ndim == 0:
-        return rates.expand(row_size).contiguous()
-    if rates.shape != (row_size,):
-        raise DyngsError(f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(rates.shape)}")
-    return rates.contiguous()
+        return _rates((lr,), row_size, param.dtype, param.device)
+    if lr.ndim > 0 and lr.shape != (row_size,):
+        raise DyngsError(f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(lr.shape)}")
+    return _rates(tuple(lr.detach().reshape(-1).cpu().numpy().tolist()), row_size, param.dtype, param.device)
+
+
+@lru_cache(maxsize=256)  # most rates are those of the last step, and lie on the GPU by then
+def _rates(values: tuple[float, ...], row_size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    if not all(map(math.isfinite, values)):
+        raise DyngsError("Adam: lr must be finite")
+    return sent(torch.tensor(values, dtype=dtype, device="cpu"), device).expand(row_size).contiguous()
 
 
 def _check(update: AdamUpdate, like: Tensor) -> None:

@@ -80,20 +80,25 @@ def check_memory(size: int, what: str, like: Tensor) -> None:
         raise DyngsError(f"render refused: {what} take {needed}; {left} of memory are available; {REMEDY}")
 
 
-def _count_nonfinite(x: Tensor) -> Tensor:
-    count = x.new_zeros(1, dtype=torch.int32)
-    launch(x, "count_nonfinite", x, count, num_threads())
-    return count[0].long()
+def _count_nonfinite(tensors: list[Tensor]) -> Tensor:
+    counts = tensors[0].new_zeros(len(tensors), dtype=torch.int32)
+    for i, x in enumerate(tensors):
+        launch(x, "count_nonfinite", x, counts[i : i + 1], num_threads())
+    return counts.long()
 
 
 count_nonfinite_op = register("count_nonfinite", _count_nonfinite)
+"""Return (K,) int64: how many numbers of each of K tensors are NaN or infinite."""
 
 
 def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
-    """Raise an error unless every element of the ``tensors`` (float32 or float64) is finite."""
-    for name, x in tensors.items():
-        native = has_kernel("count_nonfinite", x.device)
-        count = int(count_nonfinite_op(x.detach()) if native else (~x.isfinite()).sum())
+    """Raise an error unless every element of the ``tensors`` (float32 or float64, on one device) is finite."""
+    given = [x.detach() for x in tensors.values()]
+    if has_kernel("count_nonfinite", given[0].device):
+        counts = count_nonfinite_op(given)
+    else:
+        counts = torch.stack([(~x.isfinite()).sum() for x in given])
+    for (name, x), count in zip(tensors.items(), map(int, counts.cpu()), strict=True):
         if count:
             rows = int((~finite_rows([x])).sum())
             raise DyngsError(f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}")

@@ -90,18 +90,23 @@ def core_for(x: Tensor) -> ModuleType:
 
     Raises DyngsError: ``x`` is float64 on a GPU.
     """
-    if x.device.type == "cpu":
+    if x.is_cpu:
         return core
     if x.dtype == torch.float64:
         raise DyngsError("float64 is not there on a GPU; use float32")
-    module = cuda_core()
-    module.use_queue(x.get_device(), torch.cuda.current_stream(x.device).cuda_stream)
+    module, index = cuda_core(), x.get_device()
+    module.use_queue(index, torch._C._cuda_getCurrentRawStream(index))  # pyright: ignore
     return module
 
 
 def lend(size: int, device: int) -> Tensor:
     """Return ``size`` bytes of a GPU's memory; called by its core, which gives them back when its work is queued."""
-    return torch.empty(size, dtype=torch.uint8, device=f"cuda:{device}")
+    return torch.empty(size, dtype=torch.uint8, device=_gpu(device))
+
+
+@cache
+def _gpu(index: int) -> torch.device:
+    return torch.device("cuda", index)
 
 
 def active_isa() -> str:

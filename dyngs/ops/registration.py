@@ -146,8 +146,15 @@ def empty_like(x: Tensor) -> Tensor:
     return torch.empty_like(x, memory_format=torch.contiguous_format)
 
 
+_PLAIN = frozenset({int, float, bool, type(None)})
+
+
 def _passed(core: ModuleType, value: Any) -> Any:
-    if isinstance(value, Tensor):  # the most frequent kind first: a training step passes two hundred values
+    if type(value) is Tensor:  # the most frequent kinds first: a training step passes two hundred values
+        return array(value)
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, Tensor):
         return array(value)
     if isinstance(value, (list, tuple)):
         return tuple([_passed(core, x) for x in cast(Iterable[object], value)])

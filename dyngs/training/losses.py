@@ -63,10 +63,10 @@ class StepCheck:
 
     def __init__(self, terms: Mapping[str, Tensor], moved: Mapping[str, Tensor], device: torch.device) -> None:
         self._terms, self._moved = tuple(terms), {name: x.detach() for name, x in moved.items() if x.numel()}
-        numbers = [torch.stack([sent(x.detach(), device).double() for x in terms.values()])] if terms else []
+        numbers = [sent(x.detach(), device).double().reshape(1) for x in terms.values()]
         # sums, in which NaN and infinity show: a thirtieth of the time of isfinite
         numbers += [torch.stack([x.sum() for x in self._moved.values()]).double()] if self._moved else []
-        self._read = ReadBack(torch.cat(numbers))
+        self._read = ReadBack(torch.cat(numbers) if len(numbers) > 1 else numbers[0])
 
     def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:
         """Return the sum of the terms; waits for them."""

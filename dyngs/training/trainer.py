@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -163,7 +164,8 @@ class Trainer(Generic[M]):
         for loss in self.losses:
             terms |= loss(look)
         check = StepCheck(terms, drawn.moved, self.device)
-        sum(terms.values(), torch.zeros((), device=self.device)).backward()
+        with torch.autograd.set_multithreading_enabled(False):  # a GPU's nodes in this thread, too: no handing over
+            reduce(add, terms.values()).backward()
         value = check.loss(step, image, self.model.moves_by)
         drawn.after_backward()
         if self.exposures is not None:

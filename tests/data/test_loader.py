@@ -181,7 +181,7 @@ def test_images_that_a_gpu_keeps_are_sent_once(tmp_path: Path) -> None:
         for _ in range(2):
             for i in range(3):
                 images[i]
-        cameras = 2 * 6
+        cameras = 2 * 3
         assert gpu.waits == {"queued to the GPU": 3 + cameras}
     assert images.cached_bytes == 0, "they are not kept twice"
 

@@ -113,7 +113,7 @@ def updated() -> Made:
     rates = torch.linspace(0.01, 0.02, 6)
     skipped = [adam_step_(param, grad, *moments, lr=rates, step=step, rows=rows) for step in (1, 2)]
     skipped.append(adam_step_(param, grad, *moments, lr=0.01, step=3))
-    return [param, *moments, torch.tensor(skipped), seen_rows(grad), count_nonfinite_op(grad)]
+    return [param, *moments, torch.tensor(skipped), seen_rows(grad), count_nonfinite_op([grad, param])]
 
 
 def moved() -> Made:

@@ -66,7 +66,7 @@ def test_where_it_is_not_implemented_the_device_is_named() -> None:
     with pytest.raises(DyngsError, match=r"dyngs::test_double has no implementation for tensors on cpu; move all"):
         on(DispatchKey.CUDA, double_op, torch.ones(3), [1.0])
     with pytest.raises(DyngsError, match=r"dyngs::count_nonfinite has no implementation"):
-        on(DispatchKey.MPS, count_nonfinite_op, torch.ones(3))
+        on(DispatchKey.MPS, count_nonfinite_op, [torch.ones(3)])
 
 
 def test_another_device_joins_without_a_change_of_callers() -> None:
