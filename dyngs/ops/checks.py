@@ -98,7 +98,7 @@ def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input")
         counts = count_nonfinite_op(given)
     else:
         counts = torch.stack([(~x.isfinite()).sum() for x in given])
-    for (name, x), count in zip(tensors.items(), map(int, counts.cpu()), strict=True):
+    for (name, x), count in zip(tensors.items(), counts.cpu().numpy().tolist(), strict=True):
         if count:
             rows = int((~finite_rows([x])).sum())
             raise DyngsError(f"{name} holds {count} NaN or infinite value(s) in {rows} of {len(x)} rows; {remedy}")
