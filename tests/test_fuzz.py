@@ -28,21 +28,25 @@ FUZZ = """
 import sys
 from fuzz.__main__ import main
 
-report, inputs = sys.argv[1:]
+report, inputs, harm = sys.argv[1:]
 sys.argv[1:] = ["all", "--no-keep", "--inputs", inputs, "--seed", "0", "--json", report]
 main()
 print("the corpus", flush=True)
 sys.argv[1:] = ["all", "--no-keep", "--replay"]
-sys.exit(main())
+code = main()
+print("the harm", flush=True)
+exec(harm)
+sys.exit(code)
 """
 
 
 @dataclass(frozen=True)
 class Fuzzed:
-    """Changed inputs for each reader, and the corpus."""
+    """Changed inputs for each reader, the corpus, and readers that do harm."""
 
     tried: dict[str, Any]  # counts, and failures with what is known of them, of each reader
     replayed: str  # what was printed of the corpus
+    harms: str  # what was printed of those
     code: int
 
 
@@ -51,9 +55,11 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Fuzzed:
     """By one process, which imports everything and is forked: threads of these tests would not survive that."""
     report = tmp_path_factory.mktemp("fuzz") / "report.json"
     environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
-    command = [sys.executable, "-c", FUZZ, str(report), str(INPUTS)]
+    command = [sys.executable, "-c", FUZZ, str(report), str(INPUTS), HARM]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900, check=False)
-    return Fuzzed(json.loads(report.read_text()), done.stdout.partition("the corpus")[2], done.returncode)
+    assert "the harm" in done.stdout, done.stderr
+    replayed, _, harms = done.stdout.partition("the corpus")[2].partition("the harm")
+    return Fuzzed(json.loads(report.read_text()), replayed, harms, done.returncode)
 
 
 def test_changed_inputs_are_read_or_refused(fuzzed: Fuzzed) -> None:
@@ -78,15 +84,9 @@ def test_what_was_found_stays_mended(fuzzed: Fuzzed) -> None:
     assert sum(tried) >= 70
 
 
-def test_what_harms_is_noticed(tmp_path: Path) -> None:
+def test_what_harms_is_noticed(fuzzed: Fuzzed) -> None:
     """Readers that do what they must not, each told by its verdict."""
-    script = tmp_path / "harm.py"
-    script.write_text(HARM)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))}
-    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found == {
+    assert json.loads(fuzzed.harms) == {
         "quiet": "accepted: ",
         "polite": "refused: ",
         "unnamed": "failed: the error names no file outside dyngs",
@@ -107,7 +107,6 @@ def test_what_harms_is_noticed(tmp_path: Path) -> None:
 
 
 HARM = """
-import fuzz  # first: finds the dyngs that is meant
 import ctypes, json, math, os, shutil, subprocess, tempfile, time
 from pathlib import Path
 from dyngs.errors import DyngsError

@@ -92,10 +92,10 @@ def test_a_ball_that_rolls_is_followed_as_a_body(tmp_path: Path, monkeypatch: py
 
 def test_a_person(tmp_path: Path) -> None:
     """In the box of the person: in poses that were seen, and in those of a clip that was not."""
-    captured = Captured.of(tmp_path, "human", "--size", "64", "--views", "6", "--cameras", "4")
+    captured = Captured.of(tmp_path, "human", "--size", "48", "--views", "6", "--cameras", "4")
     keys = [key for key in captured.keys("human") if key not in SMALL]
-    run = dyngs.train(dyngs.load_config("human", [*keys, "train.steps=200", "model.resolution=48"]))
-    floors = {"test": 22.5, "pose": 22.0}  # 22.85, 22.29
+    run = dyngs.train(dyngs.load_config("human", [*keys, "train.steps=100", "model.resolution=48"]))
+    floors = {"test": 23.0, "pose": 21.4}  # 23.36, 21.77; after 40 steps 21.65, 20.85
     found = {split: evaluate_run(run, split).psnr_person or 0.0 for split in floors}
     assert {split: psnr for split, psnr in found.items() if psnr <= floors[split]} == {}
 

@@ -102,7 +102,8 @@ def write_run(out: Path, predictor: Predictor, views: Sequence[int], scene: Rend
     """Write ``scene``, which was predicted from ``views``, as a run after no step."""
     config = predictor.run_config(views)
     config = config.model_copy(update={"run": config.run.model_copy(update={"name": out.name, "dir": out})})
-    trainer = assemble(config, restored=True)
+    unjudged = config.train.model_copy(update={"priors": ()})  # whether maps are used is for a training to find
+    trainer = assemble(config.model_copy(update={"train": unjudged}), restored=True)
     predictor.begin(trainer.model, scene, config)
     with new_folder(out, require_empty) as started:
         write_config(config, started)

@@ -69,13 +69,15 @@ class Progress:
         rate = (record.step - self._start) / max(now - self._since, 1e-9)
         config = None if self._config is None else self._config()
         self._forecast.observe(config, record.step, now, record.num_gaussians, pixels)
+        if self._bar is None and record.step < self._next_line and record.step != self._total:
+            return  # no line is due
         left = _clock(self._forecast.seconds(config, self._total))
         psnr = "-" if self._psnr is None else f"{self._psnr:.2f}"
         count = f"{record.num_gaussians:,} Gaussians " if record.num_gaussians else ""
         text = f"loss {record.loss:.4f} psnr {psnr} {count}{rate:.1f} steps/s"
         if self._bar is not None:
             self._bar.update(self._task, completed=record.step, text=text, left=left)
-        elif record.step >= self._next_line or record.step == self._total:
+        else:
             print(f"step {record.step}/{self._total} {text} {left} left", file=self._stream, flush=True)
             self._next_line = record.step + max(1, self._total // PLAIN_LINES)
 

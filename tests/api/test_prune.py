@@ -36,6 +36,14 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes"))
 
 
+@pytest.fixture
+def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search tries one value of each kind of limit."""
+    few = {"LEFT_GAUSSIANS": (0.5,), "CUT_OFFS": (0.02,), "FIELD_LOSSES": (0.1,), "HARMONIC_LOSSES": (0.03,)}
+    for name, candidates in few.items():
+        monkeypatch.setattr(f"dyngs.prune.search.{name}", candidates)
+
+
 def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -> None:
     small = prune_run(run_dir, tmp_path / "small", ASKED)
     config = busy_config(load_resolved(run_dir).data.root, tmp_path / "whole", "control_nodes")
@@ -47,6 +55,7 @@ def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -
     assert len(load_run(file_of(small)).scene) == len(load_run(small).scene)
 
 
+@pytest.mark.usefixtures("few_candidates")
 def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     once = prune_run(run_dir, tmp_path / "once", ASKED)
     twice = prune_run(once, tmp_path / "twice", ("prune.fraction=0.5", "prune.steps=2"))
@@ -58,11 +67,9 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     assert load_run(thrice).step == 36
 
 
+@pytest.mark.usefixtures("few_candidates")
 def test_on_a_gpu_it_is_the_same(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The search, of few candidates, its file, and the comparison with the run before."""
-    few = {"LEFT_GAUSSIANS": (0.5,), "CUT_OFFS": (0.02,), "FIELD_LOSSES": (0.1,), "HARMONIC_LOSSES": (0.03,)}
-    for name, candidates in few.items():
-        monkeypatch.setattr(f"dyngs.prune.search.{name}", candidates)
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
     here = compared([run_dir, file_of(tmp_path / "here")], 1)
@@ -98,6 +105,7 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     assert str(first).count("limit:") == len(first.limits) >= 4
 
 
+@pytest.mark.usefixtures("few_candidates")
 def test_where_nothing_can_go_the_run_stays_as_it_is(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,7 @@ from dyngs.tradeoff.variants import Variant, parse_variations
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SETTINGS = ("prune=0.5", "mask_times=3", "sh_degree=0", "storage=2", "field_step=64", "alpha_min=0.02", "scale=0.5")
-PLAN = Plan(parse_variations(SETTINGS, trains=False), finetune=2, combine=2, rounds=1)
+PLAN = Plan(parse_variations(SETTINGS, trains=False), finetune=2, combine=1, rounds=1)
 
 
 @pytest.fixture(scope="module")
