@@ -18,6 +18,7 @@ from dyngs.tensor_checks import require_tensor
 
 DENSE_FRACTION = 0.01  # Scale, in reaches, up to which Gaussians are cloned; larger ones are split
 PRUNE_SCALE = 0.1  # Scale, in reaches, from which Gaussians are removed after the first opacity reset
+FAR = 5.0  # Distance, in scene extents, from which a Gaussian is far
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
 MAX_LOG_VARIANCE = 60.0  # Random offsets stay finite whatever the scales
@@ -86,9 +87,9 @@ class DefaultDensifier(Densifier):
     (later) huge ones removed; opacities are lowered now and then. At least one Gaussian is always left. Where the cap
     ``max_gaussians`` leaves no room for all, those with the largest gradients go first.
 
-    What is large is judged by the reach of a Gaussian: the scene extent, or its distance from ``center`` (3,), the mean
-    of the cameras, where that is larger. 3DGS takes the extent for all, and so removes sky and far hills, which need
-    Gaussians as large as they are far.
+    What is large is judged by the reach of a Gaussian: the scene extent, or of what is ``FAR`` its distance from
+    ``center`` (3,), the mean of the cameras. 3DGS takes the extent for all, and so removes sky and far hills, which
+    need Gaussians as large as they are far.
     """
 
     def __init__(self, options: DefaultStrategy, schedule: DensifySchedule, extent: float, center: Tensor) -> None:
@@ -163,7 +164,8 @@ class DefaultDensifier(Densifier):
         self._step_grad_sum, self._step_seen = (torch.zeros(0, device=self.seen.device) for _ in range(2))
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
-        reach = (parameters.means - self.center).norm(dim=1).clamp_min(self.extent)
+        distance = (parameters.means - self.center).norm(dim=1)
+        reach = torch.where(distance > FAR * self.extent, distance, self.extent)
         max_scale = PRUNE_SCALE * reach if step > self.schedule.prune_scale_after else math.inf
         plan = plan_edit(parameters, self.grad_sum / self.seen.clamp_min(1), self.options, reach, max_scale)
         kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split))

@@ -98,19 +98,19 @@ def test_huge_ones_go_only_after_the_first_reset() -> None:
         assert result.edit.source.tolist() == left
 
 
-def test_what_is_farther_than_the_extent_may_be_as_much_larger() -> None:
+def test_what_is_far_may_be_as_much_larger() -> None:
     """Sky and far hills stay, and are copied where nearer ones would be split; ``center`` is what they are far from."""
-    center = torch.tensor([-12.0, 0.0, 0.0])  # reach of those at x = 0: 12, at x = -12: the extent, 10
-    means = torch.tensor([0.0, -12.0])[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    center = torch.tensor([-60.0, 0.0, 0.0])  # distances 60, which is the reach, and 50, five extents: not yet far
     for scale, score, step, source in (
-        (1.1, 0.0, 400, [0]),
-        (1.3, 0.0, 400, []),
-        (0.11, 3e-4, 200, [0, 0, 1, 1]),
-        (0.13, 3e-4, 200, [0, 1, 0, 1]),
+        (5.9, 0.0, 400, [0]),
+        (6.1, 0.0, 400, []),
+        (0.59, 3e-4, 200, [0, 0, 1, 1]),
+        (0.61, 3e-4, 200, [0, 1, 0, 1]),
     ):
         densifier = DefaultDensifier(DefaultStrategy(), SCHEDULE, EXTENT, center)
-        gaussians = _gaussians([scale] * 2 + [SMALL], [0.5] * 3)
-        gaussians = gaussians.replace(means=torch.cat([means, torch.zeros(1, 3)]))
+        gaussians = _gaussians([scale, scale, SMALL], [0.5] * 3)
+        x = torch.tensor([0.0, -10.0, 0.0])
+        gaussians = gaussians.replace(means=torch.stack([x, 0 * x, 0 * x], 1))
         _signal(densifier, [score, score, 0.0])
         result = densifier.edit(step, gaussians, torch.Generator().manual_seed(0))
         assert result is not None
