@@ -16,8 +16,9 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import rotate
 from dyngs.tensor_checks import require_tensor
 
-DENSE_FRACTION = 0.01  # Scale, in scene extents, up to which Gaussians are cloned; larger ones are split
-PRUNE_SCALE = 0.1  # Scale, in scene extents, from which Gaussians are removed after the first opacity reset
+DENSE_FRACTION = 0.01  # Scale, in reaches, up to which Gaussians are cloned; larger ones are split
+PRUNE_SCALE = 0.1  # Scale, in reaches, from which Gaussians are removed after the first opacity reset
+FAR = 5.0  # Distance, in scene extents, from which a Gaussian is far
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
 MAX_LOG_VARIANCE = 60.0  # Random offsets stay finite whatever the scales
@@ -85,10 +86,14 @@ class DefaultDensifier(Densifier):
     Small Gaussians with a large gradient are copied, large ones replaced by two samples of themselves, transparent and
     (later) huge ones removed; opacities are lowered now and then. At least one Gaussian is always left. Where the cap
     ``max_gaussians`` leaves no room for all, those with the largest gradients go first.
+
+    What is large is judged by the reach of a Gaussian: the scene extent, or of what is ``FAR`` its distance from
+    ``center`` (3,), the mean of the cameras. 3DGS takes the extent for all, and so removes sky and far hills, which
+    need Gaussians as large as they are far.
     """
 
-    def __init__(self, options: DefaultStrategy, schedule: DensifySchedule, extent: float) -> None:
-        self.options, self.schedule, self.extent = options, schedule, extent
+    def __init__(self, options: DefaultStrategy, schedule: DensifySchedule, extent: float, center: Tensor) -> None:
+        self.options, self.schedule, self.extent, self.center = options, schedule, extent, center
         self.grad_sum = torch.zeros(0, device="cpu")
         self.seen = torch.zeros(0, device="cpu")
         self._step_grad_sum, self._step_seen = self.grad_sum, self.seen
@@ -128,6 +133,7 @@ class DefaultDensifier(Densifier):
 
     def place(self, device: torch.device) -> None:
         self.grad_sum, self.seen = self.grad_sum.to(device), self.seen.to(device)
+        self.center = self.center.to(device)
 
     def limit(self, max_gaussians: int) -> None:
         self.options = self.options.model_copy(update={"max_gaussians": max_gaussians})
@@ -158,8 +164,10 @@ class DefaultDensifier(Densifier):
         self._step_grad_sum, self._step_seen = (torch.zeros(0, device=self.seen.device) for _ in range(2))
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
-        max_scale = PRUNE_SCALE * self.extent if step > self.schedule.prune_scale_after else math.inf
-        plan = plan_edit(parameters, self.grad_sum / self.seen.clamp_min(1), self.options, self.extent, max_scale)
+        distance = (parameters.means - self.center).norm(dim=1)
+        reach = torch.where(distance > FAR * self.extent, distance, self.extent)
+        max_scale = PRUNE_SCALE * reach if step > self.schedule.prune_scale_after else math.inf
+        plan = plan_edit(parameters, self.grad_sum / self.seen.clamp_min(1), self.options, reach, max_scale)
         kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split))
         source = torch.cat([kept, cloned, split, split])
         is_new = torch.ones(len(source), dtype=torch.bool, device=source.device)
@@ -186,18 +194,19 @@ class EditPlan:
 
 
 def plan_edit(
-    parameters: Gaussians, score: Tensor, options: DefaultStrategy, extent: float, max_scale: float
+    parameters: Gaussians, score: Tensor, options: DefaultStrategy, reach: float | Tensor, max_scale: float | Tensor
 ) -> EditPlan:
     """Return the plan of one densification.
 
     Args:
-        max_scale: larger Gaussians are removed, world units.
+        reach: (N,) or of all, world units, see ``DefaultDensifier``.
+        max_scale: (N,) or of all, world units; larger Gaussians are removed.
     """
     scale = parameters.log_scales.amax(1).exp()
     opaque = parameters.opacities >= options.prune_opacity
     survives = opaque & (scale <= max_scale)
     wanted = opaque & (score >= options.grad_threshold)
-    large = scale > DENSE_FRACTION * extent
+    large = scale > DENSE_FRACTION * reach
     wanted = wanted if options.grow else torch.zeros_like(wanted)
     split = wanted & large & (scale / SPLIT_SHRINK <= max_scale)
     cloned = wanted & ~large & survives

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 from typing_extensions import assert_never
 
@@ -61,7 +62,8 @@ def densifier_of(run: RunStart) -> Densifier:
             return McmcDensifier(strategy, schedule, growth_per_change(steps))
         case DefaultStrategy():
             options = strategy.model_copy(update={"grad_threshold": grad_threshold(strategy, steps)})
-            return DefaultDensifier(options, densify_schedule(strategy, steps, on_white), run.extent)
+            center = torch.from_numpy(surroundings(run.capture).camera_centers.mean(axis=0)).float()
+            return DefaultDensifier(options, densify_schedule(strategy, steps, on_white), run.extent, center)
         case FixedStrategy():
             return Densifier()
         case _:

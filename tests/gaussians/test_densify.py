@@ -39,7 +39,7 @@ def _signal(densifier: DefaultDensifier, scores: list[float]) -> None:
 
 
 def _densifier(options: DefaultStrategy | None = None) -> DefaultDensifier:
-    return DefaultDensifier(options or DefaultStrategy(), SCHEDULE, EXTENT)
+    return DefaultDensifier(options or DefaultStrategy(), SCHEDULE, EXTENT, torch.zeros(3))
 
 
 def test_signal_is_the_mean_norm_in_ndc_units_over_the_views_that_see_it() -> None:
@@ -98,6 +98,26 @@ def test_huge_ones_go_only_after_the_first_reset() -> None:
         assert result.edit.source.tolist() == left
 
 
+def test_what_is_far_may_be_as_much_larger() -> None:
+    """Sky and far hills stay, and are copied where nearer ones would be split; ``center`` is what they are far from."""
+    center = torch.tensor([-60.0, 0.0, 0.0])  # distances 60, which is the reach, and 50, five extents: not yet far
+    for scale, score, step, source in (
+        (5.9, 0.0, 400, [0]),
+        (6.1, 0.0, 400, []),
+        (0.59, 3e-4, 200, [0, 0, 1, 1]),
+        (0.61, 3e-4, 200, [0, 1, 0, 1]),
+    ):
+        densifier = DefaultDensifier(DefaultStrategy(), SCHEDULE, EXTENT, center)
+        gaussians = _gaussians([scale, scale, SMALL], [0.5] * 3)
+        x = torch.tensor([0.0, -10.0, 0.0])
+        gaussians = gaussians.replace(means=torch.stack([x, 0 * x, 0 * x], 1))
+        _signal(densifier, [score, score, 0.0])
+        result = densifier.edit(step, gaussians, torch.Generator().manual_seed(0))
+        assert result is not None
+        assert result.edit is not None
+        assert [row for row in result.edit.source.tolist() if row != 2] == source, scale
+
+
 def test_nothing_happens_between_and_outside() -> None:
     for step in (100, 150, 1000, 1100):
         densifier = _densifier()
@@ -107,7 +127,9 @@ def test_nothing_happens_between_and_outside() -> None:
 
 
 def test_reset_lowers_opacities_and_clears_their_moments() -> None:
-    densifier = DefaultDensifier(DefaultStrategy(), DensifySchedule(100, 1000, 100, resets=(350,)), EXTENT)
+    densifier = DefaultDensifier(
+        DefaultStrategy(), DensifySchedule(100, 1000, 100, resets=(350,)), EXTENT, torch.zeros(3)
+    )
     result = densifier.edit(350, _gaussians([SMALL] * 2, [0.5, 0.006]), torch.Generator())
     assert result is not None
     assert result.edit is None
