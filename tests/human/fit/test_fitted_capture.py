@@ -60,6 +60,11 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
     assert "the fit of before" in said[-1]
 
 
+def test_other_cameras_are_another_fit(data: DataConfig) -> None:
+    fits = {with_fitted_body(data.model_copy(update={"train_cameras": x})).body for x in (None, (0,), (0, 1))}
+    assert len(fits) == 3
+
+
 def test_given_poses_are_left_alone_unless_asked_for(data: DataConfig) -> None:
     assert with_fitted_body(data, only_if_needed=True, say=pytest.fail) == data
 
