@@ -28,7 +28,7 @@ from dyngs.config.schema import (
     section_class,
     section_classes,
 )
-from dyngs.config.yaml_reader import PLAIN_TEXT, Leaf, read_file, read_override, require_usable
+from dyngs.config.yaml_reader import Leaf, read_file, read_override, require_usable
 from dyngs.errors import DyngsError, as_word, printable
 from dyngs.files.write import write_text
 from dyngs.files.wrong_place import command_for
@@ -121,19 +121,10 @@ def save_config(config: Config, path: Path) -> None:
     body, beside = config.data.body, path.parent.absolute()
     if body is not None and body.is_relative_to(beside):
         values["data"]["body"] = body.relative_to(beside).as_posix()
-    text = _plain(values) or yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
     if not _ODD_LINE_BREAKS.isdisjoint(text):
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)  # escapes, where YAML would fold them
     write_text(path, text, durable=True)
-
-
-def _plain(values: dict[str, Any]) -> str | None:
-    """Return ``values`` as libyaml writes them; None where it is missing, or might write them otherwise than Python."""
-    try:
-        text = yaml.dump(values, Dumper=yaml.CSafeDumper, sort_keys=False, allow_unicode=True)
-    except (AttributeError, UnicodeError):
-        return None
-    return text if PLAIN_TEXT.fullmatch(text) else None
 
 
 def find_preset(path: Path) -> Path:

@@ -14,15 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from yaml.composer import Composer, ComposerError
-from yaml.constructor import SafeConstructor
+from yaml.composer import ComposerError
 from yaml.reader import ReaderError
-from yaml.resolver import Resolver
-
-try:
-    from yaml.cyaml import CParser  # type: ignore[attr-defined]
-except ImportError:  # PyYAML without libyaml
-    CParser = None
 
 from dyngs.errors import DyngsError, printable, reason, require_name
 
@@ -37,8 +30,6 @@ _SHOWN = 100
 _ODD_NUMBER = re.compile(r"[-+]?(0\d|\d[\d_]*:)")
 """YAML 1.1 takes 010 for 8 and 1:30 for 90: nobody means that."""
 _EXACT_FLOAT = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
-PLAIN_TEXT = re.compile(r"[\w\n .,:;#()/=^+'%\[\]-]*", re.ASCII)
-"""Presets and configurations of runs are made of it: libyaml reads and writes it as Python does, six times faster."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +56,8 @@ def read_file(path: Path) -> list[Leaf]:
     except UnicodeDecodeError:
         raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
     origin = str(path)
-    with _loaded(text, origin) as (loader, root):
+    with _loaded(text, origin) as loader:
+        root = loader.get_single_node()
         if root is None:
             return []
         if not isinstance(root, yaml.MappingNode):
@@ -83,7 +75,8 @@ def read_override(text: str) -> list[Leaf]:
     if len(written) > MAX_BYTES:
         raise DyngsError(f"{origin}: has {len(written)} characters; no value is as long")
     try:
-        with _loaded(written, origin) as (loader, node):
+        with _loaded(written, origin) as loader:
+            node = loader.get_single_node()
             if isinstance(node, yaml.MappingNode) and not node.flow_style:
                 return [Leaf(keys, written, written, origin)]  # "10:", which only looks like a mapping
             if isinstance(node, yaml.MappingNode) and node.value:
@@ -98,14 +91,14 @@ class _NotYaml(DyngsError):
     """Text that is not valid YAML, as opposed to YAML that is not allowed here."""
 
 
-class _Values(Composer, SafeConstructor, Resolver):
+class _PresetLoader(yaml.SafeLoader):
     """Safe YAML without aliases, of limited depth, and with ``1e-4`` read as the number that it is."""
 
     depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        mark = self.peek_event().start_mark  # type: ignore[attr-defined]
-        if self.check_event(yaml.AliasEvent):  # type: ignore[attr-defined]
+        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+        if self.check_event(yaml.AliasEvent):
             raise ComposerError(None, None, "aliases (*name) are not allowed here", mark)
         if self.depth > MAX_DEPTH:
             raise ComposerError(None, None, "nested too deeply for a configuration", mark)
@@ -114,6 +107,11 @@ class _Values(Composer, SafeConstructor, Resolver):
             return super().compose_node(parent, index)
         finally:
             self.depth -= 1
+
+    def fetch_flow_collection_start(self, TokenClass: Any) -> None:
+        if self.flow_level > MAX_DEPTH:  # before composing: thousands of brackets take the scanner seconds
+            raise ComposerError(None, None, "nested too deeply for a configuration", self.get_mark())
+        super().fetch_flow_collection_start(TokenClass)  # type: ignore[no-untyped-call]
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         """Return the value of a node; its text where it only looks like a number or date, or is too large a number."""
@@ -128,57 +126,23 @@ class _Values(Composer, SafeConstructor, Resolver):
         return node.value if isinstance(value, int) and value.bit_length() > _BITS else value
 
 
-_Values.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, list("-+.0123456789"))
-
-
-class _PresetLoader(_Values, yaml.SafeLoader):
-    """Of any text, with messages that do not depend on whether libyaml is there."""
-
-    def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level > MAX_DEPTH:  # before composing: thousands of brackets take the scanner seconds
-            raise ComposerError(None, None, "nested too deeply for a configuration", self.get_mark())
-        super().fetch_flow_collection_start(TokenClass)  # type: ignore[no-untyped-call]
-
-
-if CParser is not None:
-
-    class _PlainLoader(_Values, CParser):
-        """By libyaml; of ``PLAIN_TEXT`` it makes what Python makes, or an error."""
-
-        def __init__(self, text: str) -> None:
-            CParser.__init__(self, text)  # type: ignore[call-arg]
-            for part in (Composer, SafeConstructor, Resolver):
-                part.__init__(self)
+_PresetLoader.add_implicit_resolver("tag:yaml.org,2002:float", _EXACT_FLOAT, list("-+.0123456789"))
 
 
 @contextmanager
-def _loaded(text: str, origin: str) -> Iterator[tuple[_Values, yaml.Node | None]]:
-    """Yield a loader of ``text`` and its root; whatever YAML raises in the block is one line."""
+def _loaded(text: str, origin: str) -> Iterator[_PresetLoader]:
+    """Yield a loader of ``text``; whatever YAML raises in the block is one line."""
+    loader: _PresetLoader | None = None
     try:
-        yield _plain(text) or _any(text)
+        loader = _PresetLoader(text)
+        yield loader
     except DyngsError:
         raise
     except Exception as error:
         raise _NotYaml(f"{origin}{_problem(error, text)}") from error
-
-
-def _plain(text: str) -> tuple[_Values, yaml.Node | None] | None:
-    """Return loader and root of text that libyaml reads; None where it is missing or ``_any`` has to judge."""
-    if CParser is None or not PLAIN_TEXT.fullmatch(text):
-        return None
-    try:
-        loader = _PlainLoader(text)
-        return loader, loader.get_single_node()
-    except Exception:
-        return None
-
-
-def _any(text: str) -> tuple[_Values, yaml.Node | None]:
-    loader = _PresetLoader(text)
-    try:
-        return loader, loader.get_single_node()
     finally:
-        loader.dispose()  # type: ignore[no-untyped-call]
+        if loader is not None:
+            loader.dispose()
 
 
 def _problem(error: Exception, text: str) -> str:
@@ -198,7 +162,7 @@ def _problem(error: Exception, text: str) -> str:
 
 
 def _walk(
-    loader: _Values, node: yaml.MappingNode, above: tuple[str, ...], origin: str, *, lines: bool = False
+    loader: yaml.SafeLoader, node: yaml.MappingNode, above: tuple[str, ...], origin: str, *, lines: bool = False
 ) -> Iterator[Leaf]:
     seen: set[str] = set()
     for key_node, value_node in node.value:

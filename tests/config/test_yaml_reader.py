@@ -7,12 +7,11 @@ import time
 from pathlib import Path
 
 import pytest
-import yaml
 from refused import error_line
 
-from dyngs.config.io import load_config, load_resolved, packaged_preset, packaged_presets, save_config
+from dyngs.config.io import load_config, load_resolved, packaged_preset, save_config
 from dyngs.config.schema import config_keys
-from dyngs.config.yaml_reader import MAX_BYTES, MAX_DEPTH, PLAIN_TEXT, read_file
+from dyngs.config.yaml_reader import MAX_BYTES, MAX_DEPTH
 from dyngs.errors import DyngsError
 
 ROOT = "data.root=/x"
@@ -189,55 +188,3 @@ def test_a_leading_zero_changes_no_number() -> None:
     assert load_config(None, [ROOT, "train.steps=010"]).train.steps == 10
     assert load_config(None, [ROOT, "optim.lr_means=0.5"]).optim.lr_means == 0.5
     assert load_config(None, [ROOT, "run.name=007"]).run.name == "007"
-
-
-PIECES = (
-    *"ab1 \n.,:;#()/=^+'%[]-_~",
-    *(
-        "key: ",
-        "- ",
-        "\n  ",
-        "\n    ",
-        ": ",
-        "---\n",
-        "...\n",
-        "1e-4",
-        "12:30",
-        "010",
-        "null",
-        "''",
-        "%YAML 1.1\n",
-        " #c",
-    ),
-)
-
-
-def test_libyaml_and_python_read_and_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Presets, and texts of the same characters: values, lines and errors; half of the texts are YAML."""
-    if not yaml.__with_libyaml__:
-        pytest.skip("PyYAML without libyaml")
-    draw = random.Random(0)
-    texts = ["run:\n  name: " + "".join(draw.choices(PIECES, k=draw.randint(1, 9))) for _ in range(600)]
-    presets = [path.read_text() for path in packaged_presets().values()]
-    assert all(PLAIN_TEXT.fullmatch(text) for text in presets), "or their commands take longer to start"
-    file = tmp_path / "config.yaml"
-
-    def found(text: str) -> str:
-        file.write_text(text)
-        try:
-            leaves = read_file(file)
-        except DyngsError as error:
-            return str(error)
-        return repr(leaves) + yaml_of([leaf.value for leaf in leaves])
-
-    def yaml_of(values: list[object]) -> str:
-        config = load_config(None, [ROOT])
-        names = " ".join(str(value) for value in values)
-        save_config(config.model_copy(update={"run": config.run.model_copy(update={"name": names})}), file)
-        return file.read_text()
-
-    fast = [found(text) for text in (*presets, *texts)]
-    monkeypatch.setattr("dyngs.config.yaml_reader.CParser", None)
-    monkeypatch.delattr(yaml, "CSafeDumper")
-    assert fast == [found(text) for text in (*presets, *texts)]
-    assert 150 < sum(text.startswith("[") for text in fast) < 600
