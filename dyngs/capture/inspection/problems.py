@@ -9,8 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid, matrix_fault, pose_fault, projected
+from dyngs.data.geometry import (
+    camera_center,
+    focus_point,
+    fraction_in_front,
+    inverse_rigid,
+    matrix_fault,
+    pose_fault,
+    projected,
+)
 from dyngs.data.images.images import SUFFIXES, read_header, read_image, read_mask
 from dyngs.data.times import distinct_times, evenly_spaced
 from dyngs.errors import DyngsError, reading, reason
@@ -23,12 +32,13 @@ MARGIN = 0.1  # fractions of the image by which a point may lie outside: lenses 
 WIDE_BASELINE = 10.0  # degrees between neighbouring views, seen from the scene, from which they are far apart
 CLOSE_IN_TIME, FEW_VIEWS = 0.08, 3
 """Motion over this fraction of a clip is small; with fewer views in it, each time step is seen from one side only."""
+UNSEEN_SIDE = 200.0  # degrees around a body without a camera from which on a part of it is hardly seen
 
 
 def before_training(capture: Capture) -> list[str]:
     """Return one line for everything about a capture that is likely to spoil a training; only some masks are read."""
     found = [*capture.warnings, *mask_problems(capture), *time_problems(capture), *scene_problems(capture)]
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys([*found, *body_problems(capture)]))
 
 
 def time_problems(capture: Capture) -> list[str]:
@@ -46,6 +56,34 @@ def time_problems(capture: Capture) -> list[str]:
             "that; move the camera or use several"
         )
     return problems + _ill_posed(capture)
+
+
+def body_problems(capture: Capture) -> list[str]:
+    """Return a line if no training view shows one side of a captured person, in any frame."""
+    body = None if capture.body is None else capture.body["train"]
+    if body is None:
+        return []
+    from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
+
+    body = about_pelvis(body, np.zeros(3) if body.pelvis is None else body.pelvis)
+    rows = {frame: row for row, frame in enumerate(body.frames)}
+    seen = [(rows[v.frame], v) for v in capture.splits.get("train", ()) if v.frame in rows and pose_fault(v) is None]
+    if not seen:
+        return []
+    at = [row for row, _ in seen]
+    away = np.stack([camera_center(view.cam_from_world) for _, view in seen]) - body.trans[at]
+    away = Rotation.from_rotvec(body.poses[at, 0]).inv().apply(away)
+    around = np.sort(np.degrees(np.arctan2(away[:, 0], away[:, 2])))  # 0 in front, 90 on the person's left
+    gaps = np.diff(np.append(around, around[0] + 360))
+    widest = int(gaps.argmax())
+    if gaps[widest] < UNSEEN_SIDE:
+        return []
+    middle = round((around[widest] + gaps[widest] / 2) / 90) % 4
+    side = ("front", "left side", "back", "right side")[middle]
+    return [
+        f"the person's {side} is never seen: all cameras are within {360 - gaps[widest]:.0f} degrees around the body; "
+        "what they do not see will be a guess (turn around once, or use more cameras)"
+    ]
 
 
 def scene_problems(capture: Capture) -> list[str]:
@@ -174,7 +212,7 @@ def problems_of(capture: Capture, deep: bool) -> list[str]:
         problems.append(f"{same} views of a static scene share their pose with another one")
     problems += listed(f"'{view.name}': {fault}" for view in views if (fault := _fault_of_intrinsics(view)) is not None)
     problems += [*_image_problems(capture, deep), *mask_problems(capture)]
-    return [*problems, *time_problems(capture), *scene_problems(capture)]
+    return [*problems, *time_problems(capture), *scene_problems(capture), *body_problems(capture)]
 
 
 def _fault_of_intrinsics(view: View) -> str | None:

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tiny_captures import opengl_pose
 
-from dyngs.capture.inspection.problems import before_training, mask_problems
+from dyngs.capture.inspection.problems import before_training, body_problems, mask_problems
 from dyngs.capture.inspection.report import format_report, report_on
+from dyngs.data.body_frames import body_frames, of_one_clip
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import cam_from_opengl, pinhole_matrix
 from dyngs.data.read import read_capture
@@ -121,3 +123,35 @@ def test_the_report_says_which_value_counts(tmp_path: Path) -> None:
     assert "5 of 6 images; white counts, black is ignored" in format_report(
         report_on(capture_with(tmp_path, mask_of(6)))
     )
+
+
+@pytest.mark.parametrize("sides", [(), (0,), (90,), (180,), (270,), (350, 10), (80, 100), (0, 170), (0, 120, 240)])
+@pytest.mark.parametrize("turns", [None, 140.0])
+def test_sides_of_a_person_that_no_camera_sees(tmp_path: Path, sides: tuple[float, ...], turns: float | None) -> None:
+    # One frame per camera; the person leans, is turned to the world, and the camera stands at an angle to the body.
+    view, poses, trans, views = clip(3, 1).splits["train"][0], [], [], []
+    for row, side in enumerate(sides):
+        heading = 77.0 * row
+        turned = Rotation.from_euler("Y", heading, degrees=True) * Rotation.from_euler("X", 8, degrees=True)
+        place = np.array([5.0, 1.0, row])
+        around = np.radians(side)
+        centre = place + turned.apply([3 * np.sin(around), 0.4, 3 * np.cos(around)])
+        pose = np.eye(4)
+        pose[:3, 3] = -centre  # where it looks does not matter here
+        views.append(replace(view, cam_from_world=pose, frame=row))
+        given = turned if turns is None else Rotation.from_rotvec([0, np.radians(turns), 0]).inv() * turned
+        poses.append(np.concatenate([given.as_rotvec(), np.zeros(69)]))
+        trans.append(place)
+    if not sides:
+        assert body_problems(Capture(root=tmp_path, format="x", splits={"train": ()})) == []
+        return
+    whole = None if turns is None else np.tile([0, np.radians(turns), 0], (len(sides), 1))
+    body = body_frames(tmp_path, range(len(sides)), poses, trans, np.zeros(10), turns=whole)
+    capture = Capture(root=tmp_path, format="x", splits={"train": tuple(views)}, body=of_one_clip(body))
+    found = body_problems(capture)
+    unseen = {(0,): "back", (90,): "right side", (180,): "front", (270,): "left side"}
+    unseen |= {(350, 10): "back", (80, 100): "right side"}
+    assert [line.split(" is never")[0] for line in found] == [
+        f"the person's {side}" for key, side in unseen.items() if key == sides
+    ]
+    assert set(found) <= set(before_training(capture))
