@@ -10,12 +10,14 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
+from dyngs.human.fit import solve
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import (
     KEYPOINT,
     LIMIT_WEIGHT,
     LR,
     LR_DECAY,
+    MISTAKEN,
     PLACE,
     Fitting,
     PosePrior,
@@ -79,12 +81,28 @@ def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
 
 def test_silhouettes_count_where_they_are_known() -> None:
     seen = ObservedFrame(camera(), torch.ones(1, SIZE, SIZE), torch.ones(1, SIZE, SIZE))
-    assert float(silhouette_error(torch.zeros(1, SIZE, SIZE), seen)) == 1
+    assert float(silhouette_error(torch.zeros(1, SIZE, SIZE), seen)) == 1 / (1 + 1 / MISTAKEN)
     half = torch.ones(1, SIZE, SIZE)
     half[:, : SIZE // 2] = 0
     drawn = torch.zeros(1, SIZE, SIZE)
     drawn[:, SIZE // 2 :] = 1
     assert float(silhouette_error(drawn, ObservedFrame(camera(), seen.alpha, half))) == 0
+
+
+def test_a_wrong_mask_among_right_ones_moves_the_person_less(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three views are right, the fourth one shows what is beside the person."""
+    given, view = clip(), camera()
+    with torch.no_grad():
+        alpha = drawn_frame(new_fit(given, surface), given, surface, 0, view)
+    views = Cameras(view.cam_from_world.expand(4, 4, 4), view.intrinsics.expand(4, 3, 3), SIZE, SIZE)
+    masks = torch.cat([alpha, alpha, alpha, alpha.roll(3, dims=2)])
+    seen = ObservedFrame(views, masks, torch.ones_like(masks))
+    fitting, moved = Fitting(given, surface, near_given(given)), []
+    for scale in (MISTAKEN, 1e9 * MISTAKEN):
+        monkeypatch.setattr(solve, "MISTAKEN", scale)
+        found = fitting.run(new_fit(given, surface), ("trans",), 80, lambda _: seen)
+        moved.append(abs(float(found["trans"][0, 0].detach())))
+    assert moved[0] < 0.5 * moved[1]
 
 
 def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> None:
