@@ -34,8 +34,8 @@ OWN_NAME = re.compile(
 
 
 def compiler() -> str:
-    """The C++ compiler; skips the test where there is none."""
-    found = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    """The C++ compiler; skips the test where there is none. Clang, which takes two thirds of GCC's time, where it is."""
+    found = shutil.which("clang++") or shutil.which("c++") or shutil.which("g++")
     if found is None:
         pytest.skip("no C++ compiler here")
     return found
