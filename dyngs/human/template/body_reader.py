@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -299,8 +300,12 @@ DEFAULT_TEMPLATE = Path(__file__).parent / "files" / "anny_smplx55.npz"
 """The file of the free template that comes with the package."""
 
 
+@cache
 def default_template() -> BodyTemplate:
-    """Read the free template of the package: an adult of 1.76 m in T-pose, 55 joints in the order of SMPL-X."""
+    """Return the free template of the package, read once: an adult of 1.76 m in T-pose, 55 joints as those of SMPL-X.
+
+    All share its tensors: none may be changed in place.
+    """
     return read_body(DEFAULT_TEMPLATE)
 
 
