@@ -9,7 +9,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -55,14 +57,19 @@ def read_file(path: Path) -> list[Leaf]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
-    origin = str(path)
+    return [replace(leaf, value=deepcopy(leaf.value)) for leaf in _leaves(text, str(path))]
+
+
+@lru_cache(maxsize=16)
+def _leaves(text: str, origin: str) -> tuple[Leaf, ...]:
+    """Read the values of the text of a file; a command asks several times for those of the same run."""
     with _loaded(text, origin) as loader:
         root = loader.get_single_node()
         if root is None:
-            return []
+            return ()
         if not isinstance(root, yaml.MappingNode):
             raise DyngsError(f"{origin}: must be a mapping of sections (data:, train:, ...)")
-        return list(_walk(loader, root, (), origin, lines=True))
+        return tuple(_walk(loader, root, (), origin, lines=True))
 
 
 def read_override(text: str) -> list[Leaf]:

@@ -11,7 +11,7 @@ from refused import error_line
 
 from dyngs.config.io import load_config, load_resolved, packaged_preset, save_config
 from dyngs.config.schema import config_keys
-from dyngs.config.yaml_reader import MAX_BYTES, MAX_DEPTH
+from dyngs.config.yaml_reader import MAX_BYTES, MAX_DEPTH, read_file
 from dyngs.errors import DyngsError
 
 ROOT = "data.root=/x"
@@ -133,6 +133,17 @@ def test_files_are_read_or_refused_with_their_line(tmp_path: Path, data: bytes, 
 def test_a_byte_order_mark_is_no_text(tmp_path: Path) -> None:
     (tmp_path / "file.yaml").write_bytes(b"\xef\xbb\xbfdata: {root: /x}\n")
     assert load_config(tmp_path / "file.yaml").data.root == Path("/x")
+
+
+def test_a_file_is_read_as_it_is_by_now_and_what_is_read_belongs_to_the_reader(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    for number in (1, 2):
+        file.write_text(f"train: {{steps: {number}, eval_at: []}}\nstrategy: {{}}\n")
+        for _ in range(2):  # also where it was read before
+            leaves = read_file(file)
+            assert [leaf.value for leaf in leaves] == [number, [], {}]
+            leaves[1].value.append(7)
+            leaves[2].value["start"] = 8
 
 
 def test_mutated_overrides_and_presets_end_in_a_configuration_or_one_line(tmp_path: Path) -> None:
