@@ -53,6 +53,27 @@ _GPU_OUT_OF_MEMORY = "CUDA out of memory"
 _GPU_IS_FULL = "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
 _OF_DATA = ("inspect", "sfm", "fit", "motion", "synth")
 """Commands of ``dyngs data``."""
+_COMMANDS = {
+    "demo": demo,
+    "train": train,
+    "prune": prune,
+    "predict": predict,
+    "eval": evaluate,
+    "render": render,
+    "view": view,
+    "export": export,
+    "convert": convert,
+    "edit": edit,
+    "tradeoff": tradeoff,
+    "compare": compare,
+    "data": data,
+    "bench": bench,
+    "config": config,
+    "docs": docs,
+    "completion": completion,
+    "doctor": doctor,
+}
+"""The module of each command, in the order in which they are listed."""
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
@@ -122,7 +143,7 @@ def _dispatch(arguments: list[str]) -> int:
     if not arguments:
         print(_NEXT)
         return 0
-    parser = make_parser()
+    parser = make_parser(arguments[0])
     try:
         parsed = _parsed(parser, arguments)
     except SystemExit as stop:  # after --help or --version
@@ -169,13 +190,13 @@ class _Parser(argparse.ArgumentParser):
         raise DyngsError(f"{printable(message, 400)} (see `{self.prog} --help`)")
 
 
-def make_parser() -> argparse.ArgumentParser:
+def make_parser(only: str = "") -> argparse.ArgumentParser:
+    """Return the parser of all commands, or, in a fraction of the time, of the command ``only`` where there is one."""
     parser = _Parser(prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU.")
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    running = (demo, train, prune, predict, evaluate, render, view, export, convert, edit, tradeoff, compare, data)
-    for module in (*running, bench, config, docs, completion, doctor):
+    for module in [_COMMANDS[only]] if only in _COMMANDS else _COMMANDS.values():
         module.add_parser(commands)
     return parser
 
