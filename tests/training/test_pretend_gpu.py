@@ -79,7 +79,6 @@ def test_it_learns_there_what_it_learns_on_the_cpu(
     assert [key for key, x in expected.items() if not torch.equal(found[key], x)] == []
 
 
-@pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter")  # of torch, about the device's name
 def test_a_network_that_predicts_people_learns_there_what_it_learns_on_the_cpu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
