@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ import dyngs
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.evaluate.report import EvalReport, evaluate_run
+from dyngs.human.fit import fitted_capture
+from dyngs.human.fit.capture_fit import FitEffort
 
 SMALL = ("init.num_random=2000", "strategy.max_gaussians=6000")
 
@@ -90,12 +93,16 @@ def test_a_ball_that_rolls_is_followed_as_a_body(tmp_path: Path, monkeypatch: py
     assert report.psnr_moving > 18.7  # 19.10 to 19.70
 
 
-def test_a_person(tmp_path: Path) -> None:
-    """In the box of the person: in poses that were seen, and in those of a clip that was not."""
+def test_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the box of the person: in poses that were seen, and in those of a clip that was not. The body is fitted in few
+    steps, by which the given poses hardly change: its tests tell how good it is."""
+    effort = FitEffort(side=48, steps=10, visits=0)
+    for name in ("fit_capture", "placed_clip"):
+        monkeypatch.setattr(fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort))
     captured = Captured.of(tmp_path, "human", "--size", "48", "--views", "6", "--cameras", "4")
     keys = [key for key in captured.keys("human") if key not in SMALL]
     run = dyngs.train(dyngs.load_config("human", [*keys, "train.steps=100", "model.resolution=48"]))
-    floors = {"test": 23.0, "pose": 21.4}  # 23.36, 21.77; after 40 steps 21.65, 20.85
+    floors = {"test": 23.0, "pose": 21.8}  # 23.32, 22.18; after 40 steps 21.58, 21.02
     found = {split: evaluate_run(run, split).psnr_person or 0.0 for split in floors}
     assert {split: psnr for split, psnr in found.items() if psnr <= floors[split]} == {}
 
