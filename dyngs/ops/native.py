@@ -137,8 +137,13 @@ class Fork:
         self._team = False
 
     def remember(self) -> None:
-        """Note whether threads run; called in the parent just before it forks."""
-        self._team = self.lost_threads or _native_threads() > self._before
+        """Note whether threads run, which then stay; called in the parent just before it forks."""
+        self._team = self.lost_threads or self._team or _native_threads() > self._before
+
+    def go_on(self) -> None:
+        """Count the threads that are not of OpenMP; called in the parent just after a fork, which ends OpenBLAS's."""
+        if not self._team:
+            self._before = _native_threads()
 
     def begin_child(self) -> None:
         """Set the number of threads; called in the child just after the fork."""
@@ -171,7 +176,7 @@ def _native_threads() -> int:
 
 _fork = Fork()
 if sys.platform != "win32":
-    os.register_at_fork(before=_fork.remember, after_in_child=_fork.begin_child)
+    os.register_at_fork(before=_fork.remember, after_in_parent=_fork.go_on, after_in_child=_fork.begin_child)
 
 
 @contextmanager
