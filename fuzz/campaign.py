@@ -88,8 +88,10 @@ def campaign(name: str, seed: int, inputs: int, seconds: float, limits: Limits =
     reader = READERS[name]
     seeds = seeds_of(reader)
     tally, begin, number, before = Tally(name), time.monotonic(), 0, cpu_seconds()
-    for case in seeds.values():
-        verdict = verdict_of(reader, case, limits)
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        judged = dict(run_cases(reader, iter(enumerate(seeds.values())), Path(folder), limits, begin + 600))
+    for i, case in enumerate(seeds.values()):
+        verdict = judged.get(i) or verdict_of(reader, case, limits)  # alone, if one before it ended the process
         if verdict.outcome is not Outcome.ACCEPTED:
             text = f"{verdict.reason} {verdict.detail}"
             tally.failures.setdefault(f"the seed {case.seed} is not accepted", []).append(
