@@ -40,10 +40,3 @@ def test_doctor_reports_a_faster_instruction_set(monkeypatch: pytest.MonkeyPatch
     assert main(["doctor"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "compiled: v2; this processor also runs v4 (AVX-512): install again on it for more speed" in text
-
-
-def test_one_openmp_runtime() -> None:
-    """torch and the native core share one pool of threads."""
-    code = "import dyngs.ops.native\nfrom dyngs.cli.doctor import openmp_runtimes\nprint(len(openmp_runtimes() or [1]))"
-    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "1"
