@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import colorsys
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
+from torch import Tensor
 
 from dyngs.errors import DyngsError
 from dyngs.human.template.body import BodyTemplate
 from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.human.template.mesh import interpolate, rasterize, vertex_normals
+from dyngs.human.template.mesh import Fragments, interpolate, rasterize, vertex_normals
 
 _PARTS = {
     "eye": ("eye",),
@@ -88,19 +90,27 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
     template is in T-pose, with texture coordinates and the 55 joints of SMPL-X; ``resolution`` is S. Raises DyngsError:
     the template has no texture coordinates.
     """
-    uv, uv_faces = texture_coordinates(body)
-    columns, rows = texel_coordinates(uv, resolution)
-    fragments = rasterize(np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces], resolution, resolution)
+    texture_coordinates(body)  # raises where there are none
+    fragments, nearest = _covered(body.uv, body.uv_faces, resolution)
     around = body.faces.cpu().numpy()[fragments.faces]
     points = interpolate(fragments.barycentric, body.vertices.double().cpu().numpy()[around])
     parts = interpolate(fragments.barycentric, _part_weights(body)[around]).argmax(axis=1)
     texture = np.zeros((resolution * resolution, 3))
     texture[fragments.index] = _painted(points, np.array(list(_PARTS))[parts], _left_eye(body), outfit)
+    return texture[nearest]
+
+
+@lru_cache(maxsize=1)  # people of a set share one atlas
+def _covered(uv: Tensor, uv_faces: Tensor, resolution: int) -> tuple[Fragments, np.ndarray]:
+    """Return the texels that the atlas covers, and of every texel the number (S, S) of the nearest one covered."""
+    columns, rows = texel_coordinates(uv.double().cpu().numpy(), resolution)
+    corners = np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces.cpu().numpy()]
+    fragments = rasterize(corners, resolution, resolution)
     is_bare = np.ones(resolution * resolution, dtype=bool)
     is_bare[fragments.index] = False
     near = distance_transform_edt(is_bare.reshape(resolution, -1), return_distances=False, return_indices=True)
     row, column = np.asarray(near)
-    return texture[row * resolution + column]
+    return fragments, row * resolution + column
 
 
 def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
