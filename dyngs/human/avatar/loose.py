@@ -51,10 +51,10 @@ def nodes_on(points: Tensor) -> Tensor:
 
 def first_cloth(nodes: Tensor) -> dict[str, Tensor]:
     """Return what is learned of cloth on nodes (M, 3), which hangs as the skin at first: names as in ``LR``."""
-    make = torch.Generator().manual_seed(0)
-    first = torch.randn(WIDTH, INPUTS, generator=make) / math.sqrt(INPUTS)
-    bias = 0.3 * torch.randn(WIDTH, generator=make)
-    last = torch.randn(SHAPES, WIDTH, generator=make) * math.sqrt(2 / WIDTH)
+    make = torch.Generator("cpu").manual_seed(0)
+    first = torch.randn(WIDTH, INPUTS, generator=make, device="cpu") / math.sqrt(INPUTS)
+    bias = 0.3 * torch.randn(WIDTH, generator=make, device="cpu")
+    last = torch.randn(SHAPES, WIDTH, generator=make, device="cpu") * math.sqrt(2 / WIDTH)
     return {
         "cloth_nodes": nodes,
         "cloth_shapes": nodes.new_zeros(SHAPES, 3 * len(nodes)),
@@ -121,7 +121,7 @@ def draped(
 
 def training_noise(step: int, like: Tensor) -> Tensor:
     """Return what is added to the inputs in a step of training (``INPUTS``,); the same for the same step."""
-    return NOISE * torch.randn(INPUTS, generator=torch.Generator().manual_seed(step)).to(like)
+    return NOISE * torch.randn(INPUTS, generator=torch.Generator("cpu").manual_seed(step), device="cpu").to(like)
 
 
 def past_motion(clip: MotionClip, seconds: np.ndarray) -> Tensor:
