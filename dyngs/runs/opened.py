@@ -20,6 +20,7 @@ from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.loose import past_motion, remembering
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
@@ -229,6 +230,8 @@ class Opened(LoadedRun):
         if motion.poses.shape[1] != len(scene.skeleton.joints):
             motion = motion.for_joints(len(scene.skeleton.joints))
         clip = motion_clip(motion)
+        if scene.hold is not None:
+            clip = replace(clip, past=past_motion(clip, np.arange(len(clip)) / motion.fps))
         if bool((motion.scale != 1).any()):
             clip = replace(clip, trans=clip.trans - clip.trans.new_tensor(self.info.world_offset))
         else:
@@ -364,4 +367,4 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
     if split != "pose" and same_bodies(own, trained):
         return run.renderable
     shown = captured_motion(capture.root, own, split_views(capture, split), avatar.skeleton.joints)
-    return avatar.playing(shown.clip)
+    return avatar.playing(shown.clip if avatar.hold is None else remembering(shown, capture.fps))

@@ -24,7 +24,6 @@ from dyngs.export.html.template import filled, script_safe, source_hash
 from dyngs.files.outputs import new_folder, require_new_folder
 from dyngs.files.write import write_text
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.models.views import training_cameras
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
@@ -116,8 +115,8 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     if opened.captured is not None and opened.missing is not None:
         up = "" if opened.person is not None else f", {opened.stated_up or 'z'} up"
         notes.append(f"without the capture ({opened.missing}) the page begins with a view from outside{up}")
-    if opened.person is not None and opened.person.light is not None:
-        notes.append(LEFT_OUT)
+    if opened.person is not None:
+        notes += opened.person.left_out
     curves = header.get("curves", {})
     if curves.get("error"):
         fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {curves['error']:.2g}"

@@ -29,7 +29,6 @@ from dyngs.export.rigged.surface import fitted_surface
 from dyngs.export.rigged.texture import bake_texels, fill_unseen, texture_image
 from dyngs.files.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.files.write import atomic_file
-from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.template.atlas import atlas_texels
 from dyngs.human.template.body import BodyTemplate
@@ -100,8 +99,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> Mesh
         )
     if scene.shapes is not None:
         notes.append("offsets that depend on the pose are left out: glTF's skins have none")
-    if scene.light is not None:
-        notes.append(LEFT_OUT)
+    notes += scene.left_out
     return MeshFile(path, tuple(notes))
 
 

@@ -29,7 +29,6 @@ from dyngs.files.gltf import GlbDocument
 from dyngs.files.write import atomic_file
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import heaviest_joints
-from dyngs.human.avatar.posing import LEFT_OUT
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.inputs import inputs_of
@@ -72,8 +71,7 @@ def write_rigged_splats(run: LoadedRun, path: Path, played: Played | None = None
         notes = ("the colours of the run are a network; the file has those seen from straight above the skin",)
     if scene.shapes is not None:
         notes = (*notes, "offsets that depend on the pose are left out: skinning weights hold none")
-    if scene.light is not None:
-        notes = (*notes, LEFT_OUT)
+    notes = (*notes, *scene.left_out)
     gaussians = gaussians.replace(
         means=rig.placed(gaussians.means), log_scales=gaussians.log_scales + float(np.log(rig.scale))
     )

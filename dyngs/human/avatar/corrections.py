@@ -14,6 +14,8 @@ from torch import Tensor
 
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.anchors import Anchors
+from dyngs.human.avatar.loose import LR as CLOTH_LR
+from dyngs.human.avatar.loose import first_cloth
 from dyngs.human.avatar.posing import TERMS, BodyPose, Light, Skeleton
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import axis_angle_to_matrix
@@ -52,9 +54,15 @@ class SharedCorrection:
 
 
 def new_corrections(
-    clip: MotionClip, skeleton: Skeleton, anchors: Anchors, normals: Tensor | None = None
+    clip: MotionClip,
+    skeleton: Skeleton,
+    anchors: Anchors,
+    normals: Tensor | None = None,
+    nodes: Tensor | None = None,
 ) -> Parameters:
     """Return the corrections to learn, all zero; with ``normals`` (N, 3) also the light that falls on them (``Light``).
+
+    With ``nodes`` (M, 3) also how loose cloth hangs on these (``first_cloth``).
 
     ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before those of the clip; ``trans`` (F, 3);
     ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m; ``log_scale`` (1,); ``weights`` (N, K).
@@ -70,9 +78,11 @@ def new_corrections(
     }
     if normals is not None:
         zeros |= {"light": normals.new_zeros(TERMS, 3), "normals": normals}
+    if nodes is not None:
+        zeros |= first_cloth(nodes)
     own = ("weights", "normals")
     roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
-    return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
+    return Parameters(zeros, LR | CLOTH_LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
 
 
 def correction_penalties(learned: Parameters) -> dict[str, Tensor]:
@@ -92,6 +102,7 @@ def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
         clip.rotations[row] @ own,
         clip.trans[row] + learned["trans"][row],
         clip.scale[row] * learned["log_scale"][0].exp(),
+        None if clip.past is None else clip.past[row],
     )
 
 

@@ -21,7 +21,9 @@ from dyngs.human.avatar.corrections import (
     learned_light,
     new_corrections,
 )
+from dyngs.human.avatar.loose import PAST, Hold, draped, first_cloth, hold_of
 from dyngs.human.avatar.posing import (
+    LEFT_OUT,
     TERMS,
     BodyPose,
     Light,
@@ -52,6 +54,7 @@ class HumanScene(GaussianScene):
     played: MotionClip | None = None
     # (N,) in [0, 1] how far colours are what the training views showed, not filled; None: that was not found out
     seen: Tensor | None = None
+    hold: Hold | None = None  # nodes of loose cloth that the Gaussians follow; None: cloth is tight
 
     @staticmethod
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
@@ -62,13 +65,15 @@ class HumanScene(GaussianScene):
         )  # files hold the sum of both
         require_avatar(gaussians, tensors)
         anchors = Anchors(**{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)})
-        clip = MotionClip(*(tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale")))
+        given = (tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale"))
+        clip = MotionClip(*given, past=tensors.get("clip.past"))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
         own, shapes = part_of(tensors, "learned"), None
         if "shapes.directions" in tensors:
             require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"]))
             shapes = PoseBlendShapes(tensors["shapes.directions"].float(), tensors["shapes.faces"].long())
-        learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
+        nodes = own.get("cloth_nodes")
+        learned = new_corrections(clip, skeleton, anchors, own.get("normals"), nodes).restored(own)
         return HumanScene(
             gaussians=gaussians,
             anchors=anchors,
@@ -77,6 +82,7 @@ class HumanScene(GaussianScene):
             learned=learned,
             shapes=shapes,
             seen=tensors.get("seen"),
+            hold=None if nodes is None else hold_of(anchors.points, nodes),
         )
 
     @property
@@ -129,6 +135,22 @@ class HumanScene(GaussianScene):
         return SharedCorrection(self.learned["turns"].detach(), float(self.learned["log_scale"].detach()))
 
     @property
+    def up(self) -> Tensor:
+        """The up direction (3,) of the world, as training saw it."""
+        from dyngs.human.motion.placement import up_direction  # late: scipy
+
+        if "up" not in self._derived:
+            self._derived["up"] = up_direction(self.clip)
+        return self._derived["up"]
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """What files that hold neither light nor loose cloth say of it."""
+        loose = "how loose cloth hangs and swings is left out: it follows the joints"
+        light = () if self.light is None else (LEFT_OUT,)
+        return light if self.hold is None else (*light, loose)
+
+    @property
     def moves_as(self) -> MotionClip:
         """The clip that is played, with what was learned about the person applied."""
         if "clip" not in self._derived:
@@ -159,12 +181,16 @@ class HumanScene(GaussianScene):
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable in the pose."""
         offsets = rest_offsets(self.anchors, posing, self.shapes)
         gaussians = pose_gaussians(self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light)
+        if self.hold is not None:
+            gaussians = draped(gaussians, self.learned, self.hold, posing, self.up)
         return GaussianTimeStep(gaussians, time, RestFrame(self.gaussians.means, posing.rotations[0]))
 
-    def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
+    def in_frame(
+        self, row: int, given_weights: Tensor | None = None, noise: Tensor | None = None
+    ) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that is learned.
 
-        With ``given_weights`` (N, J) nothing that was learned about the body is applied.
+        With ``given_weights`` (N, J) nothing that was learned about the body is applied. ``noise``: see ``draped``.
         """
         skeleton, light = self.skeleton, None
         if given_weights is None:
@@ -174,7 +200,10 @@ class HumanScene(GaussianScene):
         else:
             posing, weights = frame_pose(self.clip, row), given_weights
         offsets = rest_offsets(self.anchors, posing, self.shapes)
-        return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light), posing
+        gaussians = pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
+        if self.hold is not None and given_weights is None:
+            gaussians = draped(gaussians, self.learned, self.hold, posing, self.up, noise)
+        return gaussians, posing
 
     def given_weights(self) -> Tensor:
         """Return (N, J) skinning weights of the template."""
@@ -187,6 +216,7 @@ class HumanScene(GaussianScene):
             anchors=self.anchors.select(edit.source),
             learned=self.learned.edited(Role.PER_GAUSSIAN, edit),
             seen=None if self.seen is None else self.seen[edit.source],
+            hold=None if self.hold is None else self.hold.select(edit.source),
         )
 
     def part(self, which: str) -> HumanScene:
@@ -220,6 +250,7 @@ class HumanScene(GaussianScene):
         if self.seen is not None:
             state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
         given = {f"clip.{name}": getattr(clip, name) for name in ("times", "poses", "trans", "scale")}
+        given |= {} if clip.past is None else {"clip.past": clip.past}
         given |= {"joints": skeleton.joints, "parents": torch.tensor(skeleton.parents, device="cpu")}
         if self.shapes is not None:
             given |= {"shapes.directions": self.shapes.directions.half(), "shapes.faces": self.shapes.faces.int()}
@@ -262,6 +293,9 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         require_tensor("learned.normals", state["learned.normals"], (n, 3))
     if "shapes.directions" in state:
         require_indices("anchors.face", state["anchors.face"], (n,), len(state["shapes.faces"]))
+    if "clip.past" in state:
+        require_tensor("clip.past", state["clip.past"], (f, PAST))
+    require_cloth({name: x for name, x in state.items() if name.startswith("learned.cloth_")}, "learned.")
     if "seen" in state:
         require_tensor("seen", state["seen"], (n,))
     if "near" in state:
@@ -275,6 +309,17 @@ def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: in
     if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
         raise ValueError(f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)")
     check_tree(tuple(parents.tolist()))
+
+
+def require_cloth(state: Mapping[str, Tensor], prefix: str) -> None:
+    """Check what was learned of loose cloth, named as in ``first_cloth`` behind ``prefix``; KeyError or ValueError."""
+    if state:
+        nodes = state[f"{prefix}cloth_nodes"]
+        require_tensor(f"{prefix}cloth_nodes", nodes, (None, 3))
+        if not len(nodes):
+            raise ValueError("loose cloth has no nodes")
+        for name, x in first_cloth(nodes).items():
+            require_tensor(prefix + name, state[prefix + name], tuple(x.shape))
 
 
 def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:

@@ -37,7 +37,8 @@ def moved(clip: MotionClip, rotation: Tensor, unit: float | Tensor, shift: Tenso
     roots = rotation @ axis_angle_to_matrix(clip.poses[:, 0])
     poses = torch.cat([_axis_angle(roots)[:, None], clip.poses[:, 1:]], dim=1)
     root = clip.scale[:, None] * pelvis
-    return MotionClip(clip.times, poses, unit * ((clip.trans + root) @ rotation.T - root) + shift, unit * clip.scale)
+    trans = unit * ((clip.trans + root) @ rotation.T - root) + shift
+    return replace(clip, poses=poses, trans=trans, scale=unit * clip.scale)
 
 
 def upright(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
