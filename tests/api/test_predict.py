@@ -96,7 +96,8 @@ def test_a_body_is_fitted_where_none_is_given(made: Made, tmp_path: Path, monkey
     """By what `dyngs train human` does, too; without one nothing is written."""
     asked: list[tuple[Path, bool]] = []
 
-    def fit(data: DataConfig, *, only_if_needed: bool, say: object, report: object) -> DataConfig:
+    def fit(data: DataConfig, model: HumanModel, *, only_if_needed: bool, say: object, report: object) -> DataConfig:
+        assert model.body is None, "the template of the network"
         asked.append((data.root, only_if_needed))
         return data
 
