@@ -29,6 +29,7 @@ import pytest
 import torch
 from hypothesis import settings
 from scenes import Scene, random_scene
+from smpl_like import write_smpl_like
 from tiny_captures import random_pixels, write_colmap, write_frames, write_image
 from tiny_fields import write_tiny_capture
 
@@ -211,6 +212,12 @@ def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     effort = FitEffort(side=32, steps=2, visits=0)
     for name in ("fit_capture", "placed_clip"):
         monkeypatch.setattr(fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort))
+
+
+@pytest.fixture(scope="session")
+def smpl_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A file in the layout of SMPL with the mesh of the free template, and the .obj with its texture coordinates."""
+    return write_smpl_like(tmp_path_factory.mktemp("bodies"), "smpl")
 
 
 @pytest.fixture

@@ -453,6 +453,6 @@ def with_capture(
             from dyngs.human.detection.find_person import with_found_person  # late: other kinds need no detector
 
             data = with_found_person(data, say=say, report=report)
-        if isinstance(model, HumanModel) and model.body is None:
-            data = with_fitted_body(data, only_if_needed=not model.fit, say=say, report=report)
+        if isinstance(model, HumanModel):
+            data = with_fitted_body(data, model, only_if_needed=not model.fit, say=say, report=report)
     return config.model_copy(update={"data": data})

@@ -42,7 +42,7 @@ _OF_A_FIT = {
         "PATH",
         "a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
     ),
-    "body": ("FILE", "body file (SMPL, ...) that posed vertices belong to"),
+    "body": ("FILE", "body file (SMPL, ...) that posed vertices belong to, if it is not the one that is fitted"),
     "person": (
         "PATH",
         "a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found, by the "
@@ -50,6 +50,10 @@ _OF_A_FIT = {
     ),
 }
 """Options of ``dyngs data fit``, which are fields of ``FitInputs``."""
+_OF_A_TEMPLATE = {
+    "template": ("FILE", "fit this body file of SMPL, SMPL-H or SMPL-X instead of the free template"),
+    "uv": ("FILE", ".obj with the texture coordinates of --template, if it has none"),
+}
 
 
 def add_parser(commands: args.Commands) -> None:
@@ -101,14 +105,14 @@ def _add_fit(verbs: args.Commands) -> None:
         verbs,
         "fit",
         run_fit,
-        "fit the free body template to images of a person",
-        "Fit the free body template to the silhouettes of a person: one shape and skeleton, and the pose of every "
-        "frame. OUT is a capture for `dyngs train human`.",
+        "fit the body template to images of a person",
+        "Fit the free body template, or one of SMPL's family, to the silhouettes of a person: one shape and skeleton, "
+        "and the pose of every frame. OUT is a capture for `dyngs train human`.",
     )
     about = "folder of a capture; or a video, or a folder of images, of one fixed camera"
     parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    for name, (metavar, about) in _OF_A_FIT.items():
+    for name, (metavar, about) in (_OF_A_FIT | _OF_A_TEMPLATE).items():
         parser.add_argument(f"--{name}", type=args.input_path, metavar=metavar, help=about)
     args.add_overrides(parser, "data.key=value", "keys of data")
 
@@ -278,14 +282,20 @@ def _starts(words: list[str]) -> dict[str, float] | None:
 
 def run_fit(arguments: argparse.Namespace) -> int:
     """Fit a body and print how good the fit is, and the next command."""
+    from dyngs.config import HumanModel
     from dyngs.human.fit.fitted_capture import FitInputs, write_fitted_capture
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.capture})
     passed = {name: getattr(arguments, name) for name in _OF_A_FIT}
+    if arguments.uv is not None and arguments.template is None:
+        raise DyngsError(f"--uv {arguments.uv} goes with --template; the free template has its own texture coordinates")
     with ProgressBar() as report:
-        inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person))
+        template = HumanModel(body=arguments.template, uv=arguments.uv)
+        inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person), template=template)
         result = write_fitted_capture(options, arguments.out, report, inputs)
-    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    files = {"model.body": result.model.body, "model.uv": result.model.uv}
+    keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
+    print(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
     return 0
 
 

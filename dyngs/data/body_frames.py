@@ -142,16 +142,18 @@ def read_body_file(path: Path) -> BodyFrames:
     """Read body parameters: poses (F, 72, 156 or 165), trans (F, 3), betas and, if there, scale and ``frames`` (F,).
 
     Without ``frames``, row n is for frame n. ``surface_model_type`` "anny" says that betas are of the free template's
-    shape space.
+    shape space, ``fitted_to`` which other template dyngs fitted.
     """
-    found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames"))
+    found = read_npz(path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames", "fitted_to"))
     count = len(found["poses"]) if found["poses"].ndim else 0
     numbers = found.get("frames", np.arange(count))
     if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or len(numbers) != count:
         raise DyngsError(f"{path}: 'frames' must hold one whole number for each row of 'poses'; export it again")
     frames = [int(number) for number in numbers]
     body = body_frames(path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0))
-    return replace(body, shape_space="anny") if str(found.get("surface_model_type")) == "anny" else body
+    if str(found.get("surface_model_type")) == "anny":
+        return replace(body, shape_space="anny")
+    return replace(body, fitted_to=str(found.get("fitted_to", "")))
 
 
 def with_fitted_body(capture: Capture, folder: Path) -> Capture:

@@ -148,6 +148,7 @@ class BodyFrames:
         turns: (F, 3) axis-angle, radians, rotation about the template's origin; None for none.
         pelvis: (3,) rest position of the pelvis of the fitted body, None where the files do not say.
         shape_space: that of ``betas``: of SMPL's family, or of the free template.
+        fitted_to: ``fingerprint`` of the template that dyngs fitted; empty for the free one and parameters of others.
     """
 
     frames: tuple[int, ...]
@@ -158,6 +159,7 @@ class BodyFrames:
     turns: np.ndarray | None = None
     pelvis: np.ndarray | None = None
     shape_space: ShapeSpace = "smpl"
+    fitted_to: str = ""
 
     @property
     def kind(self) -> BodyKind:

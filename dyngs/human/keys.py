@@ -28,8 +28,8 @@ class HumanModel(_OnTemplate):
     )
     fit: bool = Field(
         default=True,
-        description="fit the free template to the silhouettes before training, as `dyngs data fit` does; a capture "
-        "without body parameters always is, one for another template (body) never",
+        description="fit the template to the silhouettes before training, as `dyngs data fit` does; a capture without "
+        "body parameters always is",
     )
     refine: bool = Field(
         default=True, description="learn corrections of poses, skeleton and skinning weights with the Gaussians"

@@ -11,7 +11,7 @@ from tiny_people import NET, TINY, people
 
 from dyngs.api.predict import Prediction, network_config, predict
 from dyngs.api.train import train
-from dyngs.config import Config, DataConfig
+from dyngs.config import Config, DataConfig, HumanModel
 from dyngs.config.io import load_resolved, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
@@ -96,7 +96,8 @@ def test_a_body_is_fitted_where_none_is_given(made: Made, tmp_path: Path, monkey
     """By what `dyngs train human` does, too; without one nothing is written."""
     asked: list[tuple[Path, bool]] = []
 
-    def fit(data: DataConfig, *, only_if_needed: bool, say: object, report: object) -> DataConfig:
+    def fit(data: DataConfig, model: HumanModel, *, only_if_needed: bool, say: object, report: object) -> DataConfig:
+        assert model.body is None, "the template of the network"
         asked.append((data.root, only_if_needed))
         return data
 

@@ -263,10 +263,60 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(tmp_path: Path, capsys: Pr
     assert not (tmp_path / "out").exists()
 
 
-def test_a_body_of_another_template_is_never_fitted(tmp_path: Path, capsys: PrintedOutput) -> None:
-    keys = [f"data.root={tmp_path / 'ann'}", "model.body=smplx.npz", f"run.dir={tmp_path / 'run'}"]
-    write_human_capture(tmp_path / "ann", HumanOptions(size=16, num_frames=1, num_new=0, num_cameras=1, num_test=1))
-    assert main(["train", "human", *keys]) == 2
-    said = capsys.readouterr()
-    assert "smplx.npz" in said.err
-    assert "fitted" not in said.out
+@pytest.mark.usefixtures("short_fits")
+def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
+    tmp_path: Path, capsys: PrintedOutput, monkeypatch: pytest.MonkeyPatch, smpl_files: tuple[Path, Path]
+) -> None:
+    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    options = HumanOptions(size=32, num_frames=1, num_new=0, num_cameras=3, num_test=1, samples=1)
+    root, fitted, run = write_human_capture(tmp_path / "person", options), tmp_path / "fitted", tmp_path / "run"
+    body, uv = map(str, smpl_files)
+    assert main(["data", "fit", str(root), str(fitted), "--template", body, "--uv", uv]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("smpl (smpl.npz), 1 frame; overlap of silhouettes")
+    keys = [f"model.body={body}", f"model.uv={uv}"]
+    assert printed.splitlines()[-1] == f"next: dyngs train human data.root={fitted} {' '.join(keys)}"
+    small = ["model.resolution=24", "train.steps=1", "run.threads=1"]
+    assert main(["train", "human", f"data.root={fitted}", f"run.dir={run}", *keys, *small]) == 0
+    assert "fitted to the silhouettes" not in capsys.readouterr().out, "that was done"
+    assert main(["data", "fit", str(root), str(tmp_path / "new"), "--person", str(run)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("smpl (smpl.npz), 1 frame")
+    assert "poses by the silhouette of the person's avatar: " in printed
+    with np.load(fitted / "body_train.npz") as old, np.load(tmp_path / "new" / "body_train.npz") as new:
+        assert np.array_equal(old["betas"], new["betas"])
+        assert str(new["surface_model_type"]) == "smpl"
+    assert main(["data", "fit", str(root), str(tmp_path / "other"), "--person", str(fitted)]) == 2
+    assert "is of another template than anny; name that of the person with --template" in capsys.readouterr().err
+    assert main(["data", "motion", str(fitted / "body_train.npz"), str(tmp_path / "moves.npz")]) == 0
+
+
+def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
+    tmp_path: Path, capsys: PrintedOutput, smpl_files: tuple[Path, Path]
+) -> None:
+    root = tmp_path / "ann"
+    write_human_capture(root, HumanOptions(size=16, num_frames=1, num_new=0, num_cameras=1, num_test=1))
+    body, uv = map(str, smpl_files)
+    damaged, wrong = tmp_path / "damaged.npz", tmp_path / "wrong.obj"
+    damaged.write_bytes(Path(body).read_bytes()[:5000])
+    wrong.write_text("v 0 0 0\nvt 0 0\nf 1/1 1/1 1/1\n")
+    for file, atlas, wanted in (
+        (str(tmp_path / "none.npz"), uv, "none.npz: "),
+        (str(damaged), uv, "damaged.npz: "),
+        (body, None, "smpl.npz: has no texture coordinates"),
+        (body, str(wrong), "wrong.obj: has 1 vertices and 1 triangles, the body has"),
+        (None, uv, "goes with --template"),
+    ):
+        out = tmp_path / "out"
+        words = (["--template", file] if file else []) + (["--uv", atlas] if atlas else [])
+        calls = [["data", "fit", str(root), str(out), *words]]
+        if file is not None:
+            keys = [f"model.body={file}"] + ([f"model.uv={atlas}"] if atlas else [])
+            calls.append(["train", "human", f"data.root={root}", f"run.dir={out}", *keys])
+        for call in calls:
+            assert main(call) == 2
+            said = capsys.readouterr()
+            assert len(said.err.strip().splitlines()) == 1
+            assert wanted in said.err
+            assert "fitted" not in said.out
+            assert sorted(path.name for path in tmp_path.iterdir()) == ["ann", "damaged.npz", "wrong.obj"]

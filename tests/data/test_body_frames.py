@@ -175,8 +175,13 @@ def test_rows_are_for_the_frames_that_the_file_names(tmp_path: Path) -> None:
     body = read_body_file(write(tmp_path / "b.npz", frames=np.array([7, 3, 5])))
     assert body.frames == (3, 5, 7)
     assert body.trans[:, 0].tolist() == [1, 2, 0]
-    assert body.shape_space == "smpl"
+    assert (body.shape_space, body.fitted_to) == ("smpl", "")
     assert read_body_file(write(tmp_path / "c.npz")).frames == (0, 1, 2)
+
+
+def test_a_fit_says_which_template_it_is_of(tmp_path: Path) -> None:
+    body = read_body_file(write(tmp_path / "b.npz", surface_model_type=np.array("smplx"), fitted_to=np.array("0a1b")))
+    assert (body.shape_space, body.fitted_to) == ("smpl", "0a1b")
 
 
 @pytest.mark.parametrize("frames", [np.zeros((3, 1), int), np.array([0.0, 1, 2]), np.array([1, 2])])

@@ -7,7 +7,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,10 @@ from torch import Tensor
 from dyngs.capture.background import with_background_masks
 from dyngs.capture.fixed_camera import FORMAT, is_plain_clip, read_fixed_camera, silhouettes_of, zoomed
 from dyngs.capture.photos import digest_of
-from dyngs.config import DataConfig
+from dyngs.config import DataConfig, HumanModel
 from dyngs.conventions import ReportProgress, report_nothing
-from dyngs.data.body_frames import numbered
-from dyngs.data.capture import Capture, Split, View
+from dyngs.data.body_frames import numbered, read_body_file
+from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import Image, ImageLoader
@@ -33,12 +33,20 @@ from dyngs.files.write import atomic_file, write_image, write_text
 from dyngs.human.avatar.posing import BodyPose, frame_pose
 from dyngs.human.fit.capture_fit import CaptureFit, Known, NewClip, fit_capture, fitted_clips, placed_clip
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
-from dyngs.human.fit.known_person import AvatarPoses, KnownAvatar, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.fit.known_person import (
+    AvatarPoses,
+    KnownAvatar,
+    known_shape,
+    posed_by_avatar,
+    shape_of,
+    template_of_run,
+    with_shape,
+)
 from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, surface_of
 from dyngs.human.fit.solve import LensFit
 from dyngs.human.motion.motion import CapturedMotion
 from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import default_template, read_body
+from dyngs.human.template.body_reader import has_same_shapes, load_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
 
 _LOOKED_AT, _PRESENT = 128, 0.2
@@ -53,10 +61,11 @@ class FitInputs:
     masks: Path | None = None  # folder of masks, white = the person
     background: Path | None = None  # image of the place without the person, or a folder of one for each camera
     joints: Path | None = None  # file or folder of 3D joints or posed vertices, see ``read_joints``
-    body: Path | None = None  # body file whose vertices these are; None: the free template
+    body: Path | None = None  # body file whose vertices these are; None: the template
     person: Path | None = None  # capture or run of the same person, whose shape is kept
     # of the same person, if that run has one: its silhouette decides the poses in the end
     avatar: KnownAvatar | None = None
+    template: HumanModel = field(default_factory=HumanModel)  # names the body file that is fitted
 
 
 def has_guessed_lens(capture: Capture) -> bool:
@@ -120,13 +129,18 @@ FRAME_RATE = 30.0  # frames per second of a clip whose capture does not say
 
 
 def write_body(
-    path: Path, found: CapturedMotion, betas: np.ndarray, world_offset: np.ndarray, fps: float | None = None
+    path: Path,
+    found: CapturedMotion,
+    body: BodyTemplate,
+    betas: np.ndarray,
+    world_offset: np.ndarray,
+    fps: float | None = None,
 ) -> None:
     """Write the body parameters of a clip, also readable as a motion: rows are named by their frame numbers.
 
-    ``betas`` (B,) are of the free template's shape space; ``fps`` frames per second, None where nobody knows.
+    ``betas`` (B,) are of the shape space of the template ``body``; ``fps`` frames per second, None where nobody knows.
     """
-    clip = found.clip
+    clip, named = found.clip, {} if body.name == "anny" else {"fitted_to": body.fingerprint}
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
@@ -134,7 +148,8 @@ def write_body(
             trans=(clip.trans.double().cpu().numpy() + world_offset).astype(np.float32),
             betas=betas.astype(np.float32),
             scale=clip.scale.cpu().numpy(),
-            surface_model_type="anny",
+            surface_model_type=body.name,
+            **named,
             gender="neutral",
             up_axis="y",
             frames=np.asarray(found.frames, dtype=np.int64),
@@ -218,6 +233,8 @@ class FittedCapture:
 
     root: Path
     found: CaptureFit
+    model: HumanModel = field(default_factory=HumanModel)  # names the template
+    template: str = "anny"  # the same for people
     new_poses: NewClip | None = None
     by_avatar: tuple[AvatarPoses, ...] = ()
 
@@ -228,9 +245,10 @@ class FittedCapture:
         worst = int(np.nanargmin(found.chosen.per_frame))
         tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
         lens = "" if found.lens is None else f"\n{found.lens.summary()}"
+        named = "" if self.template == "anny" else f"{self.template}, "
         others = [x.summary() for x in (self.new_poses, *self.by_avatar) if x is not None]
         return (
-            f"{counted(frames, 'frame')}; overlap of silhouettes (IoU) on {where}: {tried}\n"
+            f"{named}{counted(frames, 'frame')}; overlap of silhouettes (IoU) on {where}: {tried}\n"
             f"taken: {found.chosen.name}; worst frame {found.motion.frames[worst]} with "
             f"{found.chosen.per_frame[worst]:.3f}; look at {self.root / OVERLAYS_NAME}{lens}"
             + "".join(f"\n{line}" for line in others)
@@ -240,15 +258,20 @@ class FittedCapture:
 def write_fitted_capture(
     options: DataConfig, out: Path, report: ReportProgress, given: FitInputs = FitInputs(), *, with_images: bool = True
 ) -> FittedCapture:
-    """Fit the free template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
+    """Fit the template to a capture and write it to the new folder ``out`` in the layout ``body_json``.
 
     Files: ``transforms_SPLIT.json``, ``images/`` and found ``masks/`` (else for ``data.body``), ``body_train.npz``,
     ``body_pose.npz`` for another clip, ``fit_report.json``, and ``fit_overlays.png`` to look at. Raises DyngsError: see
-    ``fit_capture``; ``out`` is not empty.
+    ``fit_capture``; ``out`` is not empty; a template that cannot be read or has no texture coordinates.
     """
     require_new_folder(out)
-    person = None if given.person is None else known_shape(given.person)
-    body, folder = default_template(), temporary_folder_beside(out)
+    if given.person is not None and given.template.body is None:
+        given = replace(given, template=template_of_run(given.person))
+    body = load_template(given.template)
+    _require_texels(given.template, body)
+    name = _called(given.template, body)
+    person = None if given.person is None else known_shape(given.person, body)
+    folder = temporary_folder_beside(out)
     masks = folder / _MASKS
     try:
         capture = read_person(options, given, masks)
@@ -258,10 +281,10 @@ def write_fitted_capture(
         if given.joints is not None:
             joints = read_joints(given.joints, capture, body if given.body is None else read_body(given.body))
         known = Known(joints, has_guessed_lens(capture), person is not None)
-        shaped = body if person is None else with_shape(body, person)
+        first = _given_shape(capture, body) if person is None else person
+        shaped = with_shape(body, first)
         found = fit_capture(capture, options, shaped, report, points, known=known)
-        if person is not None:
-            found = replace(found, fit=replace(found.fit, betas=shape_of(body, person)))
+        betas = _added(found.fit.betas, None if first is None else shape_of(body, first))
         capture = with_lens(capture, found.lens)
         new_poses = placed_clip(capture, options, shaped, found, report)
         clips = fitted_clips(capture, shaped, found, new_poses)
@@ -279,16 +302,42 @@ def write_fitted_capture(
                 write_split(folder, split, shown, rows, capture.world_offset)
             clips = {split: replace(clip, frames=tuple(range(len(clip.frames)))) for split, clip in clips.items()}
         for split, clip in clips.items():
-            write_body(folder / f"body_{split}.npz", clip, found.fit.betas.numpy(), capture.world_offset, capture.fps)
-        write_image(folder / OVERLAYS_NAME, _overlays(capture, options, body, found))
-        write_text(
-            folder / REPORT_NAME, json.dumps(_report(found, new_poses, tuple(by_avatar.values())), indent=1) + "\n"
-        )
+            path = folder / f"body_{split}.npz"
+            write_body(path, clip, body, betas.numpy(), capture.world_offset, capture.fps)
+        write_image(folder / OVERLAYS_NAME, _overlays(capture, options, shaped, found))
+        said = {"template": name, "betas": [round(beta, 4) for beta in betas.tolist()]}
+        said |= _report(found, new_poses, tuple(by_avatar.values()))
+        write_text(folder / REPORT_NAME, json.dumps(said, indent=1) + "\n")
         shutil.rmtree(masks, ignore_errors=True)
         folder.replace(out)  # also where ``out`` is an empty folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return FittedCapture(out, found, new_poses, tuple(by_avatar.values()))
+    return FittedCapture(out, found, given.template, name, new_poses, tuple(by_avatar.values()))
+
+
+def _called(model: HumanModel, body: BodyTemplate) -> str:
+    """Return the name of a template for people."""
+    return body.name if model.body is None else f"{body.name} ({model.body.name})"
+
+
+def _require_texels(model: HumanModel, body: BodyTemplate) -> None:
+    """Raise DyngsError if the template has no texture coordinates."""
+    if body.uv is None:
+        raise DyngsError(
+            f"{model.body}: has no texture coordinates, which the fit needs to draw the body; name the .obj that has "
+            "them (--uv FILE, of a training model.uv=FILE)"
+        )
+
+
+def _given_shape(capture: Capture, body: BodyTemplate) -> BodyFrames | None:
+    """Return the parameters of a capture with a shape of a template of SMPL's family, which the fit begins with."""
+    given = None if capture.body is None else capture.body["train"]
+    return given if given is not None and body.name != "anny" and has_same_shapes(body, given) else None
+
+
+def _added(learned: Tensor, first: Tensor | None) -> Tensor:
+    """Return shape parameters learned (B,), added to those of the shape that the fit began with (at least B)."""
+    return learned if first is None else first + torch.nn.functional.pad(learned, (0, len(first) - len(learned)))
 
 
 def _in_order(views: Sequence[View], options: DataConfig) -> Iterator[Image]:
@@ -328,8 +377,7 @@ def _report(found: CaptureFit, new_poses: NewClip | None, by_avatar: Sequence[Av
             if iou == iou
         },
         "scale": float(np.exp(fit.shared.log_scale)),
-        "betas": [round(beta, 4) for beta in fit.betas.tolist()],
-        "turns_degrees": {name: round(float(turn), 2) for name, turn in zip(JOINT_NAMES, turns, strict=True) if turn},
+        "turns_degrees": {name: round(float(turn), 2) for name, turn in zip(JOINT_NAMES, turns, strict=False) if turn},
     }
 
 
@@ -340,20 +388,31 @@ _LARGEST = 100_000_000
 
 def with_fitted_body(
     data: DataConfig,
+    model: HumanModel | None = None,
     *,
     only_if_needed: bool = False,
     say: Callable[[str], None] = print,
     report: ReportProgress = report_nothing,
 ) -> DataConfig:
-    """Return the options with a fit of the free template to the capture; the same capture is fitted once.
+    """Return the options with a fit of a template to the capture; the same capture is fitted once.
 
-    Nothing is fitted where ``data.body`` names a fit, where the capture holds one, or without silhouettes; with
-    ``only_if_needed`` where it has body parameters. Raises DyngsError: neither body parameters nor silhouettes.
+    ``model`` names the template; None: the free one. Nothing is fitted where ``data.body`` names a fit, where the
+    capture holds one of this template, or without silhouettes; with ``only_if_needed`` where it has body parameters.
+    Raises DyngsError: neither body parameters nor silhouettes, or a template that cannot be read.
     """
+    model = model or HumanModel()
     if data.body is not None:
+        path = data.body / "body_train.npz"
+        if path.is_file() and not has_same_shapes(load_template(model), read_body_file(path)):
+            say(f"body:    {data.body} is a fit of another template: its poses are taken, not its shape")
         return data
     capture = read_capture(data)
-    if capture.body is not None and (only_if_needed or capture.body["train"].shape_space == "anny"):
+    given = None if capture.body is None else capture.body["train"]
+    if given is not None and only_if_needed:
+        return data
+    body = None if model.body is None else load_template(model)
+    is_free = body is None or body.name == "anny"
+    if given is not None and (given.shape_space == "anny" if is_free else given.fitted_to == body.fingerprint):
         return data
     if not capture.has_alpha:
         if capture.body is None:
@@ -363,14 +422,18 @@ def with_fitted_body(
             )
         say(f"{data.root}: no silhouettes, so the body parameters are taken as given")
         return data
-    folder = cache_folder("bodies") / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}"
+    own, what = "", "fitted"
+    if body is not None:
+        _require_texels(model, body)
+        own, what = f".{body.fingerprint}", f"{_called(model, body)} is fitted"
+    folder = cache_folder("bodies") / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}{own}"
     if folder.is_dir():
         say(f"body:    the fit of before, in {folder}")
     else:
-        say(f"body:    fitted to the silhouettes first, as by `dyngs data fit`, into {folder}")
+        say(f"body:    {what} to the silhouettes first, as by `dyngs data fit`, into {folder}")
         points = data.root / KEYPOINTS
-        given = FitInputs(points if points.is_dir() else None)
-        say(write_fitted_capture(data, folder, report, given, with_images=False).summary())
+        inputs = FitInputs(points if points.is_dir() else None, template=model)
+        say(write_fitted_capture(data, folder, report, inputs, with_images=False).summary())
     return data.model_copy(update={"body": folder})
 
 

@@ -10,7 +10,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from dyngs.config import DataConfig
+from dyngs.config import DataConfig, HumanModel
 from dyngs.config.io import load_config
 from dyngs.data.body_frames import read_body_file
 from dyngs.data.capture import BodyFrames, View
@@ -20,17 +20,23 @@ from dyngs.errors import DyngsError, counted, reading
 from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.human.template.body import BodyTemplate
-from dyngs.human.template.body_reader import rest_shape
+from dyngs.human.template.body import NUM_FITTED, BodyTemplate
+from dyngs.human.template.body_reader import has_same_shapes, rest_shape
 
 _BODY, _CONFIG = "body_train.npz", "config.yaml"
 
 
-def known_shape(path: Path) -> BodyFrames:
-    """Return the body parameters of a person, of whom only the shape counts.
+def template_of_run(path: Path) -> HumanModel:
+    """Return what names the template of an avatar's run, of anything else the free one."""
+    model = load_config(path / _CONFIG).model if (path / _CONFIG).is_file() else None
+    return HumanModel(body=model.body, uv=model.uv) if isinstance(model, HumanModel) else HumanModel()
+
+
+def known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
+    """Return the body parameters of a person, of whom only the shape counts, which is one of ``body``.
 
     ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained on one. Raises
-    DyngsError: none of these, or a shape that is not of the free template.
+    DyngsError: none of these, or a shape of another template.
     """
     with reading(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
         folder = path
@@ -40,15 +46,26 @@ def known_shape(path: Path) -> BodyFrames:
         if not (folder / _BODY).is_file():
             raise DyngsError(f"{path}: no fitted person there; give a capture that `dyngs data fit` wrote, or its run")
         found = read_body_file(folder / _BODY)
-    if found.shape_space != "anny":
-        raise DyngsError(f"{folder / _BODY}: is of another template; fit that person with `dyngs data fit` first")
+    if not has_same_shapes(body, found):
+        raise DyngsError(
+            f"{folder / _BODY}: is of another template than {body.name}; name that of the person with --template, or "
+            "fit that person with `dyngs data fit` first"
+        )
     return found
 
 
-def with_shape(body: BodyTemplate, known: BodyFrames) -> BodyTemplate:
-    """Return the template whose mean shape is that of a known person."""
-    vertices, joints = rest_shape(body, known)
-    return replace(body, vertices=vertices, joints=joints)
+def with_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTemplate:
+    """Return the template that is fitted: its mean shape is that of a known person, and it has no expressions.
+
+    Of a file of SMPL's family it has the first ``NUM_FITTED`` shape parameters.
+    """
+    vertices, joints = (body.vertices, body.joints) if known is None else rest_shape(body, known)
+    shaped = replace(body, vertices=vertices, joints=joints)
+    if body.name == "anny" or body.shape_dirs is None or body.joint_shape_dirs is None:
+        return shaped
+    dirs, joint_dirs = body.shape_dirs[..., :NUM_FITTED], body.joint_shape_dirs[..., :NUM_FITTED]
+    without = replace(shaped, expression_dirs=None, joint_expression_dirs=None)
+    return replace(without, shape_dirs=dirs, joint_shape_dirs=joint_dirs)
 
 
 def shape_of(body: BodyTemplate, known: BodyFrames) -> torch.Tensor:

@@ -40,6 +40,8 @@ class Surface:
     normals: Tensor  # (P, 3) outward
     weights: Tensor  # (P, J) skinning weights
     shape_dirs: Tensor  # (P, 3, B) m per unit of the shape parameters
+    # (9 (J - 1), 3 P) pose blend shapes, m per unit of the rotations minus the identity; None without
+    pose_dirs: Tensor | None
     body: BodyTemplate  # the template
 
     def __len__(self) -> int:
@@ -57,7 +59,7 @@ class Surface:
         ``betas`` (B,) are shape parameters; ``padding`` (P,) m, by how much clothes and hair lie outside the skin.
         """
         means = self.discs.means + self.shape_dirs @ betas + padding[:, None] * self.normals
-        return ShapedSurface(self.discs.replace(means=means), self.weights, self.skeleton(betas))
+        return ShapedSurface(self.discs.replace(means=means), self.weights, self.skeleton(betas), self.pose_dirs)
 
 
 @dataclass(frozen=True)
@@ -67,10 +69,15 @@ class ShapedSurface:
     discs: Gaussians  # P at rest, m
     weights: Tensor  # (P, J) skinning weights
     skeleton: Skeleton
+    pose_dirs: Tensor | None = None  # (9 (J - 1), 3 P) as of ``Surface``
 
     def in_pose(self, pose: BodyPose) -> Gaussians:
         """Return the discs in a pose, in the world; differentiable."""
-        return pose_gaussians(self.discs, self.weights, self.skeleton, pose)
+        offsets = None
+        if self.pose_dirs is not None:
+            turned = pose.rotations[1:] - torch.eye(3, dtype=pose.rotations.dtype, device=pose.rotations.device)
+            offsets = (turned.flatten() @ self.pose_dirs).unflatten(0, (-1, 3))
+        return pose_gaussians(self.discs, self.weights, self.skeleton, pose, offsets)
 
 
 def surface_of(body: BodyTemplate, resolution: int) -> Surface:
@@ -79,11 +86,13 @@ def surface_of(body: BodyTemplate, resolution: int) -> Surface:
     discs, anchors = texel_gaussians(texels, [0.0], 0)
     ratios = anchors.size.new_tensor([_WIDTH, _WIDTH, _THICKNESS]).log()
     solid = torch.full_like(discs.logit_opacities, _OPACITY_LOGIT)
+    around, parts, pose_dirs = body.faces[texels.faces], texels.barycentric[..., None], None
     if body.shape_dirs is None:
         shape_dirs = discs.means.new_zeros(len(discs), 3, 0)
     else:
-        corners = body.shape_dirs[body.faces[texels.faces]]
-        shape_dirs = (texels.barycentric[..., None, None] * corners).sum(1)
+        shape_dirs = (parts[..., None] * body.shape_dirs[around]).sum(1)
+    if body.pose_dirs is not None:
+        pose_dirs = (parts * body.pose_dirs.unflatten(1, (-1, 3))[:, around]).sum(2).flatten(1)
     return Surface(
         discs=discs.replace(
             means=discs.means - _INSET * anchors.size[:, None] * texels.normals,
@@ -93,6 +102,7 @@ def surface_of(body: BodyTemplate, resolution: int) -> Surface:
         normals=texels.normals,
         weights=skinning_weights(anchors, len(body.joints)),
         shape_dirs=shape_dirs,
+        pose_dirs=pose_dirs,
         body=body,
     )
 

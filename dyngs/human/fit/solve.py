@@ -22,7 +22,7 @@ from dyngs.human.fit.silhouettes import ObservedFrame, ShapedSurface, Surface, d
 from dyngs.human.motion.motion import MotionClip
 from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.template.body import NUM_BONE_SHAPES
-from dyngs.human.template.joints import JOINT_NAMES
+from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
 NUM_TURNED = 22
 """Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
@@ -94,7 +94,7 @@ LR = {"log_scale": 3e-3, "betas": 0.1, "turns": 1e-2, "poses": 1e-2, "trans": 6e
 }
 """Learning rates at the first step; those of positions per metre of the person's unit."""
 LR_DECAY = 0.1
-BETAS_WEIGHT = BONES_WEIGHT = 1e-3  # of the mean squared shape parameter, whose unit is the spread among adults
+BETAS_WEIGHT = 1e-3  # of the mean squared shape parameter, of bones as well, whose unit is the spread among adults
 TURN, STEP = 0.25, 0.1
 """Rotations, rad, that cost as much as one unit of shape: of all frames, and from one frame to the next."""
 TURN_WEIGHT, POSE_WEIGHT, STEP_WEIGHT = 3e-2, 1e-3, 1e-3
@@ -208,14 +208,16 @@ def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
 def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
     """Return the mean robust distance of joints (J, 3) in the world from key points (V, 55, 3), see ``ObservedFrame``.
 
+    J is 24, 52 or 55; joints of the same name are compared.
     sqrt(1 + (d / ``KEYPOINT``)^2) - 1, weighted by the confidences: large errors count linearly.
     """
-    count = min(len(joints), marked.shape[1])
-    local = joints[:count] @ cameras.cam_from_world[:, :3, :3].mT + cameras.cam_from_world[:, None, :3, 3]
+    rows = SMPLX_ROWS[len(joints)]
+    marked = marked[:, list(rows)]
+    local = joints[: len(rows)] @ cameras.cam_from_world[:, :3, :3].mT + cameras.cam_from_world[:, None, :3, 3]
     pixels = local @ cameras.intrinsics.mT
     positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
-    away = (positions - marked[:, :count, :2]).square().sum(-1) / KEYPOINT**2
-    weights = marked[:, :count, 2]
+    away = (positions - marked[..., :2]).square().sum(-1) / KEYPOINT**2
+    weights = marked[..., 2]
     return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
 
 
@@ -224,16 +226,19 @@ def place_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
 
     ``unit`` is the length of a metre of the person in the world.
     """
-    count = min(len(joints), len(given))
-    away = (joints[:count] - given[:count, :3]).square().sum(-1) / (PLACE * unit) ** 2
-    weights = given[:count, 3]
+    rows = SMPLX_ROWS[len(joints)]
+    given = given[list(rows)]
+    away = (joints[: len(rows)] - given[:, :3]).square().sum(-1) / (PLACE * unit) ** 2
+    weights = given[:, 3]
     return (weights * ((1 + away).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
 
 
 def prior(learned: Parameters, expected: PosePrior) -> Tensor:
     """Return the penalty of shapes, turns and poses that are far from those given, or that jump."""
-    body, bones = learned["betas"].square().tensor_split([-NUM_BONE_SHAPES])
-    total = BETAS_WEIGHT * body.mean() + BONES_WEIGHT * bones.mean()
+    total = learned["betas"].new_zeros(())
+    # Of the free template the last directions are those of bones; SMPL has none.
+    for part in learned["betas"].square().tensor_split([-NUM_BONE_SHAPES]):
+        total = total + (BETAS_WEIGHT * part.mean() if len(part) else 0.0)
     total = total + TURN_WEIGHT * (learned["turns"][1:] / TURN).square().mean()
     away = (learned["poses"] - expected.centre) / expected.spread
     total = total + POSE_WEIGHT * away[:, 1:].square().mean()

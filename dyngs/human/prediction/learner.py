@@ -194,8 +194,7 @@ def predictor(config: Config, checkpoint: Checkpoint, data: DataConfig, **told: 
     model = _section(config)
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
-    if model.body is None:
-        data = with_fitted_body(data, only_if_needed=True, **told)
+    data = with_fitted_body(data, human_options(model), only_if_needed=True, **told)
     person = filmed(data, model, load_template(human_options(model)))
     return PersonPredictor(config, model, network, mean, person, data)
 

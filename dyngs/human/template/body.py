@@ -5,7 +5,9 @@ Local letters: T triangles, U UV vertices, B shape and E expression parameters.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -21,6 +23,8 @@ from dyngs.human.pose.skinning import (
 )
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.state import fields_moved_to
+
+NUM_FITTED = 10  # shape parameters of a file of SMPL's family that are fitted: as many as every such file has
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,14 @@ class BodyTemplate:
     def num_expressions(self) -> int:
         """Number of expression parameters E; 0 without expressions."""
         return 0 if self.expression_dirs is None else self.expression_dirs.shape[-1]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Return 16 hexadecimal digits that tell its mesh and shape space from those of other files."""
+        digest = hashlib.sha256(self.name.encode())
+        for values in (self.vertices, self.faces, self.shape_dirs):
+            digest.update(b"" if values is None else values[..., :NUM_FITTED].contiguous().cpu().numpy().tobytes())
+        return digest.hexdigest()[:16]
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> BodyTemplate:
         """Return the template on ``device``, its floating-point tensors in ``dtype``; None leaves either as it is."""

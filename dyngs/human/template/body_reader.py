@@ -323,12 +323,22 @@ def load_template(model: HumanModel) -> BodyTemplate:
     return read_body(model.body, model.uv)
 
 
+def has_same_shapes(body: BodyTemplate, given: BodyFrames) -> bool:
+    """Return whether the shape parameters of ``given`` are of the shape space of ``body``, as far as the files say.
+
+    Those of SMPL's family are taken as one, except for a fit of dyngs, which says to which file it was fitted.
+    """
+    if body.name == "anny" or given.shape_space == "anny":
+        return given.shape_space == body.name
+    return given.fitted_to in ("", body.fingerprint)
+
+
 def rest_shape(body: BodyTemplate, given: BodyFrames) -> tuple[Tensor, Tensor]:
     """Return vertices (M, 3) and joints (J, 3) at rest in the shape of ``given``; what ``body`` lacks is ignored.
 
     A template with another shape space than that of ``given`` stays as it is.
     """
-    if (given.shape_space == "anny") != (body.name == "anny"):
+    if not has_same_shapes(body, given):
         return body.vertices, body.joints
     with torch.no_grad():
         return apply_shape(body, torch.from_numpy(given.betas).to(body.vertices)[: body.num_shapes])

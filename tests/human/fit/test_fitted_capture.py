@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.config import DataConfig
+from dyngs.config import DataConfig, HumanModel
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.readers.transforms import read_frame_file, read_views
 from dyngs.errors import DyngsError
 from dyngs.files.write import write_image
-from dyngs.human.fit import fitted_capture
+from dyngs.human.fit import fitted_capture, start
 from dyngs.human.fit.fitted_capture import (
     FitInputs,
     has_guessed_lens,
@@ -27,7 +28,9 @@ from dyngs.human.fit.fitted_capture import (
     write_split,
 )
 from dyngs.human.fit.solve import LensFit
+from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
+from dyngs.human.template.body_reader import load_template, rest_shape
 
 
 @pytest.fixture
@@ -75,6 +78,74 @@ def test_what_is_a_fit_is_not_fitted_again(data: DataConfig, tmp_path: Path) -> 
     assert with_fitted_body(given, say=pytest.fail) == given
     named = data.model_copy(update={"body": out})
     assert with_fitted_body(named, say=pytest.fail) == named
+
+
+@pytest.fixture
+def smpl(smpl_files: tuple[Path, Path]) -> HumanModel:
+    """Names a body file of 24 joints."""
+    return HumanModel(body=smpl_files[0], uv=smpl_files[1])
+
+
+def test_a_template_that_is_named_is_fitted_instead_of_the_free_one(data: DataConfig, smpl: HumanModel) -> None:
+    said: list[str] = []
+    fitted = with_fitted_body(data, smpl, say=said.append)
+    assert "smpl (smpl.npz) is fitted to the silhouettes first" in said[0]
+    assert fitted.body is not None
+    assert json.loads((fitted.body / "fit_report.json").read_text())["template"] == "smpl (smpl.npz)"
+    body = read_capture(fitted).body
+    assert body is not None
+    assert {frames.poses.shape for frames in body.values()} == {(2, 24, 3)}
+    assert {frames.fitted_to for frames in body.values()} == {load_template(smpl).fingerprint}
+    assert with_fitted_body(data, smpl, say=said.append) == fitted
+    assert "the fit of before" in said[-1]
+    assert with_fitted_body(data, say=said.append).body != fitted.body, "the free template has a fit of its own"
+
+
+def test_a_capture_without_body_parameters_gets_a_fit_of_the_named_template(
+    data: DataConfig, smpl: HumanModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in (*data.root.glob("body_*.npz"), data.root / "transforms_pose.json"):
+        path.unlink()
+    monkeypatch.setattr(start, "STEPS", 1)
+    monkeypatch.setattr(start, "ARMS", ())
+    body = read_capture(with_fitted_body(data, smpl, only_if_needed=True, say=lambda _: None)).body
+    assert body is not None
+    assert body["train"].poses.shape == (2, 24, 3)
+    assert np.abs(body["train"].betas).max() > 0
+
+
+def test_a_fit_is_fitted_again_only_for_another_template(data: DataConfig, smpl: HumanModel, tmp_path: Path) -> None:
+    out = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl)).root
+    given, said = DataConfig(root=out), list[str]()
+    assert with_fitted_body(given, smpl, say=pytest.fail) == given
+    assert with_fitted_body(given, say=said.append) != given
+    assert "fitted to the silhouettes first" in said[0]
+    named, said = data.model_copy(update={"body": out}), []
+    assert with_fitted_body(named, smpl, say=pytest.fail) == named
+    assert with_fitted_body(named, say=said.append) == named
+    assert "is a fit of another template: its poses are taken, not its shape" in said[0]
+
+
+def test_the_fit_begins_with_a_given_shape_of_the_template(data: DataConfig, smpl: HumanModel, tmp_path: Path) -> None:
+    betas = np.zeros(300)
+    betas[:10] = np.linspace(-1, 1, 10)
+    for name in ("train", "pose"):
+        path = data.root / f"body_{name}.npz"
+        np.savez(path, **(dict(np.load(path)) | {"betas": betas}))
+    found = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl))
+    with np.load(tmp_path / "fitted" / "body_train.npz") as file:
+        assert np.allclose(file["betas"], betas[:10] + found.found.fit.betas.numpy(), atol=1e-6)
+    body, given = load_template(smpl), read_capture(data).body
+    assert given is not None
+    _, joints = rest_shape(body, given["train"])
+    clip = captured_motion(data.root, given["train"], read_capture(data).splits["train"], joints).clip
+    assert torch.equal(found.found.motion.clip.trans, clip.trans), "of the shaped body"
+
+
+def test_a_template_without_texture_coordinates_is_refused(data: DataConfig, smpl: HumanModel, tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match=r"smpl\.npz: has no texture coordinates.*--uv FILE"):
+        write_fitted_capture(data, tmp_path / "out", lambda *_: None, FitInputs(template=HumanModel(body=smpl.body)))
+    assert not list(tmp_path.glob("*out*"))
 
 
 def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from synthetic_bodies import model, write_npz
 from torch import Tensor
 
 from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
@@ -16,9 +17,17 @@ from dyngs.errors import DyngsError
 from dyngs.files.write import write_image, write_text
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.fit.known_person import AvatarPoses, KnownAvatar, known_shape, posed_by_avatar, shape_of, with_shape
+from dyngs.human.fit.known_person import (
+    AvatarPoses,
+    KnownAvatar,
+    known_shape,
+    posed_by_avatar,
+    shape_of,
+    template_of_run,
+    with_shape,
+)
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.human.template.body_reader import default_template
+from dyngs.human.template.body_reader import default_template, read_body
 from dyngs.human.template.joints import JOINT_NAMES
 from dyngs.kinds import assemble
 from dyngs.training.trainer import Trainer
@@ -34,7 +43,7 @@ def fitted(folder: Path, kind: str = "anny") -> Path:
 
 def test_the_template_gets_the_shape(tmp_path: Path) -> None:
     body = default_template()
-    known = known_shape(fitted(tmp_path / "a"))
+    known = known_shape(fitted(tmp_path / "a"), body)
     shaped, betas = with_shape(body, known), shape_of(body, known)
     assert body.joint_shape_dirs is not None
     assert torch.allclose(shaped.joints, body.joints + body.joint_shape_dirs @ betas, atol=1e-5)
@@ -46,14 +55,45 @@ def test_a_run_names_the_capture_it_was_trained_on(tmp_path: Path) -> None:
     folder, run = fitted(tmp_path / "a"), tmp_path / "run"
     run.mkdir()
     write_text(run / "config.yaml", f"data:\n  root: {folder}\nmodel:\n  kind: human\n")
-    assert known_shape(run).betas[-1] == 1
+    assert known_shape(run, default_template()).betas[-1] == 1
 
 
 def test_others_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no fitted person there"):
-        known_shape(tmp_path)
+        known_shape(tmp_path, default_template())
     with pytest.raises(DyngsError, match="of another template"):
-        known_shape(fitted(tmp_path / "b", "smplx"))
+        known_shape(fitted(tmp_path / "b", "smplx"), default_template())
+
+
+def test_a_body_of_smpl_has_the_first_ten_shapes_and_no_expressions(tmp_path: Path) -> None:
+    body = read_body(write_npz(tmp_path / "x.npz", model("smplx", directions=30)))
+    assert (body.num_shapes, body.num_expressions) == (30, 0)
+    full = read_body(write_npz(tmp_path / "y.npz", model("smplx", directions=310)))
+    assert (full.num_shapes, full.num_expressions) == (300, 10)
+    for template in (body, full):
+        cut = with_shape(template, None)
+        assert (cut.num_shapes, cut.num_expressions) == (10, 0)
+        assert torch.equal(cut.vertices, template.vertices)
+    assert with_shape(default_template(), None).num_shapes == default_template().num_shapes
+
+
+def test_a_person_of_a_file_is_known_to_that_file_alone(tmp_path: Path) -> None:
+    body, other = (read_body(write_npz(tmp_path / f"{i}.npz", model("smpl", seed=i))) for i in (0, 1))
+    for folder, own in (("given", {}), ("fit", {"fitted_to": body.fingerprint})):
+        path = fitted(tmp_path / folder, "smpl") / "body_train.npz"
+        np.savez(path, **(dict(np.load(path)) | own))
+        assert np.allclose(known_shape(path.parent, body).betas[:10], np.linspace(-1, 1, 44)[:10])
+    assert known_shape(tmp_path / "given", other).fitted_to == "", "whose shape it is nobody says"
+    with pytest.raises(DyngsError, match="is of another template than smpl; name that of the person with --template"):
+        known_shape(tmp_path / "fit", other)
+
+
+def test_a_run_names_its_template(tmp_path: Path) -> None:
+    write_text(tmp_path / "config.yaml", "data:\n  root: a\nmodel:\n  kind: human\n  body: s.npz\n  uv: s.obj\n")
+    assert template_of_run(tmp_path) == HumanModel(body=Path("s.npz"), uv=Path("s.obj"))
+    assert template_of_run(tmp_path / "none") == HumanModel()
+    write_text(tmp_path / "config.yaml", "data:\n  root: a\n")
+    assert template_of_run(tmp_path) == HumanModel()
 
 
 SIZE = 64

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 import torch
 
 from dyngs.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.gaussians.rendering import render
+from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.fit.silhouettes import _OPTIONS as OPTIONS
-from dyngs.human.fit.silhouettes import drawn_silhouettes, longest_box_side, observed_frame, surface_of
-from dyngs.human.template.body_reader import default_template
+from dyngs.human.fit.silhouettes import Surface, drawn_silhouettes, longest_box_side, observed_frame, surface_of
+from dyngs.human.pose.skinning import axis_angle_to_matrix
+from dyngs.human.template.atlas import atlas_texels
+from dyngs.human.template.body import posed_vertices
+from dyngs.human.template.body_reader import default_template, read_body
 
 
 def image(rows: slice, columns: slice, height: int = 40, width: int = 60) -> Image:
@@ -85,3 +92,23 @@ def test_the_coverage_is_that_of_a_render_and_needs_no_colours() -> None:
     found, coloured = drawn_silhouettes(surface.discs, camera), render(surface.discs, camera, OPTIONS).alpha
     assert found.sum() > 50
     torch.testing.assert_close(found, coloured, rtol=0, atol=1e-6)
+
+
+def test_pose_blend_shapes_move_the_surface_as_they_move_the_mesh(smpl_files: tuple[Path, Path]) -> None:
+    body = read_body(*smpl_files)
+    surface, texels = surface_of(body, 24), atlas_texels(body, 24, body.vertices)
+    poses = 0.5 * torch.randn(24, 3, generator=torch.Generator().manual_seed(1))
+    poses[0] = 0.0
+    place = torch.tensor([0.1, 0.2, 0.3])
+    pose = BodyPose(axis_angle_to_matrix(poses), place, torch.tensor(1.0))
+    shape, skin = torch.zeros(10), surface.discs.replace(means=texels.points)
+
+    def away(drawn: Surface) -> torch.Tensor:
+        """Distances of points of the skin from where the mesh has them, m."""
+        posed = replace(drawn, discs=skin).in_shape(shape, torch.zeros(len(drawn))).in_pose(pose).means
+        mesh = posed_vertices(body, poses[None], place[None])[0]
+        return (posed - (texels.barycentric[..., None] * mesh[body.faces[texels.faces]]).sum(1)).norm(dim=1)
+
+    # What remains: points between vertices are skinned, not placed between skinned vertices.
+    assert away(surface).mean() < 2e-4
+    assert away(replace(surface, pose_dirs=None)).mean() > 2e-3

@@ -13,6 +13,7 @@ from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit import solve
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import (
+    BETAS_WEIGHT,
     KEYPOINT,
     LIMIT_WEIGHT,
     LR,
@@ -69,8 +70,9 @@ def joints_at(learned: Parameters, clip: MotionClip, surface: Surface) -> torch.
 
 
 def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
-    joints = torch.tensor([[0.0, 0.0, 0.0], [0.5, 1.0, 0.0]])
-    positions = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])[None]
+    joints, positions = torch.zeros(55, 3), torch.zeros(1, 55, 3)
+    joints[1] = torch.tensor([0.5, 1.0, 0.0])
+    positions[0, :2] = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])
     assert float(keypoint_error(joints, positions, camera())) == pytest.approx(0, abs=1e-6)
     moved = positions.clone()
     moved[0, 0, 0] += 3 * KEYPOINT
@@ -163,6 +165,30 @@ def test_joints_given_in_3d_are_robust_distances() -> None:
     given[5] = torch.tensor([0.0, 0.0, 0.0, 0.5])
     assert float(place_error(joints, given, torch.ones(()))) == pytest.approx(0.5 * (26**0.5 - 1))
     assert float(place_error(joints, given, torch.tensor(5.0))) == pytest.approx(0.5 * (2**0.5 - 1))
+
+
+@pytest.mark.parametrize(("count", "row", "name"), [(24, 21, "right_wrist"), (52, 22, "left_index1")])
+def test_joints_of_other_bodies_are_compared_by_name(count: int, row: int, name: str) -> None:
+    """The last two joints of SMPL have no counterpart, and SMPL-H has fingers where SMPL-X has a face."""
+    joints, given = torch.zeros(count, 3), torch.zeros(55, 4)
+    joints[row] = joints[-1] = torch.tensor([3 * PLACE, 4 * PLACE, 0.0])
+    given[JOINT_NAMES.index(name), 3] = given[JOINT_NAMES.index("jaw"), 3] = 1.0
+    assert float(place_error(joints, given, torch.ones(()))) == pytest.approx(26**0.5 - 1)
+    marked = torch.zeros(1, 55, 3)
+    marked[0, :, 2] = given[:, 3]
+    marked[0, JOINT_NAMES.index(name), :2] = torch.tensor([0.5, 0.5])
+    joints[row] = 0.0
+    assert float(keypoint_error(joints, marked, camera())) == pytest.approx(0, abs=1e-6)
+
+
+def test_shapes_cost_their_mean_square_with_and_without_directions_of_bones(surface: Surface) -> None:
+    expected = usual(clip())
+    for count, parts in ((surface.body.num_shapes, 2), (10, 1)):
+        learned = new_fit(clip(), surface).values() | {"betas": torch.zeros(count)}
+        flat = float(prior(Parameters(learned, {}, 1.0), expected).detach())
+        learned |= {"betas": torch.full((count,), 2.0)}
+        cost = float(prior(Parameters(learned, {}, 1.0), expected).detach()) - flat
+        assert cost == pytest.approx(4 * parts * BETAS_WEIGHT, rel=1e-3)
 
 
 def test_a_longer_lens_from_further_away_shows_the_same_size(surface: Surface) -> None:

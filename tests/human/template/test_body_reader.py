@@ -9,6 +9,7 @@ import sys
 import types
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ from dyngs.config import HumanModel
 from dyngs.data.capture import BodyFrames, ShapeSpace
 from dyngs.errors import DyngsError
 from dyngs.human.template.body import BodyTemplate, apply_shape, posed_vertices
-from dyngs.human.template.body_reader import default_template, load_template, read_body, rest_shape
+from dyngs.human.template.body_reader import default_template, has_same_shapes, load_template, read_body, rest_shape
 
 TEMPLATE = Path(inspect.getfile(BodyTemplate)).parent / "files" / "anny_smplx55.npz"
 
@@ -457,3 +458,28 @@ def test_shape_parameters_count_in_their_own_shape_space_only() -> None:
     assert torch.equal(rest_shape(free, parameters(betas, "smpl"))[0], free.vertices)
     assert torch.equal(rest_shape(other, parameters(betas, "anny"))[1], other.joints)
     assert torch.equal(rest_shape(free, parameters(betas, "anny"))[1], apply_shape(free, betas)[1])
+
+
+def test_the_shape_of_a_fit_counts_for_its_file_only(tmp_path: Path) -> None:
+    first, second = (read_body(write_npz(tmp_path / f"{i}.npz", model("smpl", seed=i))) for i in (0, 1))
+    given = replace(parameters(torch.ones(10), "smpl"), fitted_to=first.fingerprint)
+    assert has_same_shapes(first, given)
+    assert not has_same_shapes(second, given)
+    assert torch.equal(rest_shape(first, given)[0], apply_shape(first, torch.ones(10))[0])
+    assert torch.equal(rest_shape(second, given)[0], second.vertices)
+    assert has_same_shapes(second, parameters(torch.ones(10), "smpl")), "of other programs"
+
+
+def test_a_fingerprint_tells_files_apart_by_mesh_shapes_and_joints(tmp_path: Path) -> None:
+    arrays = model("smpl")
+    body = read_body(write_npz(tmp_path / "a.npz", arrays))
+    again = read_body(write_pickle(tmp_path / "a.pkl", arrays))
+    assert again.fingerprint == body.fingerprint, "whatever kind of file it is"
+    more = np.concatenate([arrays["shapedirs"], arrays["shapedirs"]], axis=2)
+    longer = read_body(write_npz(tmp_path / "b.npz", arrays | {"shapedirs": more}))
+    assert longer.fingerprint == body.fingerprint, "only ten shapes are fitted"
+    others = [replace(body, name="smplh")] + [
+        read_body(write_npz(tmp_path / f"{key}.npz", arrays | {key: 1.01 * arrays[key]}))
+        for key in ("v_template", "shapedirs")
+    ]
+    assert len({x.fingerprint for x in (body, *others)}) == 4
