@@ -140,7 +140,7 @@ def write_body(
 
     ``betas`` (B,) are of the shape space of the template ``body``; ``fps`` frames per second, None where nobody knows.
     """
-    clip, named = found.clip, {} if body.name == "anny" else {"fitted_to": body.fingerprint}
+    clip = found.clip
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
@@ -149,7 +149,7 @@ def write_body(
             betas=betas.astype(np.float32),
             scale=clip.scale.cpu().numpy(),
             surface_model_type=body.name,
-            **named,
+            fitted_to="" if body.name == "anny" else body.fingerprint,
             gender="neutral",
             up_axis="y",
             frames=np.asarray(found.frames, dtype=np.int64),
@@ -411,9 +411,10 @@ def with_fitted_body(
     if given is not None and only_if_needed:
         return data
     body = None if model.body is None else load_template(model)
-    is_free = body is None or body.name == "anny"
-    if given is not None and (given.shape_space == "anny" if is_free else given.fitted_to == body.fingerprint):
-        return data
+    if given is not None:
+        is_free = body is None or body.name == "anny"
+        if given.shape_space == "anny" if is_free else body is not None and given.fitted_to == body.fingerprint:
+            return data
     if not capture.has_alpha:
         if capture.body is None:
             raise DyngsError(
