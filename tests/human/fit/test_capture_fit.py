@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from smpl_like import write_capture_of, write_smpl_like
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
@@ -29,12 +31,13 @@ from dyngs.human.fit.capture_fit import (
     simplest_of_the_best,
     split_views,
 )
+from dyngs.human.fit.known_person import with_shape
 from dyngs.human.fit.silhouettes import surface_of
 from dyngs.human.fit.solve import VIEWS, InTurn, body_fit, new_fit
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.pose.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.human.template.body_reader import default_template, rest_shape
+from dyngs.human.template.body_reader import default_template, read_body, rest_shape
 
 OPTIONS = HumanOptions(size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5)
 
@@ -76,6 +79,27 @@ def test_the_joints_come_nearer_to_the_truth(wrong: tuple[Capture, Capture]) -> 
     before, after = ((joints_of(given, fit) - truth).norm(dim=-1).mean() for fit in (None, found(given.root)))
     assert before > 0.03
     assert after < 0.5 * before
+
+
+def test_a_body_file_finds_its_own_shape(
+    smpl_files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A person of a file of 55 joints, wide as no mean; a file of 24 joints has the same shapes."""
+    betas = torch.zeros(10)
+    betas[:2] = torch.tensor([2.0, -1.5])
+    options = HumanOptions(size=96, num_frames=3, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1)
+    root = write_capture_of(*write_smpl_like(tmp_path, "smplx"), tmp_path / "person", options, betas, monkeypatch)
+    capture, body = read_capture(DataConfig(root=root)), with_shape(read_body(*smpl_files), None)
+    assert capture.body is not None
+    wrong = {split: replace(given, betas=np.zeros(10)) for split, given in capture.body.items()}
+    effort = FitEffort(side=64, steps=30, visits=6)
+    fit = fit_capture(capture.replace(body=wrong), DataConfig(root=root), body, lambda *_: None, effort=effort)
+    assert fit.chosen.iou > fit.tried[0].iou + GAIN
+    assert body.shape_dirs is not None
+    truth, found = (body.vertices + body.shape_dirs @ x for x in (betas, fit.fit.betas))
+    size = fit.fit.shared.log_scale
+    away, before = ((x - x.mean(0)) - (truth - truth.mean(0)) for x in (math.exp(size) * found, body.vertices))
+    assert away.norm(dim=1).mean() < 0.5 * before.norm(dim=1).mean()
 
 
 def test_the_fit_is_judged_on_views_that_it_did_not_see(wrong: tuple[Capture, Capture]) -> None:
