@@ -131,7 +131,7 @@ def test_the_fit_begins_with_a_given_shape_of_the_template(data: DataConfig, smp
     betas[:10] = np.linspace(-1, 1, 10)
     for name in ("train", "pose"):
         path = data.root / f"body_{name}.npz"
-        np.savez(path, **(dict(np.load(path)) | {"betas": betas}))
+        np.savez(path, **(dict(np.load(path)) | {"betas": betas}))  # pyright: ignore[reportArgumentType]
     found = write_fitted_capture(data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl))
     with np.load(tmp_path / "fitted" / "body_train.npz") as file:
         assert np.allclose(file["betas"], betas[:10] + found.found.fit.betas.numpy(), atol=1e-6)

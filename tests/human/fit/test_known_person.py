@@ -81,7 +81,7 @@ def test_a_person_of_a_file_is_known_to_that_file_alone(tmp_path: Path) -> None:
     body, other = (read_body(write_npz(tmp_path / f"{i}.npz", model("smpl", seed=i))) for i in (0, 1))
     for folder, own in (("given", {}), ("fit", {"fitted_to": body.fingerprint})):
         path = fitted(tmp_path / folder, "smpl") / "body_train.npz"
-        np.savez(path, **(dict(np.load(path)) | own))
+        np.savez(path, **(dict(np.load(path)) | own))  # pyright: ignore[reportArgumentType]
         assert np.allclose(known_shape(path.parent, body).betas[:10], np.linspace(-1, 1, 44)[:10])
     assert known_shape(tmp_path / "given", other).fitted_to == "", "whose shape it is nobody says"
     with pytest.raises(DyngsError, match="is of another template than smpl; name that of the person with --template"):
