@@ -333,10 +333,15 @@ def write_split(out: Path, split: str, avatar: Avatar, shots: Shots, lens: Lens,
             overlaps.append(float((mask & other).sum() / (mask | other).sum()))
             entry: dict[str, object] = {"file_path": name, "frame": i, "camera": camera}
             frames.append(entry | {"time": i / max(len(clip.joints) - 1, 1), "transform_matrix": pose.tolist()})
+    write_transforms(out / f"transforms_{split}.json", lens, frames)
+    return overlaps
+
+
+def write_transforms(path: Path, lens: Lens, frames: list[dict[str, object]], **more: object) -> None:
+    """Write the cameras of a split, all with the same ``lens``, and ``more`` fields of the file."""
     size, focal = lens.size, lens.focal
     intrinsics = {"w": size, "h": size, "fl_x": focal, "fl_y": focal, "cx": 0.5 * size, "cy": 0.5 * size}
-    write_text(out / f"transforms_{split}.json", json.dumps(intrinsics | {"frames": frames}, indent=1) + "\n")
-    return overlaps
+    write_text(path, json.dumps(more | intrinsics | {"frames": frames}, indent=1) + "\n")
 
 
 def chosen_frames(motion: Motion, count: int, offset: float) -> tuple[Motion, list[int]]:

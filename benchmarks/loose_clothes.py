@@ -23,7 +23,6 @@ Local letters: R rows and C columns of the cloth, V = R C points, F frames, M ve
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,12 +39,13 @@ from clothed_people import (
     draw,
     longest_lens,
     ring,
+    write_transforms,
 )
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation, Slerp
 from skinned_avatar import Avatar, posed_mesh, read_avatar
 
-from dyngs.files.write import write_image, write_text
+from dyngs.files.write import write_image
 from dyngs.human.motion.amass import read_amass, write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.capture import random_light
@@ -297,7 +297,7 @@ def main() -> None:
     lens = longest_lens([vertices for vertices, _ in posed.values()], np.stack(cameras), given.size)
     frames_of = {"train": rows[: given.frames], "test": rows[: given.frames], "pose": rows[given.frames :]}
     for split, shown in frames_of.items():
-        entries = []
+        entries: list[dict[str, object]] = []
         for i, row in enumerate(shown.tolist()):
             for camera, pose in list(enumerate(cameras))[slice(8) if split == "train" else slice(8, 12)]:
                 name = f"{split}/f{i:03d}_c{camera:02d}.png"
@@ -306,10 +306,7 @@ def main() -> None:
                 write_image(given.out / "cloth" / name, np.repeat(mask[..., None].astype(np.float64), 3, axis=2))
                 entry = {"file_path": f"images/{name}", "frame": i, "camera": camera, "time": i / (len(shown) - 1)}
                 entries.append(entry | {"transform_matrix": pose.tolist()})
-        size, focal = lens.size, lens.focal
-        intrinsics = {"w": size, "h": size, "fl_x": focal, "fl_y": focal, "cx": 0.5 * size, "cy": 0.5 * size}
-        written = {"fps": RATE / EVERY} | intrinsics | {"frames": entries}
-        write_text(given.out / f"transforms_{split}.json", json.dumps(written, indent=1) + "\n")
+        write_transforms(given.out / f"transforms_{split}.json", lens, entries, fps=RATE / EVERY)
         print(f"{split}: {len(entries)} images", flush=True)
     fit = Fit(avatar, body)
     for split in ("train", "pose"):

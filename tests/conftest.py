@@ -1,4 +1,4 @@
-"""How the tests draw their examples, and fixtures that several folders of tests share: a plugin of pytest.
+"""How the tests draw their examples, and fixtures that several folders of tests share.
 
 Examples of property tests are fixed by default (profile ``ci``): a run passes or fails whoever starts it. The profile
 ``random`` draws as many at random, ``long`` ten times as many; they say how to draw a failing one again::

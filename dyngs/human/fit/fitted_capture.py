@@ -410,11 +410,9 @@ def with_fitted_body(
     given = None if capture.body is None else capture.body["train"]
     if given is not None and only_if_needed:
         return data
-    body = None if model.body is None else load_template(model)
-    if given is not None:
-        is_free = body is None or body.name == "anny"
-        if given.shape_space == "anny" if is_free else body is not None and given.fitted_to == body.fingerprint:
-            return data
+    body = load_template(model)
+    if given is not None and _is_fit_of(body, given):
+        return data
     if not capture.has_alpha:
         if capture.body is None:
             raise DyngsError(
@@ -424,7 +422,7 @@ def with_fitted_body(
         say(f"{data.root}: no silhouettes, so the body parameters are taken as given")
         return data
     own, what = "", "fitted"
-    if body is not None:
+    if model.body is not None:
         _require_texels(model, body)
         own, what = f".{body.fingerprint}", f"{_called(model, body)} is fitted"
     folder = cache_folder("bodies") / f"{re.sub(r'[^A-Za-z0-9-]', '_', data.root.name)[:40]}.{_digest(data)}{own}"
@@ -436,6 +434,11 @@ def with_fitted_body(
         inputs = FitInputs(points if points.is_dir() else None, template=model)
         say(write_fitted_capture(data, folder, report, inputs, with_images=False).summary())
     return data.model_copy(update={"body": folder})
+
+
+def _is_fit_of(body: BodyTemplate, given: BodyFrames) -> bool:
+    """Return whether dyngs fitted ``body`` to get ``given``; of the free template nobody else has the shape space."""
+    return given.shape_space == "anny" if body.name == "anny" else given.fitted_to == body.fingerprint
 
 
 def _digest(data: DataConfig) -> str:
