@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +14,7 @@ from dyngs.config import DataConfig
 from dyngs.conventions import ReportProgress
 from dyngs.data.body_frames import numbered
 from dyngs.data.capture import Capture, Split, View
-from dyngs.data.loader import ImageLoader
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.errors import DyngsError
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.fit.keypoints import Joints3D, Keypoints
@@ -51,6 +52,9 @@ them where that gains this fraction of ``GAIN``. Where a limb is off, it gains s
 LONGER, HIGHER = 3, 0.3
 """Poses that were found frame by frame are off by more than given ones: they get so many times the steps, at rates of
 10 to this power times as much at first. Found in 20 frames of four people."""
+MOST_OF_THE_BORDER = 0.6
+"""Mean fraction of the outermost pixels of images beyond which a silhouette is that of the background: people who are
+cut off on three sides cover less."""
 SHAPE = ("log_scale", "betas", "padding", "offset", "shift")  # what is the same in all frames
 
 
@@ -230,6 +234,11 @@ def look_at(
     images = ImageLoader(views, options.model_copy(update={"longest_side": IMAGE_SIDE, "downscale": 1}))
     used, left_out = split_views(views, motion)
     shown = [i for rows in (used, left_out) for own in rows.values() for i in own]
+    if float(np.mean([_border_covered(images[i]) for i in shown])) > MOST_OF_THE_BORDER:
+        raise DyngsError(
+            f"{capture.root}: the silhouettes cover the borders of the images; white is the person: are the masks "
+            "inverted? (docs/human.md)"
+        )
     side = longest_box_side(images[i] for i in shown)
     if side < 8:
         raise DyngsError(f"{capture.root}: nobody is seen in the silhouettes; check the masks (docs/human.md)")
@@ -241,6 +250,14 @@ def look_at(
 
     held_out, seen = sum(map(len, left_out.values())), frames(used)
     return Seen(seen, frames(left_out) if held_out else seen, held_out)
+
+
+def _border_covered(image: Image) -> float:
+    """Return the fraction of the image's outermost pixels that the silhouette covers."""
+    if image.alpha is None:
+        return 0.0
+    inside = image.alpha > 0.5
+    return float(torch.cat([inside[0], inside[-1], inside[1:-1, 0], inside[1:-1, -1]]).float().mean())
 
 
 def _marked(views: Sequence[View], images: ImageLoader, shown: Sequence[int], points: Keypoints) -> Keypoints:

@@ -12,10 +12,13 @@ import pytest
 import torch
 from smpl_like import write_capture_of, write_smpl_like
 
+from dyngs.capture.fixed_camera import silhouettes_of
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
+from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
+from dyngs.files.write import write_image
 from dyngs.human.fit import capture_fit, start
 from dyngs.human.fit.capture_fit import (
     GAIN,
@@ -191,6 +194,19 @@ def test_without_given_poses_every_frame_has_its_own(
     clips = fitted_clips(capture, default_template(), fit, None)
     assert clips["train"].frames == (0, 1, 2, 3)
     assert torch.equal(clips["train"].clip.poses, poses)
+
+
+def test_masks_of_the_background_are_refused(wrong: tuple[Capture, Capture], tmp_path: Path) -> None:
+    given, views = wrong[0], []
+    for view in given.splits["train"]:
+        image = read_image(view.image_path).numpy()
+        photo, mask = (tmp_path / name / f"{view.name}.png" for name in ("photos", "masks"))
+        write_image(photo, image[..., :3])
+        write_image(mask, 255 - image[..., 3:])
+        views.append(replace(view, image_path=photo, silhouette=silhouettes_of(mask.parent, [mask.name])[0]))
+    capture = given.replace(splits={**given.splits, "train": tuple(views)})
+    with pytest.raises(DyngsError, match="are the masks inverted"):
+        fit_capture(capture, DataConfig(root=capture.root), default_template(), print)
 
 
 def test_images_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) -> None:
