@@ -59,7 +59,7 @@ def scores_from_own_poses(drawing: Drawing, images: ImageLoader, size: float, lp
 def _person_scores(
     avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
 ) -> PoseScores:
-    fitted = fitted_to_images(avatar, images, drawing.background, avatar.options, comparison)
+    fitted = fitted_to_images(avatar, images, drawing.background, comparison)
     each = (images[i] for i in range(len(images)))
     views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
     return PoseScores(**means_of(views), updates=fmean(fitted.updates), per_view=tuple(views))

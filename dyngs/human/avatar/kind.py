@@ -18,6 +18,7 @@ from dyngs.human.avatar.anchors import pixel_size, surface_gaussians, surface_te
 from dyngs.human.avatar.loose import remembering
 from dyngs.human.avatar.observations import Subject, in_colours_of
 from dyngs.human.avatar.outlines import outline_loss
+from dyngs.human.avatar.pose_refit import PoseRefit
 from dyngs.human.avatar.posing import Skeleton, pose_blend_shapes, rest_normals
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
@@ -25,7 +26,7 @@ from dyngs.human.motion.motion import captured_motion
 from dyngs.human.template.body_reader import load_template, rest_shape
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
-from dyngs.models.views import training_cameras
+from dyngs.models.views import evaluation_background, training_cameras
 
 _NOT_LOOSE = (
     "model.loose=true: how fast the person moves is not known, as the capture does not say its frames per second; "
@@ -55,7 +56,9 @@ def start(run: RunStart) -> GaussianModel:
     cameras = training_cameras(filmed, config.data)
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
     outlines = None if colours.network is not None else outline_loss(run)
-    training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines)
+    behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
+    refit = PoseRefit(run.images, behind) if model.refine and config.train.minutes is None else None
+    training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines, refit)
     lit = model.light and model.refine and colours.network is None
     scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
     return GaussianModel(run, scene, training, densifier_of(run), colours)

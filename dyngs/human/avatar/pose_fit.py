@@ -6,7 +6,7 @@ So do GART (Lei et al. 2024) and Anim-NeRF (Chen et al. 2021) before they score 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor
 
 from dyngs.data.images.images import area_downscale
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.corrections import POSE_CM, POSE_WEIGHT, SharedCorrection, corrected_clip
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.avatar.scene import HumanScene
@@ -37,6 +36,7 @@ class Comparison:
     turn_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
     shift_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
     views_to_turn: int = 1  # images of a time step from which on rotations are fitted; with fewer the shift is
+    most_windows: int | None = None  # after which a round ends; None: ``MOST_WINDOWS``
 
 
 def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
@@ -108,17 +108,19 @@ class FittedPoses:
 
 
 def fitted_to_images(
-    scene: HumanScene, images: ImageLoader, background: Tensor, options: RenderOptions, comparison: Comparison = IMAGES
+    scene: HumanScene,
+    images: ImageLoader,
+    background: Tensor,
+    comparison: Comparison = IMAGES,
+    which: Collection[int] | None = None,
 ) -> FittedPoses:
     """Return the person in the poses in which it looks most like ``images``: rotations of joints and translation.
 
     All images of a time step decide its pose. The fit begins with the pose that is played, or with that corrected as
     the one before was, whichever looks more alike. ``scene`` plays the clip to correct; ``background`` (3,) is behind
-    both.
+    both. ``which`` are the indices of the images that count, None: all.
     """
-    groups: dict[float, list[int]] = {}
-    for index, time in enumerate(images.times):
-        groups.setdefault(0.0 if time is None else time, []).append(index)
+    groups = by_time(images, which)
     times = sorted(groups)
     parts = [scene.moves_as.at(time) for time in times]
     poses, trans, scale = (torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale"))
@@ -129,7 +131,7 @@ def fitted_to_images(
     counts: list[int] = []
     for row, time in enumerate(times):
         start = starts.select(torch.tensor([row], device="cpu"))
-        fit = _Fit(scene, start, time, background, options, tuple(images[i] for i in groups[time]), comparison)
+        fit = _Fit(scene, start, time, background, tuple(images[i] for i in groups[time]), comparison)
         correction, count = fit.fitted(found[-1] if found else None)
         found.append(correction)
         counts.append(count)
@@ -140,6 +142,15 @@ def fitted_to_images(
     return FittedPoses(scene.playing(exactly), tuple(counts))
 
 
+def by_time(images: ImageLoader, which: Collection[int] | None = None) -> dict[float, list[int]]:
+    """Return indices of images by their time; those without one are of time 0. ``which`` count, None: all."""
+    groups: dict[float, list[int]] = {}
+    for index, time in enumerate(images.times):
+        if which is None or index in which:
+            groups.setdefault(0.0 if time is None else time, []).append(index)
+    return groups
+
+
 @dataclass(frozen=True)
 class _Fit:
     """The fit of one pose."""
@@ -148,7 +159,6 @@ class _Fit:
     start: MotionClip  # the pose to begin with, a clip of one frame
     time: float  # of the images
     background: Tensor
-    options: RenderOptions
     images: tuple[Image, ...]  # V
     comparison: Comparison  # what of these counts
 
@@ -181,7 +191,7 @@ class _Fit:
         moments = [torch.zeros_like(x) for x in (now.turns, now.turns, now.shift, now.shift)]
         window = len(self.images) * math.ceil(WINDOW / len(self.images))
         before, update = math.inf, 0
-        for _ in range(MOST_WINDOWS):
+        for _ in range(self.comparison.most_windows or MOST_WINDOWS):
             total = 0.0
             for _ in range(window):
                 update += 1
@@ -212,7 +222,7 @@ class _Fit:
         moment = self.scene.in_pose(posing, self.time)
         losses = []
         for image in images:
-            drawn = self.scene.render(image.cameras, moment, options=self.options, background=self.background)
+            drawn = self.scene.render(image.cameras, moment, options=self.scene.options, background=self.background)
             losses.append(how.difference(drawn, image, self.background, shrink))
         size = how.turn_weight * correction.turns.square().mean() + how.shift_weight * correction.shift.square().mean()
         return torch.stack(losses).mean() + size

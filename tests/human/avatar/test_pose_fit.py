@@ -126,7 +126,7 @@ def images_of(scene: HumanScene, cameras: list[Cameras], times: list[float], mas
 
 
 def fitted(scene: HumanScene, images: list[Image], comparison: Comparison = IMAGES) -> FittedPoses:
-    return fitted_to_images(scene, cast(ImageLoader, Shown(images)), WHITE, scene.options, comparison)
+    return fitted_to_images(scene, cast(ImageLoader, Shown(images)), WHITE, comparison)
 
 
 def disturbed(scene: HumanScene) -> HumanScene:
