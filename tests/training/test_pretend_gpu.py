@@ -145,7 +145,7 @@ def test_how_often_the_host_waits_in_a_step(
     """
     kind, capture, more = CASES[name] if name != "static" else ("static", "still", STATIC)
     sizes = {"item": 2, "nonzero": 2} if name == "ngp" else {}
-    long = ("train.steps=40", *([] if sizes else ["strategy.kind=fixed"]))  # nothing but steps happens in those counted
+    long = ("train.steps=60", *([] if sizes else ["strategy.kind=fixed"]))  # nothing but steps happens in those counted
     config = config_of(kind, request.getfixturevalue(capture), *more, *long)
     with pretend_gpu() as gpu:
         monkeypatch.setattr("dyngs.kinds.device_for", lambda _: GPU)

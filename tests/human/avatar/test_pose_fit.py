@@ -8,10 +8,9 @@ from typing import cast
 
 import pytest
 import torch
-from torch import Tensor
+from posed_person import SIZE, WHITE, Shown, disturbed, images_of, joints_of, mean_psnr, person_and_cameras
 
 from dyngs.camera import Cameras
-from dyngs.config import Config, DataConfig, HumanModel, OptimConfig, RunConfig, TrainConfig
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.pose_fit import (
@@ -24,16 +23,9 @@ from dyngs.human.avatar.pose_fit import (
     fitted_to_images,
     shrunk,
 )
-from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import apply_transforms, joint_transforms
-from dyngs.human.template.joints import JOINT_NAMES
-from dyngs.kinds import assemble
-from dyngs.metrics import psnr
 from dyngs.models.renderable import Rendering
 
-WHITE = torch.ones(3)
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]]), 16, 12)
 
 
@@ -81,74 +73,13 @@ def test_shrinking_averages() -> None:
     torch.testing.assert_close(small[..., 0], torch.tensor([[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]))
 
 
-SIZE = 64
-MOVED = ("pelvis", "left_hip", "right_knee", "spine2", "left_shoulder", "right_shoulder", "left_elbow", "head")
-
-
-class Shown:
-    """Images in memory, as a loader has them."""
-
-    def __init__(self, images: list[Image]) -> None:
-        self._images = images
-        self.times = tuple(image.time for image in images)
-
-    def __getitem__(self, index: int) -> Image:
-        return self._images[index]
-
-
 @pytest.fixture(scope="module")
 def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
-    """A person of a few hundred Gaussians, which was not trained, and three cameras."""
-    config = Config(
-        data=DataConfig(root=person),
-        model=HumanModel(resolution=24, sh_degree=0),
-        optim=OptimConfig(),
-        train=TrainConfig(steps=10),
-        run=RunConfig(threads=1),
-    )
-    trainer = assemble(config)
-    assert isinstance(trainer.model.scene, HumanScene)
-    cameras = {tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.images)}
-    grow = torch.tensor([SIZE / 32, SIZE / 32, 1.0])[:, None]
-    larger = [Cameras(x.cam_from_world, grow * x.intrinsics, SIZE, SIZE) for x in cameras.values()]
-    return trainer.model.scene, larger
-
-
-def images_of(scene: HumanScene, cameras: list[Cameras], times: list[float], mask: Tensor | None = None) -> list[Image]:
-    found = []
-    for time in times:
-        for i, camera in enumerate(cameras):
-            with torch.no_grad():
-                drawn = scene.render(camera, time, background=torch.zeros(3))
-            rgb = drawn.rgb[0].clamp(0, 1)
-            found.append(Image(f"{time}_{i}", camera, rgb, drawn.alpha[0], mask, time))
-    return found
+    return person_and_cameras(person)
 
 
 def fitted(scene: HumanScene, images: list[Image], comparison: Comparison = IMAGES) -> FittedPoses:
     return fitted_to_images(scene, cast(ImageLoader, Shown(images)), WHITE, comparison)
-
-
-def disturbed(scene: HumanScene) -> HumanScene:
-    """The same person with some joints turned by 9 degrees about some axis, 3 cm from where it was."""
-    random = torch.Generator().manual_seed(2)
-    clip = scene.clip
-    rows = [JOINT_NAMES.index(name) for name in MOVED]
-    poses, away = clip.poses.clone(), torch.randn(len(clip), len(rows), 3, generator=random)
-    poses[:, rows] += 0.15 * away / away.norm(dim=2, keepdim=True)
-    return scene.playing(replace(clip, poses=poses, trans=clip.trans + torch.tensor([0.03, 0.0, 0.0])))
-
-
-def joints_of(scene: HumanScene, clip: MotionClip, row: int) -> Tensor:
-    posing, skeleton = frame_pose(clip, row), scene.learned_skeleton
-    moved = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
-    return posing.scale * apply_transforms(moved, skeleton.joints)[:22] + posing.trans
-
-
-def mean_psnr(scene: HumanScene, images: list[Image]) -> float:
-    with torch.no_grad():
-        drawn = [scene.render(x.cameras, x.time, background=WHITE).rgb[0] for x in images]
-    return sum(psnr(a, x.composite(WHITE)) for a, x in zip(drawn, images, strict=True)) / len(images)
 
 
 def test_disturbed_poses_are_found_again(

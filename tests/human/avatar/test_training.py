@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from synthetic_bodies import model, write_npz
@@ -217,3 +219,41 @@ def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_chan
     same_colour = (filled["gaussians.sh"] == plain["gaussians.sh"]).flatten(1).all(1)
     assert (seen[same_colour] > 0.9).all(), "what was seen keeps its colour, and nothing else does"
     assert 0 < float(seen[~same_colour].min()) < 0.5 < float(seen.max()) <= 1
+
+
+def turned(capture: Path, out: Path) -> Path:
+    """The same capture, in whose poses hips, knees, shoulders and elbows are turned by 23 degrees to either side."""
+    shutil.copytree(capture, out)
+    with np.load(out / "body_train.npz") as file:
+        body = dict(file)
+    poses = body["poses"].reshape(len(body["poses"]), -1, 3)
+    poses[:, [1, 2, 4, 5, 16, 17, 18, 19]] += np.random.default_rng(0).choice([-0.4, 0.4], (len(poses), 8, 3))
+    np.savez(out / "body_train.npz", **body | {"poses": poses.reshape(len(poses), -1)})
+    return out
+
+
+def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(capture: Path, tmp_path: Path) -> None:
+    config = tiny(turned(capture, tmp_path / "turned"), steps=40, refine_from=0.1)
+    trainer = assemble(config)
+    lines = [trainer.step().finding or "" for _ in range(16)]
+    assert "poses are fitted to the images again" in lines[9]
+    assert "".join(lines[:9] + lines[10:]) == ""
+    straight = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
+    given = assemble(config).checkpoint().tensors["model.clip.poses"]
+    assert (straight["model.clip.poses"] != given).flatten(1).any(1).all(), "every frame"
+    first = assemble(config)
+    tensors_after(first, 11)
+    second = assemble(config)
+    second.restore(first.checkpoint())
+    assert same(straight, tensors_after(second, 5))
+
+
+@pytest.mark.parametrize("changes", [{"refine": False}, {"minutes": 1.0}])
+def test_poses_stay_on_request_and_in_previews(capture: Path, tmp_path: Path, changes: dict[str, object]) -> None:
+    minutes = changes.pop("minutes", None)
+    config = tiny(turned(capture, tmp_path / "turned"), steps=40, refine_from=0.1, **changes)
+    config = config.model_copy(update={"train": config.train.model_copy(update={"minutes": minutes})})
+    trainer = assemble(config)
+    given = human(trainer).clip.poses.clone()
+    assert all(trainer.step().finding is None for _ in range(12))
+    assert torch.equal(human(trainer).clip.poses, given)
