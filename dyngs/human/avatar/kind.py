@@ -57,7 +57,7 @@ def start(run: RunStart) -> GaussianModel:
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
     outlines = None if colours.network is not None else outline_loss(run)
     behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
-    refit = PoseRefit(run.images, behind) if model.refine and config.train.minutes is None else None
+    refit = PoseRefit(run.images, behind, config.train.steps) if model.refine and config.train.minutes is None else None
     training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines, refit)
     lit = model.light and model.refine and colours.network is None
     scene = training.first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)

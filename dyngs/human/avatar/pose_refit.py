@@ -1,6 +1,7 @@
 """Poses of training fitted again, in the middle of it, to its images: silhouettes place limbs less well than colours.
 
-Poses that were given well gain little, so it is tried first, at a few time steps, on views that are left out.
+The better the poses, the sharper the avatar, and the better it places limbs: so it is done a few times. Poses that were
+given well gain little: each time it is tried first, at a few time steps, on views that are left out.
 """
 
 from __future__ import annotations
@@ -13,28 +14,51 @@ from torch import Tensor
 
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.human.avatar.pose_fit import IMAGES, by_time, fitted_to_images
+from dyngs.human.avatar.pose_fit import FIRST_RATES, IMAGES, WINDOW, by_time, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.metrics import psnr
 
 TRIED = 3  # time steps at which a view is left out
 LEAST_GAIN = 0.5  # mean of its PSNR in the person's box, dB, from which all poses are fitted
-QUICKLY = replace(IMAGES, most_windows=3)  # training goes on with what is found
+STARTS = (0.25, 0.45, 0.65)  # fractions of the run after which poses are fitted, one after each step
+MOST_WINDOWS = 6  # of each round of a fit: training goes on with what is found
 
 
 class PoseRefit:
-    """What poses are fitted to: the training ``images``, and the colour ``background`` (3,) behind person and render.
+    """When and to what poses are fitted in a run of ``steps``.
 
-    Only time steps with two images or more are fitted: one hides how far limbs reach towards the camera.
+    To the training ``images``, with the colour ``background`` (3,) behind person and render. Only time steps with two
+    images or more are fitted: one hides how far limbs reach towards the camera.
+
+    Attributes:
+        goes_on: whether views gained when poses were fitted last.
     """
 
-    def __init__(self, images: ImageLoader, background: Tensor) -> None:
+    goes_on = True
+
+    def __init__(self, images: ImageLoader, background: Tensor, steps: int) -> None:
         self._images, self._background = images, background
         self._groups = [sorted(group) for _, group in sorted(by_time(images).items())]
+        self._starts = [round(start * steps) for start in STARTS]
+        few = steps // (len(FIRST_RATES) * WINDOW * len(self._groups))  # as many updates as the run has, at most
+        self._comparison = replace(IMAGES, most_windows=min(max(few, 1), MOST_WINDOWS))
 
     def suits(self, scene: HumanScene) -> bool:
         """Return whether each row of the clip of training has images of its own, and some have two or more."""
         return len(self._groups) == len(scene.clip) and any(map(self._is_fitted, range(len(scene.clip))))
+
+    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, str] | None:
+        """Return the scene as it is after ``step``, and a line if that was decided; None: nothing is to do."""
+        since = [step - start for start in self._starts if start <= step]
+        if not self.goes_on or not since or since[-1] > len(self._groups) or not self.suits(scene):
+            return None
+        scene.changed()
+        if since[-1] > 0:
+            return self.refitted(scene, since[-1] - 1), ""
+        gain = self.gain(scene)
+        self.goes_on = gain >= LEAST_GAIN
+        decided = "are fitted to the images again" if self.goes_on else "stay, but for what is learned"
+        return scene, f"poses {decided}: views left out of such a fit gain {gain:.1f} dB in the person's box"
 
     def gain(self, scene: HumanScene) -> float:
         """Return by how many dB views gain, in the person's box, from poses fitted to the others of their time."""
@@ -66,7 +90,7 @@ class PoseRefit:
 
     def _fitted(self, scene: HumanScene, which: list[int]) -> HumanScene:
         still = replace(scene, gaussians=scene.gaussians.detach())
-        return fitted_to_images(still, self._images, self._background, QUICKLY, which).scene
+        return fitted_to_images(still, self._images, self._background, self._comparison, which).scene
 
     @torch.no_grad()
     def _psnr(self, scene: HumanScene, index: int) -> float:

@@ -23,7 +23,7 @@ from dyngs.human.avatar.loose import hold_of, nodes_on, training_noise
 from dyngs.human.avatar.neighbours import HARDLY, filled, linked_neighbours, mirror_images, sightings, strains, trust_in
 from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.outlines import OutlineLoss
-from dyngs.human.avatar.pose_refit import LEAST_GAIN, PoseRefit
+from dyngs.human.avatar.pose_refit import PoseRefit
 from dyngs.human.avatar.posing import BodyPose, difference_of_sides
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.ops.adam import Count
@@ -64,7 +64,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
-        self._refit, self._refits = refit, False
+        self._refit = refit
 
     def first_scene(self, gaussians: Gaussians, subject: Subject, normals: Tensor | None = None) -> HumanScene:
         """Return the scene of the first Gaussians: nothing is learned yet; light only with their ``normals`` (N, 3)."""
@@ -119,16 +119,14 @@ class HumanTraining(SceneTraining[HumanScene]):
     def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene, and after the last step new values for what the images hardly show.
 
-        After the first step with a line about outlines, if there is one. When poses of single frames begin to be
-        learned, they may be fitted again, one after each step.
+        After the first step with a line about outlines, if there is one. In between poses may be fitted again.
         """
         if step == 1 and self._finding is not None:
             return scene, EditResult(None, finding=self._finding)
         if step == self.rates.steps:
             return self._filled(scene, step) if self.options.fill_unseen and self.views and len(scene) else None
-        if self._refit is not None and self._refines(step) and 0 <= step - self.frames_from <= len(scene.clip):
-            return self._with_fitted_poses(scene, self._refit, step)
-        return None
+        found = None if self._refit is None else self._refit.revised(scene, step)
+        return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
 
     def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
         shown = [self.views[i] for i in evenly_spaced(len(self.views), LOOKS)]
@@ -150,31 +148,20 @@ class HumanTraining(SceneTraining[HumanScene]):
         finding = line if hardly >= WORTH_TELLING else None
         return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
 
-    def _with_fitted_poses(self, scene: HumanScene, refit: PoseRefit, step: int) -> tuple[HumanScene, EditResult]:
-        scene.changed()
-        row = step - self.frames_from - 1
-        if row >= 0:
-            return refit.refitted(scene, row) if self._refits else scene, EditResult(None)
-        if not refit.suits(scene):
-            return scene, EditResult(None)
-        gain = refit.gain(scene)
-        self._refits = gain >= LEAST_GAIN
-        decided = "are fitted to the images again" if self._refits else "stay as they are, but for what is learned"
-        line = f"poses {decided}: views left out of such a fit gain {gain:.1f} dB in the person's box"
-        return scene, EditResult(None, finding=line)
-
     def follow(self, edit: TopologyEdit) -> None:
         """Find out anew who the neighbours are, and what they weigh."""
         self._given_weights = self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self._near, self._given_weights, self._images = tensors.get("near"), None, None
-        self._refits = "refits" in tensors
+        if self._refit is not None:
+            self._refit.goes_on = "poses_stay" not in tensors
         return HumanScene.restored(gaussians, tensors)
 
     def state(self) -> State:
         kept = {} if self._near is None else {"near": self._near}
-        kept |= {"refits": torch.ones(1, device="cpu")} if self._refits else {}
+        if self._refit is not None and not self._refit.goes_on:
+            kept["poses_stay"] = torch.ones(1, device="cpu")
         return with_role(kept, Role.TRAINING)
 
     def _in_frame(

@@ -25,6 +25,7 @@ from dyngs.config import (
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
+from dyngs.human.avatar import pose_refit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.joints import mirrored_joints
@@ -232,8 +233,11 @@ def turned(capture: Path, out: Path) -> Path:
     return out
 
 
-def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(capture: Path, tmp_path: Path) -> None:
-    config = tiny(turned(capture, tmp_path / "turned"), steps=40, refine_from=0.1)
+def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240,))
+    config = tiny(turned(capture, tmp_path / "turned"), steps=240, refine_from=0.1)
     trainer = assemble(config)
     lines = [trainer.step().finding or "" for _ in range(16)]
     assert "poses are fitted to the images again" in lines[9]
@@ -249,11 +253,26 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(captu
 
 
 @pytest.mark.parametrize("changes", [{"refine": False}, {"minutes": 1.0}])
-def test_poses_stay_on_request_and_in_previews(capture: Path, tmp_path: Path, changes: dict[str, object]) -> None:
+def test_poses_stay_on_request_and_in_previews(
+    capture: Path, tmp_path: Path, changes: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240,))
     minutes = changes.pop("minutes", None)
-    config = tiny(turned(capture, tmp_path / "turned"), steps=40, refine_from=0.1, **changes)
+    config = tiny(turned(capture, tmp_path / "turned"), steps=240, refine_from=0.1, **changes)
     config = config.model_copy(update={"train": config.train.model_copy(update={"minutes": minutes})})
     trainer = assemble(config)
     given = human(trainer).clip.poses.clone()
     assert all(trainer.step().finding is None for _ in range(12))
     assert torch.equal(human(trainer).clip.poses, given)
+
+
+def test_poses_that_views_gain_nothing_from_stay_for_good(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pose_refit, "STARTS", (10 / 240, 14 / 240))
+    trainer = assemble(tiny(capture, steps=240))
+    given = human(trainer).clip.poses.clone()
+    lines = [trainer.step().finding or "" for _ in range(12)]
+    assert lines[9].startswith("poses stay")
+    resumed = assemble(tiny(capture, steps=240))
+    resumed.restore(trainer.checkpoint())
+    assert all(resumed.step().finding is None for _ in range(4)), "it is not tried again"
+    assert torch.equal(human(resumed).clip.poses, given)

@@ -1,0 +1,68 @@
+"""Poses of training fitted again: wrong ones gain and come nearer to the truth, right ones do not gain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import pytest
+import torch
+from posed_person import WHITE, Shown, disturbed, images_of, joints_of, person_and_cameras
+
+from dyngs.camera import Cameras
+from dyngs.data.loader import ImageLoader
+from dyngs.human.avatar.pose_refit import LEAST_GAIN, PoseRefit
+from dyngs.human.avatar.scene import HumanScene
+
+
+@pytest.fixture(scope="module")
+def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
+    return person_and_cameras(person)
+
+
+def refit_to(scene: HumanScene, cameras: list[Cameras]) -> PoseRefit:
+    return PoseRefit(cast(ImageLoader, Shown(images_of(scene, cameras, list(scene.times)))), WHITE, 400)
+
+
+def trained_on(scene: HumanScene) -> HumanScene:
+    """The same person whose clip of training is the one with turned joints, and some corrections of it."""
+    clip = disturbed(scene).played
+    assert clip is not None
+    copied = scene.learned.restored({name: x.tensor for name, x in scene.learned.state().items()})
+    return replace(scene, clip=clip, learned=copied)
+
+
+def test_views_left_out_gain_from_wrong_poses_only(truth: tuple[HumanScene, list[Cameras]]) -> None:
+    scene, cameras = truth
+    refit = refit_to(scene, cameras)
+    assert refit.suits(scene)
+    assert abs(refit.gain(scene)) < LEAST_GAIN
+    assert refit.gain(trained_on(scene)) > LEAST_GAIN + 1
+
+
+def test_one_row_comes_nearer_to_the_truth_and_all_else_stays(truth: tuple[HumanScene, list[Cameras]]) -> None:
+    scene, cameras = truth
+    start = trained_on(scene)
+    with torch.no_grad():
+        start.learned["poses"].fill_(0.01)
+        start.learned["trans"].fill_(0.002)
+    true = joints_of(scene, scene.moves_as, 1)
+    before = float((joints_of(start, start.moves_as, 1) - true).norm(dim=1).mean())
+    found = refit_to(scene, cameras).refitted(start, 1)
+    after = float((joints_of(found, found.moves_as, 1) - true).norm(dim=1).mean())
+    assert after < 0.6 * before
+    for name in ("poses", "trans"):
+        assert torch.equal(getattr(found.clip, name)[::2], getattr(start.clip, name)[::2])
+        assert not torch.equal(getattr(found.clip, name)[1], getattr(start.clip, name)[1])
+        assert found.learned[name].abs().amax(-1)[1].max() == 0
+        assert found.learned[name][::2].abs().min() > 0
+    assert found.gaussians is start.gaussians
+
+
+def test_one_view_of_each_time_does_not_suit(truth: tuple[HumanScene, list[Cameras]]) -> None:
+    scene, cameras = truth
+    alone = refit_to(scene, cameras[:1])
+    assert not alone.suits(scene)
+    assert alone.refitted(scene, 0) is scene
+    assert not refit_to(scene, cameras).suits(replace(scene, clip=scene.clip.select(torch.tensor([0, 1]))))
