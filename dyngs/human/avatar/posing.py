@@ -15,7 +15,7 @@ from dyngs.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.anchors import Anchors
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import joint_transforms
+from dyngs.human.pose.skinning import apply_transforms, joint_transforms
 from dyngs.human.template.body import BodyTemplate
 from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
@@ -167,3 +167,9 @@ def frame_pose(clip: MotionClip, row: int) -> BodyPose:
     """Return the pose of one frame of a clip."""
     past = None if clip.past is None else clip.past[row]
     return BodyPose(clip.rotations[row], clip.trans[row], clip.scale[row], past)
+
+
+def posed_joints(skeleton: Skeleton, pose: BodyPose) -> Tensor:
+    """Return the joints (J, 3) in the world."""
+    moves = joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
+    return pose.scale * apply_transforms(moves, skeleton.joints) + pose.trans

@@ -17,10 +17,10 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
 from dyngs.human.avatar.corrections import SharedCorrection, corrected_clip
-from dyngs.human.avatar.posing import BodyPose, Skeleton
+from dyngs.human.avatar.posing import BodyPose, posed_joints
 from dyngs.human.fit.silhouettes import ObservedFrame, ShapedSurface, Surface, drawn_silhouettes
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.pose.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
+from dyngs.human.pose.skinning import axis_angle_to_matrix
 from dyngs.human.template.body import NUM_BONE_SHAPES
 from dyngs.human.template.joints import JOINT_NAMES, SMPLX_ROWS
 
@@ -186,12 +186,6 @@ def frame_pose_of(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
     scale = clip.scale[row] * learned["log_scale"][0].exp()
     away = learned["shift"] + learned["trans"][row] + scale * (turned[0] @ learned["offset"])
     return BodyPose(torch.cat([turned, given[len(own) :]]), clip.trans[row] + away, scale)
-
-
-def posed_joints(skeleton: Skeleton, pose: BodyPose) -> Tensor:
-    """Return the joints (J, 3) in the world."""
-    moves = joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
-    return pose.scale * apply_transforms(moves, skeleton.joints) + pose.trans
 
 
 def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 from dyngs.camera import Cameras
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.times import evenly_spaced
+from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface
 from dyngs.human.fit.solve import (
     NUM_TURNED,
@@ -24,7 +25,6 @@ from dyngs.human.fit.solve import (
     keypoint_error,
     mean_error,
     new_fit,
-    posed_joints,
     prior,
     usual,
     usual_pose,

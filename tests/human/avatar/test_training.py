@@ -252,13 +252,12 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     assert same(straight, tensors_after(second, 5))
 
 
-@pytest.mark.parametrize("changes", [{"refine": False}, {"minutes": 1.0}])
+@pytest.mark.parametrize(("refine", "minutes"), [(False, None), (True, 1.0)])
 def test_poses_stay_on_request_and_in_previews(
-    capture: Path, tmp_path: Path, changes: dict[str, object], monkeypatch: pytest.MonkeyPatch
+    capture: Path, tmp_path: Path, refine: bool, minutes: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pose_refit, "STARTS", (10 / 240,))
-    minutes = changes.pop("minutes", None)
-    config = tiny(turned(capture, tmp_path / "turned"), steps=240, refine_from=0.1, **changes)
+    config = tiny(turned(capture, tmp_path / "turned"), steps=240, refine_from=0.1, refine=refine)
     config = config.model_copy(update={"train": config.train.model_copy(update={"minutes": minutes})})
     trainer = assemble(config)
     given = human(trainer).clip.poses.clone()

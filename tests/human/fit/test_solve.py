@@ -10,6 +10,7 @@ import torch
 
 from dyngs.camera import Cameras
 from dyngs.gaussians.parameters import Parameters
+from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.fit import solve
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
 from dyngs.human.fit.solve import (
@@ -29,7 +30,6 @@ from dyngs.human.fit.solve import (
     near_given,
     new_fit,
     place_error,
-    posed_joints,
     prior,
     refined,
     silhouette_error,

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dyngs.camera import Cameras
+from dyngs.human.avatar.posing import posed_joints
 from dyngs.human.fit.silhouettes import ObservedFrame, Surface, surface_of
-from dyngs.human.fit.solve import drawn_frame, frame_pose_of, new_fit, posed_joints, usual_pose
+from dyngs.human.fit.solve import drawn_frame, frame_pose_of, new_fit, usual_pose
 from dyngs.human.fit.start import (
     NUM_HEADINGS,
     PELVIS_FRACTION,
