@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from moving_scene import camera
-from tiny_field_people import field_config, field_people
 from tiny_people import NET, people, person
-from tiny_stereo import stereo_config, stereo_people
 from toy_kind import registered
 
 from dyngs.config import Config, ModelSection
@@ -20,22 +17,12 @@ from dyngs.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.prediction.learner import PersonPredictor, new_network
 from dyngs.kinds import build, restored_model
-from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import KINDS, kind_of
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
+from dyngs.models.kind import KINDS, Kind, kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.state import Role
 from dyngs.training.trainer import Trainer
-
-
-def people_config(folder: Path) -> Config:
-    values = {"data": {"root": people(folder, (1,))}, "model": NET.model_dump(), "train": {"steps": 3}}
-    return Config.model_validate(json.loads(json.dumps(values, default=str)))
-
-
-def stereo_config_of(folder: Path) -> Config:
-    return stereo_config(stereo_people(folder / "set"), folder / "run")
-
 
 TRAINED = {
     "static": ("still", ["init.num_random=40"]),
@@ -50,12 +37,8 @@ TRAINED = {
     "toy": ("still", []),
 }
 """Fixture with a capture for each kind that is trained on one, and other keys of a small run."""
-NETWORKS: dict[str, Callable[[Path], Config]] = {
-    "human_predictor": people_config,
-    "gps": stereo_config_of,
-    "keypoint_nerf": lambda folder: field_config("keypoint_nerf", field_people(folder / "set"), folder / "run"),
-    "eg_human_nerf": lambda folder: field_config("eg_human_nerf", field_people(folder / "set"), folder / "run"),
-}
+NETWORKS = {"human_predictor", "gps", "keypoint_nerf", "eg_human_nerf"}
+"""Kinds that predict scenes: tests of training.prediction, gps.learner and human_fields.learner resume them."""
 PREDICTED = {"predicted_field"}
 """Kinds that are not trained: tests/human_fields/test_scene.py."""
 
@@ -66,7 +49,7 @@ def toy() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(params=sorted(TRAINED))
+@pytest.fixture(scope="module", params=sorted(TRAINED))
 def config(request: pytest.FixtureRequest) -> Config:
     """Of a small run of a kind."""
     capture, keys = TRAINED[request.param]
@@ -75,12 +58,19 @@ def config(request: pytest.FixtureRequest) -> Config:
     return load_config(None, [*common, *keys])
 
 
-def trained(config: Config, steps: int) -> Trainer:
+def trained(config: Config) -> Trainer:
+    """After four steps."""
     trainer = build(config)
     assert isinstance(trainer, Trainer)
-    for _ in range(steps):
+    for _ in range(4):
         trainer.step()
     return trainer
+
+
+@pytest.fixture(scope="module")
+def trainer(config: Config) -> Trainer:
+    """Of tests that leave it as it is."""
+    return trained(config)
 
 
 def same(one: Checkpoint, other: Checkpoint) -> bool:
@@ -89,7 +79,7 @@ def same(one: Checkpoint, other: Checkpoint) -> bool:
 
 
 def test_every_kind_is_here() -> None:
-    known = TRAINED.keys() | NETWORKS.keys() | PREDICTED
+    known = TRAINED.keys() | NETWORKS | PREDICTED
     assert {kind.section.model_fields["kind"].default for kind in KINDS} | {"toy"} == known
     for kind in KINDS:
         assert kind_of(kind.section()) is kind
@@ -98,7 +88,7 @@ def test_every_kind_is_here() -> None:
 
 def test_it_is_trained_stored_and_restored(config: Config) -> None:
     """What a checkpoint holds is taken over as it is, and training goes on with the same bytes."""
-    trainer = trained(config, 4)
+    trainer = trained(config)
     first, again = trainer.checkpoint(), build(config, restored=True)
     assert isinstance(again, Trainer)
     again.restore(first)
@@ -112,8 +102,7 @@ def test_it_is_trained_stored_and_restored(config: Config) -> None:
     assert state.keys() >= trainer.model.scene.state().keys()
 
 
-def test_its_scene_is_restored_and_drawn(config: Config) -> None:
-    trainer = trained(config, 4)
+def test_its_scene_is_restored_and_drawn(config: Config, trainer: Trainer) -> None:
     scene, own = restored_model(trainer.checkpoint(), config.model), trainer.model.scene
     assert isinstance(scene, Renderable)
     assert scene.state().keys() == own.state().keys()
@@ -135,8 +124,8 @@ def test_its_scene_is_restored_and_drawn(config: Config) -> None:
         scene.time_step(float("nan"))
 
 
-def test_its_scene_says_when_and_where_it_is(config: Config) -> None:
-    scene = trained(config, 4).model.scene
+def test_its_scene_says_when_and_where_it_is(trainer: Trainer) -> None:
+    scene = trainer.model.scene
     assert list(scene.times) == sorted(set(scene.times))
     assert all(0 <= time <= 1 for time in scene.times)
     low, high = scene.bounds
@@ -152,8 +141,8 @@ def test_its_scene_says_when_and_where_it_is(config: Config) -> None:
         assert scene.is_static == all(torch.equal(seen, scene.render(view, time).rgb) for time in (0.5, 1.0))
 
 
-def test_only_what_is_made_of_gaussians_passes_for_that(config: Config) -> None:
-    scene = trained(config, 1).model.scene
+def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer: Trainer) -> None:
+    scene = trainer.model.scene
     if config.model.made_of_gaussians:
         assert require_gaussians(scene, "it") is scene
         return
@@ -162,19 +151,10 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config) -> None:
         require_gaussians(scene, "it")
 
 
-@pytest.mark.parametrize("name", sorted(NETWORKS))
-def test_a_network_is_trained_stored_and_restored(tmp_path: Path, name: str) -> None:
-    """It is no scene, but predicts one."""
-    config = NETWORKS[name](tmp_path)
-    assert config.model.kind == name
-    trainer, again = build(config), build(config, restored=True)
-    trainer.step()
-    first = trainer.checkpoint()
-    again.restore(first)
-    assert same(first, again.checkpoint())
-    assert again.step().loss == trainer.step().loss
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.section.model_fields["kind"].default in NETWORKS])
+def test_a_network_is_no_scene_but_predicts_one(kind: Kind) -> None:
     with pytest.raises(DyngsError, match="a network, not a scene"):
-        restored_model(first, config.model)
+        restored_model(Checkpoint(CheckpointInfo(1, 1.0, (0.0, 0.0, 0.0), "white", "classic"), {}), kind.section())
 
 
 def test_a_predictor_makes_a_scene_of_views(tmp_path: Path) -> None:
