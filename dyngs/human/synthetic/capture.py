@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.human.synthetic.clips import random_clip, squat, walk
 from dyngs.human.synthetic.clothes import (
+    Outfit,
     dress_body,
     paint_texture,
     random_outfit,
@@ -93,6 +95,11 @@ class PosedMesh:
     uv_faces: np.ndarray  # (T, 3) int64 into ``uv``
     texture: np.ndarray  # (S, S, 3) sRGB values in [0, 1]
 
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Unit normals (M, 3) at the vertices, the same for all cameras."""
+        return vertex_normals(self.vertices, self.faces)
+
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
     """Write images of a walking person in the layout that ``dyngs.data.readers.blender`` reads; returns ``out``.
@@ -106,8 +113,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     if min(options.num_new, options.num_test, options.seed) < 0:
         raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
     body, betas = _person(options.body_seed)
-    outfit = random_outfit(options.seed, options.usual_clothes)
-    clothed, texture = dress_body(body, outfit), paint_texture(body, outfit)
+    outfit, clothed, texture = _dressed(options.body_seed, options.seed, options.usual_clothes)
     train, test = _cameras(options)
     seed, lengths = options.clip_seed, {"train": options.num_frames}
     if options.num_new and test:
@@ -228,6 +234,13 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
     return replace(body, vertices=vertices, joints=joints), betas
 
 
+@lru_cache(maxsize=4)  # several captures of a person, of other clips or cameras, are painted once
+def _dressed(body_seed: int | None, seed: int, usual_clothes: bool) -> tuple[Outfit, BodyTemplate, np.ndarray]:
+    """Return clothes, the template with them on, and its texture (S, S, 3)."""
+    (body, _), outfit = _person(body_seed), random_outfit(seed, usual_clothes)
+    return outfit, dress_body(body, outfit), paint_texture(body, outfit)
+
+
 def random_light(seed: int | None) -> Lamp:
     """Return the light of ``seed``, from any side and above, of which three quarters to all reach a white surface that
     faces it; None: ``Lamp()``."""
@@ -252,12 +265,11 @@ def render_mesh(
     behind it.
     """
     image = _image_of(mesh.vertices, world_from_cam, size)
-    normals = vertex_normals(mesh.vertices, mesh.faces)
-    sums = np.zeros((size * size, 4))
+    corners, sums = image[mesh.faces], np.zeros((size * size, 4))
     for k in range(samples * samples):
         sample = np.array([(k % samples + 0.5) / samples, (k // samples + 0.5) / samples, 0.0])
-        fragments = rasterize((image - sample)[mesh.faces], size, size)
-        sums[fragments.index, :3] += _shaded(mesh, normals, fragments, light)
+        fragments = rasterize(corners - sample, size, size)
+        sums[fragments.index, :3] += _shaded(mesh, fragments, light)
         sums[fragments.index, 3] += 1.0
     rgb = sums[:, :3] / np.maximum(sums[:, 3:], 1.0)
     return np.concatenate([rgb, sums[:, 3:] / samples**2], axis=1).reshape(size, size, 4)
@@ -358,9 +370,9 @@ def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _shaded(mesh: PosedMesh, normals: np.ndarray, fragments: Fragments, light: Lamp) -> np.ndarray:
+def _shaded(mesh: PosedMesh, fragments: Fragments, light: Lamp) -> np.ndarray:
     uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
-    normal = normalized(interpolate(fragments.barycentric, normals[mesh.faces[fragments.faces]]))
+    normal = normalized(interpolate(fragments.barycentric, mesh.normals[mesh.faces[fragments.faces]]))
     facing = np.maximum(normal @ normalized(np.array(light.towards)), 0.0)
     received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
     return np.minimum(_sampled(mesh.texture, uv) * received, 1.0)

@@ -27,12 +27,12 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     Triangles without area cover nothing; edges belong to both sides.
     """
     x, y, near = np.ascontiguousarray(corners.transpose(2, 1, 0))
-    (x0, x1, x2), (y0, y1, y2) = x, y
+    (left, across), (top, down) = _span(x, width), _span(y, height)
+    some = np.flatnonzero(across * down)  # of small images most triangles have no grid point at all
+    (x0, x1, x2), (y0, y1, y2), left, across, top, down = (v[..., some] for v in (x, y, left, across, top, down))
     area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
-    left, across = _span(x, width)
-    top, down = _span(y, height)
     counts = np.where(area != 0, across * down, 0)
-    owner = np.repeat(np.arange(len(corners)), counts)
+    owner = np.repeat(np.arange(len(some)), counts)
     within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     column, row = left[owner] + within % across[owner], top[owner] + within // across[owner]
     right, below = column - x0[owner], row - y0[owner]
@@ -40,7 +40,7 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     third = ((x1 - x0)[owner] * below - (y1 - y0)[owner] * right) / area[owner]
     barycentric = np.stack([1.0 - second - third, second, third])
     inside = barycentric.min(axis=0) >= -1e-9  # with a margin, so that no gaps open between neighbours
-    barycentric, owner, index = barycentric[:, inside], owner[inside], (row * width + column)[inside]
+    barycentric, owner, index = barycentric[:, inside], some[owner[inside]], (row * width + column)[inside]
     barycentric = barycentric * near[:, owner]
     inverse = barycentric.sum(axis=0)
     nearest = np.zeros(width * height)
