@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -315,12 +315,25 @@ def template_path(model: HumanModel) -> Path:
 
 
 def load_template(model: HumanModel) -> BodyTemplate:
-    """Read the template that ``model`` names, or the free one. Raises DyngsError: the file cannot be read."""
+    """Read the template that ``model`` names, or the free one; files once, as a command asks several times.
+
+    Raises DyngsError: a file cannot be read.
+    """
     if model.body is None and model.uv is None:
         return default_template()
     if model.body is None:
         raise DyngsError(f"model.uv={model.uv} goes with model.body; the free template has its own texture coordinates")
-    return read_body(model.body, model.uv)
+    try:
+        found = [path.stat() for path in (model.body, model.uv) if path is not None]
+    except OSError:
+        return read_body(model.body, model.uv)  # says which is missing
+    return _read_once(model.body, model.uv, tuple((x.st_ino, x.st_size, x.st_mtime_ns) for x in found))
+
+
+@lru_cache(maxsize=1)
+def _read_once(body: Path, uv: Path | None, state: tuple[tuple[int, int, int], ...]) -> BodyTemplate:
+    """Return the template of files that are in a ``state``: where it is another, they are read again."""
+    return read_body(body, uv)
 
 
 def has_same_shapes(body: BodyTemplate, given: BodyFrames) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,16 +34,22 @@ from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.human.template.body_reader import load_template, rest_shape
 
 
-@pytest.fixture
-def data(tmp_path: Path, short_fits: None) -> DataConfig:
-    """A small capture, an empty cache, and fits of two steps."""
-    options = HumanOptions(size=64, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1, body_seed=3)
-    root = write_human_capture(tmp_path / "person", options)
+@pytest.fixture(scope="module")
+def person_of_zeros(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small capture whose poses are said to be for the mean shape of another template."""
+    options = HumanOptions(size=32, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1, body_seed=3)
+    root = write_human_capture(tmp_path_factory.mktemp("fit") / "person", options)
     for name in ("train", "pose"):
         arrays = dict(np.load(root / f"body_{name}.npz"))
         arrays |= {"betas": np.zeros(10), "surface_model_type": np.array("smplx")}
         np.savez(root / f"body_{name}.npz", **arrays)
-    return DataConfig(root=root)
+    return root
+
+
+@pytest.fixture
+def data(person_of_zeros: Path, tmp_path: Path, short_fits: None) -> DataConfig:
+    """A copy of it, an empty cache, and fits of two steps."""
+    return DataConfig(root=Path(shutil.copytree(person_of_zeros, tmp_path / "person")))
 
 
 def test_a_capture_is_fitted_once(data: DataConfig) -> None:

@@ -433,6 +433,14 @@ def test_a_body_file_is_read(tmp_path: Path) -> None:
     assert found.name == "smplx"
 
 
+def test_files_are_read_again_only_when_they_have_changed(tmp_path: Path) -> None:
+    named = HumanModel(body=write_npz(tmp_path / "x.npz", model("smpl", seed=1)))
+    first = load_template(named)
+    assert load_template(named) is first
+    write_npz(tmp_path / "x.npz", model("smpl", seed=2))
+    assert not torch.equal(load_template(named).vertices, first.vertices)
+
+
 def test_texture_coordinates_alone_are_an_error() -> None:
     with pytest.raises(DyngsError, match=r"goes with model\.body"):
         load_template(HumanModel(uv=Path("smplx_uv.obj")))
