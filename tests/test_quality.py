@@ -136,9 +136,9 @@ def test_what_moves_before_fixed_cameras_is_trained_as_moving(
 
 
 def test_the_command_trains_the_same_bytes_as_python(still_life: Captured) -> None:
-    keys = still_life.keys("by_command", "train.steps=100")
+    keys = still_life.keys("by_command", "train.steps=20")
     assert main(["train", "static", *keys]) == 0
-    by_python = dyngs.train(dyngs.load_config("static", still_life.keys("by_python", "train.steps=100")))
+    by_python = dyngs.train(dyngs.load_config("static", still_life.keys("by_python", "train.steps=20")))
     assert checkpoint_bytes(still_life.root / "by_command") == checkpoint_bytes(by_python)
 
 

@@ -258,7 +258,7 @@ def write_rolling_ball(root: Path) -> None:
         Image.fromarray((255 * rgba).round().byte().numpy()).save(view.image_path)
 
 
-@pytest.mark.parametrize(("moves", "steps"), [(True, 300), (False, 300)])
+@pytest.mark.parametrize(("moves", "steps"), [(True, 200), (False, 300)])
 def test_never_worse_than_static(moves: bool, steps: int, tmp_path: Path) -> None:
     """Real small runs: motion wins where something moves, the static model where nothing does."""
     root, keys = tmp_path / "capture", ["init.num_random=200", "model.num_random_moving=60"]

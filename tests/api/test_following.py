@@ -23,7 +23,7 @@ from dyngs.config import (
 )
 from dyngs.errors import DyngsError
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint
+from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, load_checkpoint
 from dyngs.training.processes import Processes
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=5, max_gaussians=150)
@@ -56,10 +56,10 @@ def _person(capture: Path, run: Path, batch: int) -> Config:
 
 
 def _require_same_bytes(one: Path, other: Path) -> None:
-    first, second = latest_checkpoint(one), latest_checkpoint(other)
-    assert first.info == second.info
-    assert first.tensors.keys() == second.tensors.keys()
-    assert [name for name, x in first.tensors.items() if not torch.equal(x, second.tensors[name])] == []
+    first, second = (checkpoint_paths(run)[-1] for run in (one, other))
+    tensors = [load_checkpoint(path).tensors for path in (first, second)]
+    assert [name for name, x in tensors[0].items() if not torch.equal(x, tensors[1][name])] == []
+    assert first.read_bytes() == second.read_bytes()
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import random
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -37,8 +35,6 @@ from dyngs.runs.checkpoint import (
     seconds_at,
 )
 from dyngs.storage.tensors import drawable
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 def _checkpoint(step: int) -> Checkpoint:
@@ -120,20 +116,6 @@ def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
         assert x.dtype == loaded.tensors[name].dtype
         assert torch.equal(x, loaded.tensors[name])
     assert loaded.part("sampler").keys() == {"order"}
-
-
-def test_equal_checkpoints_have_equal_bytes_in_any_process(tmp_path: Path) -> None:
-    folders = [str(REPOSITORY / "tests"), str(REPOSITORY / "tests" / "runs")]
-    code = (
-        f"import sys; from pathlib import Path; sys.path[:0] = {folders!r}\n"
-        "from test_checkpoint import _checkpoint; from dyngs.runs.checkpoint import save_checkpoint\n"
-        "save_checkpoint(Path(sys.argv[1]), _checkpoint(7), 99.0)"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path / "other")]
-    # Not from the repository: its source folder would hide the installed package.
-    subprocess.run(command, check=True, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "1"})
-    mine = save_checkpoint(tmp_path / "mine", _checkpoint(7), 1.0)
-    assert mine.read_bytes() == checkpoint_paths(tmp_path / "other")[0].read_bytes()
 
 
 def test_only_the_last_two_are_kept_with_their_times(tmp_path: Path) -> None:
