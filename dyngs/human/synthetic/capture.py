@@ -113,7 +113,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     if min(options.num_new, options.num_test, options.seed) < 0:
         raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
     body, betas = _person(options.body_seed)
-    outfit, clothed, texture = _dressed(options.body_seed, options.seed, options.usual_clothes)
+    outfit, clothed, texture = _dressed(body, options.seed, options.usual_clothes)
     train, test = _cameras(options)
     seed, lengths = options.clip_seed, {"train": options.num_frames}
     if options.num_new and test:
@@ -235,9 +235,9 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
 
 
 @lru_cache(maxsize=4)  # several captures of a person, of other clips or cameras, are painted once
-def _dressed(body_seed: int | None, seed: int, usual_clothes: bool) -> tuple[Outfit, BodyTemplate, np.ndarray]:
-    """Return clothes, the template with them on, and its texture (S, S, 3)."""
-    (body, _), outfit = _person(body_seed), random_outfit(seed, usual_clothes)
+def _dressed(body: BodyTemplate, seed: int, usual_clothes: bool) -> tuple[Outfit, BodyTemplate, np.ndarray]:
+    """Return the clothes of ``seed``, the body with them on, and its texture (S, S, 3)."""
+    outfit = random_outfit(seed, usual_clothes)
     return outfit, dress_body(body, outfit), paint_texture(body, outfit)
 
 
