@@ -22,10 +22,10 @@ from dyngs.metrics import psnr
 
 TRIED = 3  # time steps at which a view is left out
 LEAST_GAIN = 0.5  # mean of its PSNR in the person's box, dB, from which all poses are fitted
-LEAST_MOVE = 0.004
+LEAST_MOVE = 0.005
 """Mean of all joints, m of the body, from which they are fitted the first time: training learns less without.
 
-Poses that are given, or found in good silhouettes, are moved by 2 to 3.5 mm, those in a detector's masks by 5 to 18.
+Poses that are given, or found in good silhouettes, are moved by 2 to 6 mm, those in a detector's masks by 6 to 16.
 """
 STARTS = (0.25, 0.45, 0.65)  # fractions of the run after which poses are fitted, one after each step
 MOST_WINDOWS = 6  # of each round of a fit: training goes on with what is found
