@@ -238,12 +238,13 @@ class Opened(LoadedRun):
         motion = read_motion(path, load_template(model))
         if motion.poses.shape[1] != len(scene.skeleton.joints):
             motion = motion.for_joints(len(scene.skeleton.joints))
+        is_fit = bool((motion.scale != 1).any())
+        if is_fit:
+            motion = replace(motion, trans=motion.trans - motion.trans.new_tensor(self.info.world_offset))
         clip = motion_clip(motion)
         if scene.hold is not None:
             clip = replace(clip, past=past_motion(clip, np.arange(len(clip)) / motion.fps))
-        if bool((motion.scale != 1).any()):
-            clip = replace(clip, trans=clip.trans - clip.trans.new_tensor(self.info.world_offset))
-        else:
+        if not is_fit:
             clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         playing, notes = scene.playing(clip), self.notes
         if keep_feet:

@@ -145,7 +145,7 @@ def write_body(
         np.savez(
             file,
             poses=clip.poses.reshape(len(clip), -1).cpu().numpy(),
-            trans=(clip.trans.double().cpu().numpy() + world_offset).astype(np.float32),
+            trans=clip.trans.double().cpu().numpy() + world_offset,
             betas=betas.astype(np.float32),
             scale=clip.scale.cpu().numpy(),
             surface_model_type=body.name,

@@ -18,7 +18,7 @@ from torch import Tensor
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.lens import undistorted_points
 from dyngs.errors import DyngsError, reading
-from dyngs.files.fields import entry, first_few, float_array, numbers_of, read_json_object
+from dyngs.files.fields import LARGEST, entry, first_few, float_array, numbers_of, read_json_object
 from dyngs.files.limits import require_at_most
 from dyngs.files.numpy_files import read_arrays, read_npz
 from dyngs.files.pickles import read_pickle
@@ -205,7 +205,7 @@ def joints_of_vertices(where: Path, body: BodyTemplate, vertices: np.ndarray) ->
         near = np.minimum(weights[:, joint], weights[:, parent]) if parent >= 0 else weights[:, joint]
         rows = np.flatnonzero((own > NEAR) & (near > 0.05))
         if len(rows) >= 4:
-            found[:, joint] = [_moved(rest[rows], posed[rows], joints[joint]) for posed in vertices]
+            found[:, joint] = [_moved(rest[rows], posed[rows].astype(np.float64), joints[joint]) for posed in vertices]
     return found
 
 
@@ -344,7 +344,7 @@ def _joints_of(where: str, value: object) -> np.ndarray:
     if array.shape[1] == 3:
         array = np.concatenate([array, np.ones((len(array), 1))], axis=1)
     known = np.isfinite(array).all(axis=1, keepdims=True)
-    near = (np.abs(np.nan_to_num(array)) < _FARTHEST).all(axis=1, keepdims=True)
+    near = (np.abs(np.nan_to_num(array)) <= LARGEST).all(axis=1, keepdims=True)
     return np.where(np.logical_and(known, near), array, 0.0)
 
 

@@ -34,7 +34,9 @@ _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def read_amass(path: Path, body: BodyTemplate, up: UpAxis = "auto") -> Motion:
-    """Read a motion of 55 joints, y up, in float32; joints that the file lacks do not rotate.
+    """Read a motion of 55 joints, y up; joints that the file lacks do not rotate.
+
+    Tensors are float32, but ``trans`` of a fit, a file with ``scale``, is float64 where the file has it so.
 
     Keys: ``poses`` (F, 72, 156 or 165), or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
     ``mocap_framerate`` or ``mocap_frame_rate``; ``betas`` (B,); ``scale`` (one or F) and ``up_axis`` in files of dyngs
@@ -93,8 +95,11 @@ def _motion(path: Path, arrays: dict[str, np.ndarray], body: BodyTemplate, up: U
         pelvis = scale[:, None] * _pelvis(body, betas)
         poses[:, 0] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
         trans = (trans + pelvis) @ turn.T - pelvis
-    tensors = [torch.from_numpy(x).float() for x in (poses, trans, betas, scale)]
-    motion = Motion(tensors[0], tensors[1], tensors[2], _fps(path, arrays), tensors[3])
+    tensors = [torch.from_numpy(x).float() for x in (poses, betas, scale)]
+    # A fit may lie so far from the origin that float32 is too coarse.
+    is_fine = "scale" in arrays and arrays["trans"].dtype == np.float64
+    place = torch.from_numpy(trans if is_fine else trans.astype(np.float32))
+    motion = Motion(tensors[0], place, tensors[1], _fps(path, arrays), tensors[2])
     return place_on_floor(motion, body) if is_other_model else motion
 
 

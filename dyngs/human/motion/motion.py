@@ -36,7 +36,7 @@ class Motion:
     """Body parameters per frame; y up."""
 
     poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
-    trans: Tensor  # (F, 3) m, added after skinning
+    trans: Tensor  # (F, 3) m, added after skinning; float64 in a fit to a capture
     betas: Tensor  # (B,) shape parameters
     fps: float  # frames per second
     scale: Tensor  # (F,) uniform scale of the template
@@ -74,10 +74,10 @@ class Motion:
     def _interpolated(self, times: np.ndarray, fps: float) -> Motion:
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
         after = np.minimum(before + 1, len(self) - 1)
-        fraction = torch.from_numpy(times - before).to(self.trans)
+        fraction = torch.from_numpy(times - before)
 
         def linear(values: Tensor) -> Tensor:
-            weight = fraction.reshape(-1, *[1] * (values.dim() - 1))
+            weight = fraction.to(values).reshape(-1, *[1] * (values.dim() - 1))
             return torch.lerp(values[before], values[after], weight)
 
         poses = interpolate_rotations(self.poses[before], self.poses[after], times - before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from dyngs.config import (
     RunConfig,
     TrainConfig,
 )
+from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
@@ -187,8 +189,6 @@ def test_colours_beyond_degree_1_are_refused(capture: Path) -> None:
 def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> None:
     trainer = assemble(tiny(capture))
     save_checkpoint(tmp_path, trainer.checkpoint(), 0.0)
-    from dyngs.config.io import RESOLVED_NAME, save_config
-
     save_config(trainer.config, tmp_path / RESOLVED_NAME)
     run = open_run(tmp_path)
     own = run.in_motion(capture / "body_train.npz")
@@ -199,6 +199,22 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     assert rest.is_static
     spread = rest.at(None).means.amax(0) - rest.at(None).means.amin(0)
     assert float(spread[0]) > 1.5, "arms to the sides"
+
+
+def test_a_fit_far_from_the_origin_is_played_exactly(capture: Path, tmp_path: Path) -> None:
+    trainer = assemble(tiny(capture))
+    save_checkpoint(tmp_path, trainer.checkpoint(), 0.0)
+    save_config(trainer.config, tmp_path / RESOLVED_NAME)
+    near, offset = open_run(tmp_path), (500_000.0, 4_600_000.0, 120.0)
+    far = replace(near, info=replace(near.info, world_offset=offset))
+    with np.load(capture / "body_train.npz") as file:
+        fit = dict(file)
+    fit["scale"] = 1.01 * np.ones(len(fit["poses"]))
+    for name, shift in (("near", np.zeros(3)), ("far", np.array(offset))):
+        write_npz(tmp_path / f"{name}.npz", fit | {"trans": fit["trans"] + shift})
+    played = (run.in_motion(tmp_path / f"{name}.npz").scene for run, name in ((near, "near"), (far, "far")))
+    there, here = (scene.at(0.5).means for scene in played)
+    torch.testing.assert_close(there, here, rtol=0, atol=1e-6)
 
 
 def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_changes(capture: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from dyngs.config import DataConfig, HumanModel
+from dyngs.data.body_frames import moved, read_body_file
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -25,6 +26,7 @@ from dyngs.human.fit.fitted_capture import (
     read_person,
     with_fitted_body,
     with_lens,
+    write_body,
     write_fitted_capture,
     write_split,
 )
@@ -245,3 +247,13 @@ def test_no_capture_and_no_clip_is_refused(tmp_path: Path) -> None:
         read_person(DataConfig(root=tmp_path), FitInputs(), tmp_path / "m")
     with pytest.raises(DyngsError, match="no such folder"):
         read_person(DataConfig(root=tmp_path / "none.mp4"), FitInputs(), tmp_path / "m")
+
+
+def test_a_fit_far_from_the_origin_is_written_exactly(data: DataConfig, tmp_path: Path) -> None:
+    capture, body = read_capture(data), load_template(HumanModel())
+    assert capture.body is not None
+    clip = captured_motion(data.root, capture.body["train"], capture.splits["train"], body.joints)
+    offset = np.array([500_000.0, 4_600_000.0, 120.0])
+    write_body(tmp_path / "body.npz", clip, body, np.zeros(10), offset)
+    near = moved(read_body_file(tmp_path / "body.npz"), offset)
+    np.testing.assert_allclose(near.trans, clip.clip.trans.numpy(), rtol=0, atol=1e-8)

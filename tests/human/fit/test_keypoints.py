@@ -137,6 +137,24 @@ def test_all_orders_have_the_knee(tmp_path: Path, order: str) -> None:
     assert found[2][KNEE].tolist() == [1.5, row, 2.0 + row, 1.0]  # less the offset of the recentred world
 
 
+def test_joints_far_from_the_origin(tmp_path: Path) -> None:
+    offset = np.array([500_000.0, 4_600_000.0, 120.0])
+    np.savez(tmp_path / "a.npz", joints=joints("smpl") + offset)
+    found = read_joints(tmp_path / "a.npz", capture().replace(world_offset=offset), default_template())
+    row = ORDERS["smpl"].index("left_knee")
+    assert found[2][KNEE].tolist() == [2.0, row, 2.0 + row, 1.0]
+
+
+def test_posed_vertices_far_from_the_origin(tmp_path: Path) -> None:
+    body, offset = default_template(), np.array([500_000.0, 4_600_000.0, 120.0])
+    vertices = posed(body)[0].double().numpy()
+    np.savez(tmp_path / "near.npz", vertices=vertices)
+    np.savez(tmp_path / "far.npz", vertices=vertices + offset)
+    near = read_joints(tmp_path / "near.npz", capture(1).replace(world_offset=np.zeros(3)), body)
+    far = read_joints(tmp_path / "far.npz", capture(1).replace(world_offset=offset), body)
+    torch.testing.assert_close(far[0], near[0], rtol=0, atol=1e-6)
+
+
 def test_joints_of_the_trunk_count_less(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", joints=joints("smpl"))
     found = read_joints(tmp_path / "a.npz", capture(), default_template())
