@@ -30,10 +30,10 @@ SCENES = {
     "mip": SHORT,
     "blender": SHORT,
     "dynamic": [*SHORT, "model.choose=false", "strategy.max_gaussians=300"],
-    "human": ["train.steps=8", "run.threads=1", "model.resolution=32"],
+    "human": ["train.steps=8", "run.threads=1", "model.resolution=32", "data.train_cameras=[0]"],
     "ngp": ["train.steps=4", "run.threads=1", "model.levels=4"],
     "nerf": ["train.steps=3", "run.threads=1", "model.width=16", "model.coarse=4", "model.fine=4"],
-    "bg_triangle": ["train.steps=6", "run.threads=1", "model.max_triangles=200"],
+    "bg_triangle": ["train.steps=6", "run.threads=1", "model.max_triangles=200", "model.gaussian_steps=20"],
 }
 NETWORK_KEYS = {
     "human_predictor": {"kind": "human_predictor"} | NET.model_dump(),
