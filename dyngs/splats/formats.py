@@ -21,6 +21,8 @@ from dyngs.splats.splat_file import (
     Nonfinite,
     SplatFile,
     drawable,
+    near_origin,
+    offset_notes,
     require_writable,
     unit_rotations,
     with_degree,
@@ -41,7 +43,7 @@ class Format:
     @property
     def holds_comments(self) -> bool:
         """Return whether its files say how they were turned and edited; beside others lies a note about edits."""
-        return self.home[0] == "ply"
+        return self.home[0] in ("ply", "gltf", "usd", "sog")
 
     @property
     def reader(self) -> Callable[[Path], SplatFile]:
@@ -123,9 +125,9 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
         splat = own.reader(path)
         if splat.up is None:
             splat = replace(splat, up=own.up)
-        if not own.holds_comments:
+        if splat.edited == UNMOVED and own.home[0] != "ply":
             splat = replace(splat, edited=read_note(path))
-        return drawable(splat, path, nonfinite)
+        return drawable(near_origin(splat), path, nonfinite)
 
 
 def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
@@ -165,6 +167,7 @@ def fitted(path: Path, own: Format, splat: SplatFile, sh_degree: int | None) -> 
         notes.append(f"harmonics above degree {degree} are left out: {why}")
     if splat.mode is RasterizeMode.ANTIALIASED and not own.states_mode:
         notes.append(f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker")
+    notes += offset_notes(splat, "the file states it" if own.holds_comments else f"{own.name} cannot state it")
     return replace(splat, gaussians=_unit(with_degree(gaussians, degree))), tuple(notes)
 
 

@@ -115,6 +115,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     if opened.captured is not None and opened.missing is not None:
         up = "" if opened.person is not None else f", {opened.stated_up or 'z'} up"
         notes.append(f"without the capture ({opened.missing}) the page begins with a view from outside{up}")
+    if any(opened.world_offset):
+        offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
+        notes.append(f"the scene is far from the origin: {offset} is subtracted from its positions")
     if opened.person is not None:
         notes += opened.person.left_out
     curves = header.get("curves", {})
