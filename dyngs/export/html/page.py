@@ -136,7 +136,7 @@ def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists)
         told = add_triangles(opened.renderable, lists)
     else:
         apart = float((views[0].centers[0] - views[0].centers.new_tensor(target)).norm())
-        pixel = max(apart, 1e-6) / float(views[0].intrinsics[0, 1, 1])
+        pixel = (apart or 1.0) / float(views[0].intrinsics[0, 1, 1])
         told = add_scene(opened.scene, lists, TOLERANCE * pixel) | _drawn(opened.scene.options)
     return told | _shown(opened, time, views, target)
 
