@@ -253,7 +253,7 @@ def measured(scene: GaussianScene, config: Config) -> Row:
     images = (loader[i] for i in range(len(loader)))
     scores, _ = score_views(scene, images, scene.options, background, Lpips("alex", "not measured"), regions)
     cameras = training_cameras(views, config.data)
-    truth = read_true_tracks(capture.root, capture.world_offset)
+    truth = read_true_tracks(capture)
     pairs = list(zip(views, cameras, strict=True))
     tracks: TrackScores = track_scores(scene, truth, pairs, all_views(capture.splits))
     return Row(

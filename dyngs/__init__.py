@@ -9,12 +9,11 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from dyngs.api.load import load
+    from dyngs.api.load import load, read_capture
     from dyngs.api.train import train
     from dyngs.camera import Cameras
     from dyngs.compat import rasterization
     from dyngs.config.io import load_config
-    from dyngs.data.read import read_capture
     from dyngs.errors import DyngsError
     from dyngs.gaussians import Gaussians
     from dyngs.gaussians.rendering import RenderOptions, contributions, render
@@ -49,7 +48,7 @@ _HOMES = {
     "load": "dyngs.api.load",
     "load_config": "dyngs.config.io",
     "rasterization": "dyngs.compat",
-    "read_capture": "dyngs.data.read",
+    "read_capture": "dyngs.api.load",
     "render": "dyngs.gaussians.rendering",
     "train": "dyngs.api.train",
 }

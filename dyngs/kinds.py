@@ -14,7 +14,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.decoding import usual_threads
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.scene_space import outside_of_cube
+from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, reading
 from dyngs.gaussians.init import surroundings
@@ -156,7 +156,8 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
         if isinstance(init, PointsInit):
             capture, lines = with_first_points(capture, config.data, init)
         elif isinstance(init, RandomInit):
-            why = outside_of_cube(capture.splits["train"], init.half_extent)
+            views = capture.splits["train"]
+            why = outside_of_cube(views, cube_half_side(init.half_extent, views, capture.world_scale))
             lines = [] if why is None else [f"init.kind=random draws points around the origin, but {why}: give auto"]
     for line in [] if quiet else [*lines, *before_training(capture)]:
         print(f"dyngs: warning: {line}", file=sys.stderr, flush=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -10,6 +10,8 @@ from dyngs.conventions import RasterizeMode
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Length = Annotated[float, Field(gt=0, le=1e9)] | Literal["auto"]
+"""A number in the unit of the capture, or a fraction of the scene extent."""
 CutOff = Annotated[float, Field(ge=1e-6, le=0.5)]
 """Opacity or transmittance below which the rasterizer stops."""
 
@@ -73,7 +75,9 @@ class SceneModel(ModelSection):
         description="variance of the 2D low-pass filter, px^2; Mip-Splatting: 0.1 with antialiased",
     )
     filter_3d: bool = Field(default=False, description="3D smoothing filter of Mip-Splatting (Yu et al. 2024)")
-    near: Positive = Field(default=0.2, le=1e9, description="near plane, world units")
+    near: Length = Field(
+        default="auto", description="near plane, in the unit of the capture; auto: a fraction of the scene extent"
+    )
     alpha_min: CutOff = Field(
         default=1 / 255, description="a pixel skips Gaussians with an alpha below this there; 1/255 in 3DGS"
     )

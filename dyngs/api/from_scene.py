@@ -51,8 +51,8 @@ def first_of(config: Config, capture: Capture) -> FirstGaussians | None:
         )
     keeps_filter = isinstance(scene, StaticScene) and scene.filter_std is not None and config.model.filter_3d
     gaussians = scene.gaussians.detach() if keeps_filter else scene.at(None)
-    x, y, z = (-capture.world_offset).tolist()
-    how = Similarity(shift=(x, y, z)).after(opened.world)
+    x, y, z = capture.world_offset.tolist()
+    how = Similarity(scale=capture.world_scale, shift=(x, y, z)).inverse().after(opened.world)
     gaussians = gaussians if how == UNMOVED else how.gaussians(gaussians)
     gaussians = with_degree(gaussians, config.stored_sh_degree)
     frozen = None

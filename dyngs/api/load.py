@@ -1,15 +1,30 @@
-"""Load anything that dyngs writes, or any file of Gaussians, as a scene."""
+"""What Python users read: scenes and captures, in the unit of the capture's files."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dyngs.gaussians.scene import GaussianScene
+from torch import Tensor
+
+from dyngs.camera import Cameras
+from dyngs.config import DataConfig
+from dyngs.data import read
+from dyngs.data.capture import Capture
+from dyngs.data.scene_space import expressed
+from dyngs.gaussians import Gaussians, TopologyEdit
+from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
+from dyngs.models.renderable import TimeStep
 from dyngs.runs.opened import open_scene
+from dyngs.splats.similarity import Similarity
+from dyngs.state import State
 
 
 def load(path: Path | str) -> GaussianScene:
     """Load a scene, to be drawn from anywhere, at any time.
+
+    Coordinates are those of the capture's files, as in ``read_capture``.
 
     Example::
 
@@ -29,4 +44,97 @@ def load(path: Path | str) -> GaussianScene:
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    return open_scene(Path(path)).scene
+    opened = open_scene(Path(path))
+    scene, scale = opened.scene, opened.info.world_scale
+    if scale == 1:
+        return scene
+    options = replace(scene.options, near=scale * scene.options.near)
+    gaussians = _scaled(scene.gaussians, scale)
+    return ScaledScene(gaussians=gaussians, options=options, background=scene.background, scene=scene, scale=scale)
+
+
+def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
+    """Read the capture in a folder; images are not decoded, only their headers are read.
+
+    Poses and points are in the unit of the files; where these lie far from their origin, ``Capture.world_offset`` is
+    subtracted. For arguments, splits, times and errors see ``dyngs.data.read.read_capture``.
+
+    Example::
+
+        import dyngs
+        from dyngs.data.loader import ImageLoader
+
+        capture = dyngs.read_capture("lego")
+        image = ImageLoader(capture.splits["train"])[0].to("cpu")
+        image.cameras, image.rgb_premultiplied  # what to render from, and what should come out
+    """
+    capture = read.read_capture(source, decode_videos)
+    return expressed(capture, 1.0, capture.world_offset)
+
+
+@dataclass(frozen=True)
+class _ScaledTimeStep(GaussianTimeStep):
+    inner: GaussianTimeStep | None = None  # of the scene that is scaled
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaledScene(GaussianScene):
+    """A scene in another unit of length.
+
+    Attributes:
+        scene: in scene units.
+        scale: length of a scene unit in the other unit.
+    """
+
+    scene: GaussianScene
+    scale: float
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        return self.scene.times
+
+    @property
+    def is_static(self) -> bool:
+        return self.scene.is_static
+
+    @property
+    def rows(self) -> Tensor:
+        return self.scene.rows
+
+    def time_step(self, time: float | None) -> _ScaledTimeStep:
+        inner = self.scene.time_step(time)
+        return _ScaledTimeStep(_scaled(inner.gaussians, self.scale), inner.time, inner.frame, inner=inner)
+
+    def render(
+        self,
+        cameras: Cameras,
+        time: float | TimeStep | None = None,
+        *,
+        options: RenderOptions | None = None,
+        background: Tensor | None = None,
+        probe: Tensor | None = None,
+    ) -> GaussianRendering:
+        options = self.options if options is None else options
+        poses = cameras.cam_from_world.clone()
+        poses[:, :3, 3] = poses[:, :3, 3] / self.scale
+        drawn = self.scene.render(
+            replace(cameras, cam_from_world=poses),
+            time.inner if isinstance(time, _ScaledTimeStep) else time,
+            options=replace(options, near=options.near / self.scale, far=options.far / self.scale),
+            background=self.background if background is None else background,
+            probe=probe,
+        )
+        return drawn if drawn.depth is None else replace(drawn, depth=self.scale * drawn.depth)
+
+    def edited(self, edit: TopologyEdit) -> ScaledScene:
+        return replace(self, scene=self.scene.edited(edit), gaussians=self.gaussians.edited(edit))
+
+    def state(self) -> State:
+        return self.scene.state()
+
+    def _model_state(self) -> State:
+        return self.scene._model_state()
+
+
+def _scaled(gaussians: Gaussians, scale: float) -> Gaussians:
+    return Similarity(scale=scale).gaussians(gaussians)

@@ -19,7 +19,7 @@ from dyngs.errors import DyngsError
 from dyngs.export.scene_file import write_scene_file
 from dyngs.files.outputs import new_folder
 from dyngs.kinds import assemble
-from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.search import MOST_HELD_OUT, Promise, Search
@@ -92,7 +92,7 @@ def prune_within(
     keep_freed_memory()
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or num_cores()), bytewise:
-        trainer = assemble(config, restored=True)
+        trainer = assemble(config, read_capture_of(config.data, start.info), restored=True)
         trainer.restore(start)
         chosen, file, promise = Search(trainer, start, tell, unseen_images(config, trainer.device)).run(max_loss)
     with new_folder(out, require_empty) as started:

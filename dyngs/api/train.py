@@ -33,6 +33,7 @@ from dyngs.errors import DyngsError, as_word, counted
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.fit.fitted_capture import with_fitted_body
 from dyngs.kinds import build
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.floaters import FloaterRemoval
@@ -161,7 +162,7 @@ def train(
             )
             return folder
         asked = asked_for(folder) if resume_from is not None else config
-        config, choices, capture = _chosen(config, begins=resumed is None)
+        config, choices, capture = _chosen(config, resumed)
         run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, threads=threads)
         write_choices(run.folder, choices)
         run.run(listeners)
@@ -170,12 +171,13 @@ def train(
     return folder
 
 
-def _chosen(config: Config, *, begins: bool) -> tuple[Config, list[Choice], Capture | None]:
+def _chosen(config: Config, resumed: Checkpoint | None) -> tuple[Config, list[Choice], Capture | None]:
     """Return the configuration with all decided, what was said, and the capture, which nothing reads again."""
     if config.model.is_network:
         return config, [], None  # it has several captures
-    capture = read_capture(config.data)
-    return choose(config, capture) if begins else (config, [], capture)
+    if resumed is not None:
+        return config, [], read_capture_of(config.data, resumed.info)
+    return choose(config, read_capture(config.data))
 
 
 def _told_again(config: Config, folder: Path) -> str:

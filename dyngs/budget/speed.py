@@ -245,7 +245,8 @@ def drawing_seconds(trainer: GaussianTrainer, scene: GaussianScene, views: int =
     config = trainer.config
     chosen = [trainer.images.views[i] for i in evenly_spaced(len(trainer.images), views)]
     cameras = training_cameras(chosen, config.data)
-    drawing = Drawing(scene, render_options(config.model), torch.zeros(3, device=scene.gaussians.means.device))
+    options = render_options(config.model, trainer.extent, trainer.capture.world_scale)
+    drawing = Drawing(scene, options, torch.zeros(3, device=scene.gaussians.means.device))
     drawing.image(cameras[0], chosen[0].time)
     least = [math.inf] * len(chosen)
     for _ in range(ROUNDS):

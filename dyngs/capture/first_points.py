@@ -27,7 +27,7 @@ from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import camera_center, projected, times_seen
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.scene_space import outside_of_cube, points_in_frusta
+from dyngs.data.scene_space import cube_half_side, outside_of_cube, points_in_frusta
 from dyngs.data.times import evenly_spaced
 from dyngs.files.write import write_image
 
@@ -208,12 +208,13 @@ def with_first_points(capture: Capture, options: DataConfig, init: PointsInit) -
         return _with_dense_points(capture, options, init.dense, lines)
     views = capture.splits["train"]
     is_by_custom = capture.format in AROUND_ORIGIN
-    why = outside_of_cube(views, init.half_extent) if is_by_custom else None
+    half_side = cube_half_side(init.half_extent, views, capture.world_scale)
+    why = outside_of_cube(views, half_side) if is_by_custom else None
     is_in_cube = is_by_custom and why is None
     if why is not None:
         lines.append(f"the scene does not lie around the origin, where Blender scenes do by custom: {why}")
     if is_in_cube and views[0].time is None:
-        points = points_in_silhouettes(views, options, init)
+        points = points_in_silhouettes(views, options, init.num_random, half_side)
         if points is not None:
             lines.append(f"{len(points.xyz):,} first points were drawn at random in the silhouettes of the images")
         return capture.replace(points=points), lines

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dyngs.capture.looks import colours_at, small_image
-from dyngs.config import DataConfig, PointsInit
+from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
 from dyngs.data.times import evenly_spaced
 
@@ -21,18 +21,20 @@ runs ended with a quarter, and four fifths, more Gaussians."""
 MOST = 0.5  # fraction of the points inside above which the silhouettes say nothing
 
 
-def points_in_silhouettes(views: Sequence[View], options: DataConfig, init: PointsInit) -> PointCloud | None:
+def points_in_silhouettes(
+    views: Sequence[View], options: DataConfig, num_random: int, half_side: float
+) -> PointCloud | None:
     """Return random points of the cube around the origin that lie in the silhouettes, in the images' median colours.
 
-    ``init.num_random`` are drawn, and as many again where few of them lie inside. None where images have no
-    silhouettes, where those hold no points, or most.
+    ``num_random`` are drawn, and as many again where few of them lie inside; ``half_side`` is half the side of the
+    cube. None where images have no silhouettes, where those hold no points, or most.
     """
     shown = [(views[i], small_image(views[i], options)) for i in evenly_spaced(len(views), SILHOUETTES)]
     if all(bool((image[..., 3] >= INSIDE).all()) for _, image in shown):
         return None
     rng, xyz, rgb = np.random.default_rng(0), np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     for drawn in range(1, DRAWS + 1):
-        points = init.half_extent * (2 * rng.random((init.num_random, 3)) - 1)
+        points = half_side * (2 * rng.random((num_random, 3)) - 1)
         colours = colours_at(points, shown)
         outside = (colours[..., 3] < INSIDE).sum(axis=0)  # NaN, out of the image, is not below
         inside = (outside <= MISTAKEN * len(shown)) & ~np.isnan(colours[..., 3]).all(axis=0)
@@ -40,6 +42,6 @@ def points_in_silhouettes(views: Sequence[View], options: DataConfig, init: Poin
             return None
         median = np.nanmedian(colours[:, inside, :3], axis=0) if inside.any() else np.zeros((0, 3))
         xyz, rgb = np.concatenate([xyz, points[inside]]), np.concatenate([rgb, np.rint(255 * median).astype(np.uint8)])
-        if len(xyz) >= min(ENOUGH, init.num_random) or (drawn == 1 and not len(xyz)):
+        if len(xyz) >= min(ENOUGH, num_random) or (drawn == 1 and not len(xyz)):
             break
-    return PointCloud(xyz[: init.num_random], rgb[: init.num_random]) if len(xyz) else None
+    return PointCloud(xyz[:num_random], rgb[:num_random]) if len(xyz) else None

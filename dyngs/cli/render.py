@@ -60,7 +60,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     fps = "frames per second of the video (default 30, or as in the .json)"
     parser.add_argument("--fps", type=float, metavar="F", help=fps)
-    depth = "write depth as well: coloured .png, and .exr in world units"
+    depth = "write depth as well: coloured .png, and .exr in the unit of the capture"
     parser.add_argument("--depth", action="store_true", help=depth)
     parser.add_argument("--alpha", action="store_true", help="write opacity as well")
     size = "image size for a path or fixed camera, in pixels"

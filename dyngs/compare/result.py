@@ -14,11 +14,11 @@ from dyngs.budget.size import has_file
 from dyngs.compare.curve import CurvePoint, QualityCurve, read_curve
 from dyngs.compare.plan import Bench, Entry
 from dyngs.data.loader import Image
-from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import evaluate_run, images_of_split
 from dyngs.evaluate.view_scores import Drawing
 from dyngs.files.write import write_image
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import device_for
 from dyngs.ops.native import kernel_threads
@@ -141,7 +141,7 @@ class Measured:
     def drawing(self, name: str, count: int) -> tuple[Drawing, list[Image]]:
         """Return how a trained model is drawn, and at most ``count`` of the held-out images, evenly chosen."""
         run, split, device = load_run(self.drawn_folder(name)), self.bench.split, device_for(self.bench.device)
-        capture = read_capture(run.config.data)
+        capture = read_capture_of(run.config.data, run.info)
         loader = images_of_split(capture, split_views(capture, split), self.bench.run_dir(name), run)
         loader.device = device
         _, background = evaluation_background(run.config.data.background, capture.has_alpha)

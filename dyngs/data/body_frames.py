@@ -82,9 +82,9 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     return replace(body, poses=poses, trans=trans, turns=None, pelvis=np.asarray(pelvis, dtype=np.float64))
 
 
-def moved(body: BodyFrames, offset: np.ndarray) -> BodyFrames:
-    """Return the bodies with ``offset`` (3,) subtracted from all positions."""
-    return replace(body, trans=body.trans - offset)
+def moved(body: BodyFrames, shift: np.ndarray, factor: float) -> BodyFrames:
+    """Return the bodies of a world in which a point x is ``factor * (x - shift)``, with ``shift`` (3,)."""
+    return replace(body, trans=factor * (body.trans - shift), scale=factor * body.scale)
 
 
 def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:

@@ -65,7 +65,7 @@ class View:
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
         image_path: image file; for a frame of a ``video`` the file it is decoded to, see ``images.frame_cache``.
-        cam_from_world: (4, 4) float64, OpenCV axes, in the capture's recentred world (see ``Capture.world_offset``).
+        cam_from_world: (4, 4) float64, OpenCV axes, in scene coordinates (see ``Capture.world_scale``).
         intrinsics: (3, 3) float64 in pixels of the *stored* image size.
         width, height: stored image size in pixels.
         camera_id: index of the physical camera.
@@ -125,7 +125,7 @@ def each_view(splits: Splits, change: Callable[[View], View]) -> Splits:
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Sparse points: ``xyz`` (P, 3) float64 in the recentred world, ``rgb`` (P, 3) uint8."""
+    """Sparse points: ``xyz`` (P, 3) float64 in scene coordinates, ``rgb`` (P, 3) uint8."""
 
     xyz: np.ndarray
     rgb: np.ndarray
@@ -177,8 +177,9 @@ class Capture:
         splits: split name to views, each tuple sorted by name; train is never empty.
         points: sparse points or None.
         points_file: the .ply that the points are from, which is not known to fit the cameras; None for other points.
-        world_offset: (3,) float64, added to recentred coordinates gives those of the files; zero unless the scene lies
-            far from its origin.
+        world_scale: power of two, length of a scene unit in the unit of the files. A point x in scene coordinates is
+            ``world_scale * x + world_offset`` in the files. See ``scene_space.normalised``.
+        world_offset: (3,) float64 in the unit of the files; zero unless the scene lies far from its origin.
         has_alpha: images carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people.
         fps: frames per second of the recording.
@@ -194,6 +195,7 @@ class Capture:
     splits: Splits
     points: PointCloud | None = None
     points_file: Path | None = None
+    world_scale: float = 1.0
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     has_alpha: bool = False
     body: dict[Split, BodyFrames] | None = None

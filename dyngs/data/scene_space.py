@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from dyngs.data.body_frames import moved
 from dyngs.data.capture import Capture, PointCloud, View, all_views, each_view
 from dyngs.data.geometry import camera_center, focus_point, fraction_in_front, inverse_rigid, times_seen
 from dyngs.data.times import evenly_spaced
+from dyngs.section import Length
 
 NEAR_PER_FOCUS = 0.25  # nearest depth, in distances from the cameras to what they look at
 FAR_PER_BASELINE = 38.0
@@ -18,6 +20,7 @@ FAR_PER_BASELINE = 38.0
 MIN_VIEWS = 3
 """Images that see a random point, where there are as many."""
 COUNTED_VIEWS = 60  # views, evenly spaced, in which points are counted
+CUBE_PER_EXTENT = 0.25  # 3DGS: 1.3 units in NeRF-synthetic scenes, whose cameras have an extent of 5.2
 MIN_CUBE_SEEN = 0.5  # fraction of a cube that two cameras must see for the scene to lie in it
 
 
@@ -31,8 +34,7 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
     """
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
-    baseline = 2 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
-    baseline = baseline if baseline > 1e-6 else 1.0
+    baseline = 2 * extent_of(centers) / EXTENT_MARGIN or 1.0
     focus = focus_point(poses)
     distance = baseline
     if focus is not None and fraction_in_front(poses, focus) > 0.5:
@@ -59,6 +61,14 @@ def points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarra
     return points, times_seen(points, [views[i] for i in evenly_spaced(len(views), COUNTED_VIEWS)])
 
 
+def cube_half_side(half_extent: Length, views: Sequence[View], world_scale: float) -> float:
+    """Return half the side, scene units, of the cube that ``init.half_extent`` asks for."""
+    if half_extent != "auto":
+        return half_extent / world_scale
+    centers = np.array([camera_center(view.cam_from_world) for view in views])
+    return CUBE_PER_EXTENT * (extent_of(centers) or TYPICAL_EXTENT)
+
+
 def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
     """Return why the scene cannot lie in the cube around the origin, in a few words; None where it may.
 
@@ -77,36 +87,90 @@ def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
     return None
 
 
-MAX_DISTANCE = 1e5
-MAX_DISTANCE_PER_SPREAD = 1e4
-HARMLESS_DISTANCE = 1e3
-"""Nearer scenes are not moved, however small the spread of their cameras (that of one static camera is 0)."""
+EXTENT_MARGIN = 1.1
+SMALLEST_EXTENT = 3.25
+"""Normalised scenes have an extent from this to twice as much: those of NeRF-synthetic scenes (5.2) and of many COLMAP
+models lie between, so that these keep their own unit."""
+TYPICAL_EXTENT = 4.6  # Middle of that range
+MAX_DISTANCE = 100.0
+"""Distance from the origin, in extents, from which a scene is moved there: float32 is 0.01 px coarse at a focal length
+of 1,000 px."""
+DEPTH_PER_EXTENT = 20.0  # Median depth of the points, in extents, beyond which the depth decides
+ROUNDING = 2e-7  # Relative error of a position in float32, as many programs write it
+NEGLIGIBLE = 1e-3  # Extent, in median depths of the points, below which the cameras tell nothing about lengths
 
 
-def recenter(capture: Capture) -> Capture:
-    """Return the capture with its median camera at the origin if that is far away, else the capture itself.
+def extent_of(centers: np.ndarray) -> float:
+    """Return 1.1 x the largest distance of a camera centre, of (V, 3), to their mean; 0 where that is rounding."""
+    offsets = centers - centers.mean(axis=0)
+    largest = float(np.linalg.norm(offsets, axis=1).max())
+    return EXTENT_MARGIN * largest if largest > ROUNDING * float(np.abs(centers).max()) else 0.0
 
-    Far: the median camera centre is more than 1e5 units from the origin, or more than 1e4 times the cameras' spread
-    (median distance from that centre). What is subtracted is added to ``world_offset``.
+
+def normalised(capture: Capture) -> Capture:
+    """Return the capture in scene coordinates: near the origin, and in a unit in which thresholds are meaningful.
+
+    The unit is the power of two of the files' unit in which the extent of all cameras is at least ``SMALLEST_EXTENT``
+    and less than twice that; for a person it is about a metre. A power of two changes no digit of a coordinate. Where
+    the median camera is farther than ``MAX_DISTANCE`` extents from the origin, the point that the cameras look at
+    becomes the origin, or the median camera where they look at none. See ``Capture.world_scale`` and
+    ``Capture.world_offset``.
     """
-    centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
+    poses = np.array([inverse_rigid(view.cam_from_world) for view in all_views(capture.splits)])
+    centers = poses[:, :3, 3]
     median = np.median(centers, axis=0)
-    spread = float(np.median(np.linalg.norm(centers - median, axis=1)))
+    length = _length(capture, centers)
     distance = float(np.linalg.norm(median))
-    too_far = distance > MAX_DISTANCE or distance > max(MAX_DISTANCE_PER_SPREAD * spread, HARMLESS_DISTANCE)
-    return shifted(capture, median) if too_far else capture
+    if distance > MAX_DISTANCE * (length or distance):
+        focus, origin = focus_point(poses), median
+        if focus is not None and fraction_in_front(poses, focus) > 0.5 and np.linalg.norm(focus - median) < length:
+            origin = focus
+        capture = expressed(capture, capture.world_scale, origin * capture.world_scale + capture.world_offset)
+    if not length:
+        return capture
+    scale = 2.0 ** math.floor(math.log2(length / SMALLEST_EXTENT))
+    return expressed(capture, scale * capture.world_scale, capture.world_offset)
 
 
-def shifted(capture: Capture, offset: np.ndarray) -> Capture:
-    """Return the capture with ``offset`` (3,) subtracted from all positions and added to ``world_offset``."""
+def _length(capture: Capture, centers: np.ndarray) -> float:
+    """Return the length that is to become ``SMALLEST_EXTENT`` or up to twice as much; 0 where nothing tells one.
+
+    ``centers`` (V, 3) of all cameras.
+    """
+    if capture.body is not None:
+        return TYPICAL_EXTENT * float(np.median(capture.body["train"].scale))
+    extent = extent_of(centers)
+    if capture.points is None:
+        return extent
+    median_point = np.median(capture.points.xyz, axis=0)
+    depth = float(np.median(np.linalg.norm(centers - median_point, axis=1)))
+    return depth if extent < NEGLIGIBLE * depth else max(extent, depth / DEPTH_PER_EXTENT)
+
+
+def expressed(capture: Capture, scale: float, offset: Sequence[float] | np.ndarray) -> Capture:
+    """Return the capture in other scene coordinates, with this ``world_scale`` and ``world_offset`` (3,)."""
+    offset = np.asarray(offset, np.float64)
+    if scale == capture.world_scale and (offset == capture.world_offset).all():
+        return capture
+    # A point x is ``factor * (x - shift)`` in the other coordinates.
+    factor = capture.world_scale / scale
+    shift = (offset - capture.world_offset) / capture.world_scale
 
     def moved_view(view: View) -> View:
         pose = view.cam_from_world.copy()
-        # Through the centre: R @ offset + t would first round both terms at the size of the offset.
-        pose[:3, 3] = -pose[:3, :3] @ (camera_center(pose) - offset)
+        # Through the centre: R @ shift + t would first round both terms at the size of the shift.
+        center = camera_center(pose) - shift if shift.any() else None
+        translation = pose[:3, 3] if center is None else -pose[:3, :3] @ center
+        pose[:3, 3] = factor * translation
         return replace(view, cam_from_world=pose)
 
-    splits = each_view(capture.splits, moved_view)
-    points = capture.points and PointCloud(capture.points.xyz - offset, capture.points.rgb)
-    body = capture.body and {name: moved(body, offset) for name, body in capture.body.items()}
-    return replace(capture, splits=splits, points=points, body=body, world_offset=capture.world_offset + offset)
+    points = capture.points and PointCloud(factor * (capture.points.xyz - shift), capture.points.rgb)
+    body = capture.body and {name: moved(x, shift, factor) for name, x in capture.body.items()}
+    return replace(
+        capture,
+        splits=each_view(capture.splits, moved_view),
+        points=points,
+        body=body,
+        world_scale=scale,
+        world_offset=offset,
+    )

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from dyngs.data.capture import View
+from dyngs.data.capture import Capture, View
 from dyngs.errors import DyngsError
 from dyngs.files.containment import inside
 from dyngs.files.numpy_files import read_npz
@@ -94,9 +94,9 @@ def write_true_tracks(root: Path, tracks: TrueTracks, name: str = TRACKS_FILE) -
     return path
 
 
-def read_true_tracks(root: Path, world_offset: np.ndarray, name: str = TRACKS_FILE) -> TrueTracks | None:
-    """Return the tracks of the capture in ``root``, in its recentred world (see ``Capture``); None without any."""
-    path = root / name
+def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | None:
+    """Return the tracks of a capture in scene coordinates (see ``Capture.world_scale``); None without any."""
+    path = capture.root / name
     if not inside(path).is_file():
         return None
     found = read_npz(path, ("points", "times", "views", "moments", "visible"))
@@ -111,4 +111,5 @@ def read_true_tracks(root: Path, world_offset: np.ndarray, name: str = TRACKS_FI
         )
     if len(moments) and not (moments.min() >= 0 and moments.max() < len(times)):
         raise DyngsError(f"{path}: moments must be rows of times; write it again, or remove it to do without")
-    return TrueTracks(points - world_offset, times, views, moments, visible)
+    points = (points - capture.world_offset) / capture.world_scale
+    return TrueTracks(points, times, views, moments, visible)

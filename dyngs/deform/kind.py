@@ -66,7 +66,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
-    looked_at, options = views_to_compare(views), training_options(config)
+    looked_at, options = views_to_compare(views), training_options(run)
 
     def shader(time: float) -> Shader | None:
         return None if colours.network is None else colours.network.shader(time)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.data.scene_space import MAX_DISTANCE, MAX_DISTANCE_PER_SPREAD
+from dyngs.data.scene_space import MAX_DISTANCE
 from dyngs.errors import DyngsError, printable, require_regular
 from dyngs.files.limits import require_at_most
 from dyngs.splats.rotation import AXES, turn_between
@@ -160,7 +160,7 @@ def geo_frame(path: Path) -> GeoFrame:
     residuals = np.linalg.norm(found.points(points) - world, axis=1)
     middle = world.mean(axis=0).round()
     spread, distance = np.linalg.norm(world - middle, axis=1).max(), np.linalg.norm(middle)
-    if distance > MAX_DISTANCE or distance > MAX_DISTANCE_PER_SPREAD * spread:
+    if distance > MAX_DISTANCE * spread:
         x, y, z = (np.array(found.shift) - middle).tolist()
         a, b, c = middle.tolist()
         return GeoFrame(replace(found, shift=(x, y, z)), (a, b, c), residuals)

@@ -14,6 +14,7 @@ from dyngs.config.io import load_resolved
 from dyngs.errors import DyngsError
 from dyngs.files.outputs import new_folder
 from dyngs.kinds import GaussianTrainer, assemble
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -32,9 +33,10 @@ from dyngs.runs.log import LOG_NAME
 
 def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
     """Return the trainer of a run where it ended; without checkpoints with nothing but its scene."""
-    trainer: GaussianTrainer = assemble(config, restored=True)
+    run = load_run(run_dir, config.data.root)
+    trainer: GaussianTrainer = assemble(config, read_capture_of(config.data, run.info), restored=True)
     if has_only_scene_file(run_dir):
-        scene = load_run(run_dir, config.data.root).scene.to(trainer.device)
+        scene = run.scene.to(trainer.device)
         trainer.model.begin_with(scene, trainer.model.training)
         trainer.model.exchange(scene)
     else:

@@ -12,11 +12,11 @@ import torch
 
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import parameter_megabytes, scene_of_split, split_views
 from dyngs.evaluate.view_scores import Drawing, seconds_in_turn
 from dyngs.metrics import psnr
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
 from dyngs.ops.native import kernel_threads
@@ -44,7 +44,7 @@ def compared(
 ) -> list[Cost]:
     """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all alike."""
     runs = [load_run(folder, data_root) for folder in folders]
-    capture = read_capture(runs[0].config.data)
+    capture = read_capture_of(runs[0].config.data, runs[0].info)
     has_test = bool(capture.splits.get("test"))
     with kernel_threads(threads), torch.no_grad():
         splits = ("train", "test") if has_test else ("train",)

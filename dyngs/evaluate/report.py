@@ -14,7 +14,6 @@ import torch
 
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import read_capture
 from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.evaluate.regions import REGION_METRICS, Regions
@@ -26,6 +25,7 @@ from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.metrics import Lpips, LpipsNet, load_lpips, psnr
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import device_for
@@ -175,7 +175,7 @@ def evaluate_run(
     draws_on = device_for(device)
     _require_possible(run_dir, split, refine_poses)
     run = load_run(run_dir, data_root)
-    capture = capture or read_capture(run.config.data)
+    capture = capture or read_capture_of(run.config.data, run.info)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(draws_on)
@@ -275,7 +275,7 @@ def report_path(run_dir: Path, split: str) -> Path:
 
 
 def _track_scores(run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]) -> TrackScores:
-    tracks = read_true_tracks(capture.root, capture.world_offset)
+    tracks = read_true_tracks(capture)
     cameras = training_cameras(views, run.config.data)
     if not isinstance(scene, GaussianScene):
         return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")

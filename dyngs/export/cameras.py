@@ -33,7 +33,7 @@ def write_cameras(
         inputs_of(capture).require_output(out)
     if world is None:
         x, y, z = capture.world_offset.tolist()
-        world = Similarity(shift=(x, y, z))
+        world = Similarity(scale=capture.world_scale, shift=(x, y, z))
     folder = Path(os.path.abspath(path.parent))
     frames: list[dict[str, object]] = []
     content: dict[str, object] = {}

@@ -44,7 +44,7 @@ class DrawnImage:
 class OutputOptions:
     """Files to write in addition to the colour images."""
 
-    # ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, world units along the optical axis)
+    # ``NAME_depth.png`` (colours) and ``NAME_depth.exr`` (float32, along the optical axis, in the unit of the capture)
     depth: bool = False
     alpha: bool = False  # ``NAME_alpha.png``, white = opaque
     video: Path | None = None  # MP4 of the colour images in order
@@ -102,7 +102,7 @@ def write_path_images(
         ]
         limits = depth_limits(*(np.concatenate([x.ravel() for x in part]) for part in zip(*seen, strict=True)))
     digits = max(4, len(str(len(path) - 1)))
-    with _FrameWriter(out_dir, output, inputs_of(opened), limits) as writer:
+    with _FrameWriter(out_dir, output, inputs_of(opened), opened.frame.scale, limits) as writer:
         for i, frame in enumerate(path_frames(opened.renderable, path, options)):
             writer.write(f"frame_{i:0{digits}d}", frame)
             report("frames", i + 1, len(path))
@@ -131,7 +131,7 @@ def write_split_images(
     options = _with_depth(scene, output)
     shown = set(np.linspace(0, len(loader) - 1, min(len(loader), _SHEET_ROWS)).round().astype(int).tolist())
     rows: list[SheetRow] = []
-    with _FrameWriter(out_dir, output, inputs) as writer:
+    with _FrameWriter(out_dir, output, inputs, opened.frame.scale) as writer:
         for i, stem in enumerate(file_stems([view.name for view in views])):
             image = loader[i]
             frame = render_frame(scene, image.cameras, image.time, options)
@@ -173,11 +173,17 @@ class _FrameWriter:
     """Context manager that writes frames to images and a video; ``written`` lists the files."""
 
     def __init__(
-        self, out_dir: Path | None, output: OutputOptions, inputs: Inputs, limits: tuple[float, float] | None = None
+        self,
+        out_dir: Path | None,
+        output: OutputOptions,
+        inputs: Inputs,
+        depth_unit: float,
+        limits: tuple[float, float] | None = None,
     ) -> None:
         self.written: list[Path] = []
         self._inputs = inputs
         self._out_dir, self._output, self._limits = out_dir, output, limits
+        self._depth_unit = np.float32(depth_unit)
         self._stack = ExitStack()
         self._video: VideoWriter | None = None
         self._size: tuple[int, ...] | None = None
@@ -209,7 +215,7 @@ class _FrameWriter:
             self.write_image(self._out_dir / f"{stem}_alpha.png", frame.alpha)
         if self._output.depth and frame.depth is not None:
             self.write_image(self._out_dir / f"{stem}_depth.png", depth_to_rgb(frame.depth, frame.alpha, self._limits))
-            self.write_image(self._out_dir / f"{stem}_depth.exr", frame.depth)
+            self.write_image(self._out_dir / f"{stem}_depth.exr", frame.depth * self._depth_unit)
 
     def write_image(self, path: Path, pixels: np.ndarray) -> None:
         self._inputs.require_output(path)

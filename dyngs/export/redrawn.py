@@ -54,12 +54,13 @@ def compare_run(opened: Opened, scene: GaussianScene, time: float, meant: SplatF
     """
     with torch.no_grad():
         moment = scene.time_step(time)
-        for cameras in (capture_cameras(opened), meant.frame.inverse().cameras(around(meant))):
+        frame = meant.frame.after(opened.file_unit)
+        for cameras in (capture_cameras(opened), frame.inverse().cameras(around(meant))):
             if cameras is None:
                 continue
             drawn = scene.render(cameras, moment, background=_black(moment.gaussians.means))
             if float((drawn.alpha > 0.1).float().mean()) >= _LEAST_FRACTION:
-                return compare(drawn.rgb, meant.frame.cameras(cameras), read, scene.options.near * meant.frame.scale)
+                return compare(drawn.rgb, frame.cameras(cameras), read, scene.options.near * frame.scale)
     raise DyngsError("nothing of the scene is seen by the cameras of the capture, or from an orbit around it")
 
 

@@ -181,9 +181,10 @@ def splats_at(opened: Opened, scene: GaussianScene, time: float, how: Writing = 
         gaussians = baked.gaussians
         comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     x, y, z = opened.info.world_offset
-    splat = SplatFile(gaussians.detach(), model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
+    gaussians = opened.file_unit.gaussians(gaussians.detach())
+    splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
-        splat = moved_file(splat, opened.frame, opened.edited.up)
+        splat = moved_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
         if any(opened.edited.offset):
             splat = replace(splat, comments=(*splat.comments, geo_comment(opened.edited.offset)))
     splat = turned_file(splat, how.turn, how.up)

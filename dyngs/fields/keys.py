@@ -19,8 +19,8 @@ class FieldModel(ModelSection):
         default=None,
         gt=0,
         le=1e9,
-        description="half the side of the cube that is resolved best, world units; null: what all cameras frame of an "
-        "object before a background, else where the cameras are",
+        description="half the side of the cube that is resolved best, in the unit of the capture; null: what all "
+        "cameras frame of an object before a background, else where the cameras are",
     )
     surroundings: Literal["auto", "never", "always"] = Field(
         default="auto",

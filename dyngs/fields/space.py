@@ -14,6 +14,7 @@ from dyngs.camera import Cameras
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
 from dyngs.data.loader import Image
+from dyngs.data.scene_space import extent_of
 from dyngs.errors import DyngsError
 from dyngs.fields.keys import FieldModel
 from dyngs.ops.rays import Rays, Space
@@ -39,10 +40,11 @@ def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
         DyngsError: nothing tells depth, or much lies too far away.
     """
     views = capture.splits["train"]
+    requested = None if model.half_extent is None else model.half_extent / capture.world_scale
     poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
     centres = poses[:, :3, 3]
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    if spread < 1e-6:
+    if not extent_of(centres):
         raise DyngsError(
             "the capture has a single camera position, from which a field cannot tell depth: give more images, or a "
             "capture whose camera moves"
@@ -52,13 +54,13 @@ def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
     far = model.surroundings == "always" or (model.surroundings == "auto" and not capture.has_alpha)
     if not far:
         middle = centres.mean(axis=0) if looked_at is None else looked_at
-        return _space(middle, model.half_extent or _framed(views, middle), 1, cells)
+        return _space(middle, requested or _framed(views, middle), 1, cells)
     middle = centres.mean(axis=0)
     if looked_at is not None and np.linalg.norm(looked_at - middle) < 2 * spread:
         middle = looked_at
     beside = BESIDE * float(np.abs(centres - middle).max())
     framed = beside if middle is not looked_at else min(beside, _framed(views, middle))
-    half = model.half_extent or framed
+    half = requested or framed
     return _space(middle, half, _cascades(capture, middle, half), cells)
 
 

@@ -14,13 +14,12 @@ from dyngs.capture.first_points import AROUND_ORIGIN
 from dyngs.config import DefaultStrategy, FixedStrategy, McmcStrategy, PointsInit, RandomInit, SceneInit, Strategy
 from dyngs.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import Capture, View
-from dyngs.data.scene_space import MIN_VIEWS, outside_of_cube, points_in_frusta
+from dyngs.data.scene_space import MIN_VIEWS, cube_half_side, extent_of, outside_of_cube, points_in_frusta
 from dyngs.gaussians import Gaussians
 
 START_OPACITY = 0.1
 MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1  # Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with
 MIN_SQUARED_DISTANCE = 1e-7
-EXTENT_MARGIN = 1.1
 CANDIDATES = 4  # Random points that are drawn per one that is taken, where what the cameras see decides
 
 
@@ -46,13 +45,14 @@ class StartValues:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Cameras and extent of a scene before training, in world units."""
+    """Cameras and extent of a scene before training, in scene units."""
 
     views: Sequence[View]
     points: np.ndarray | None = None  # (P, 3) sparse points, or None
     points_rgb: np.ndarray | None = None
     # by convention the scene lies around the origin (Blender scenes), where the cameras look there
     around_origin: bool = False
+    world_scale: float = 1.0  # as ``Capture.world_scale``
 
     @property
     def camera_centers(self) -> np.ndarray:
@@ -65,10 +65,7 @@ class Surroundings:
 
         Learning rates and size thresholds are relative to it. Where all cameras share one centre it is 1.
         """
-        centers = self.camera_centers
-        offsets = centers - centers.mean(axis=0)
-        extent = EXTENT_MARGIN * float(np.linalg.norm(offsets, axis=1).max())
-        return extent if extent > 1e-6 else 1.0
+        return extent_of(self.camera_centers) or 1.0
 
 
 def surroundings(capture: Capture) -> Surroundings:
@@ -79,6 +76,7 @@ def surroundings(capture: Capture) -> Surroundings:
         points=None if points is None else points.xyz,
         points_rgb=None if points is None else points.rgb,
         around_origin=capture.format in AROUND_ORIGIN,
+        world_scale=capture.world_scale,
     )
 
 
@@ -112,7 +110,7 @@ def _random_points(
 ) -> tuple[Tensor, Tensor]:
     """Positions (N, 3) float64, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
     count = min(options.num_random, max_points)
-    half_extent = options.half_extent
+    half_extent = cube_half_side(options.half_extent, scene.views, scene.world_scale)
     if options.kind == "random" or (scene.around_origin and outside_of_cube(scene.views, half_extent) is None):
         xyz = (torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1) * half_extent
     else:

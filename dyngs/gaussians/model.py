@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.config import AutoColour, Config, DefaultStrategy, SceneInit, SceneModel
+from dyngs.config import AutoColour, DefaultStrategy, SceneInit, SceneModel
 from dyngs.conventions import SH_C0, RasterizeMode
 from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
@@ -121,7 +121,7 @@ class GaussianModel(Model[GaussianScene]):
         self._config, self.densifier, self.colours = config, densifier, colours
         self._run, self._generator = run, run.generator
         self._rates, self._course = learning_rates(config), rates_of(config)
-        self.options = training_options(config)
+        self.options = training_options(run)
         self.begin_with(scene, training)
 
     def begin_with(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
@@ -132,7 +132,7 @@ class GaussianModel(Model[GaussianScene]):
         self._scene = replace(
             scene.with_gaussians(self._optimizer.parameters),
             colour=self.colours.network,
-            options=render_options(config.model),
+            options=self._render_options(config.model),
             background=behind,
         )
 
@@ -267,7 +267,7 @@ class GaussianModel(Model[GaussianScene]):
 
     def draw_as(self, model: SceneModel) -> None:
         """Draw with the settings of another section of the same kind from now on."""
-        options = render_options(model)
+        options = self._render_options(model)
         self.options = replace(self.options, alpha_min=options.alpha_min)
         self._scene = replace(self._scene, options=options)
 
@@ -345,8 +345,13 @@ class GaussianModel(Model[GaussianScene]):
         may_train = [i for i, time in enumerate(images.times) if self.training.trains_on(time, step)]
         return TrainingLooks(may_train, views, self._options(step), colour)
 
+    def _render_options(self, model: SceneModel) -> RenderOptions:
+        return render_options(model, self._run.extent, self._run.capture.world_scale)
 
-def training_options(config: Config) -> RenderOptions:
+
+def training_options(run: RunStart) -> RenderOptions:
     """Return how the training images of a run are drawn."""
-    absgrad = isinstance(config.strategy, DefaultStrategy) and config.strategy.absgrad
-    return replace(render_options(config.model), absgrad=absgrad, nonfinite="trust")
+    strategy = run.config.strategy
+    absgrad = isinstance(strategy, DefaultStrategy) and strategy.absgrad
+    options = render_options(run.config.model, run.extent, run.capture.world_scale)
+    return replace(options, absgrad=absgrad, nonfinite="trust")

@@ -17,13 +17,14 @@ from torch import Tensor
 
 from dyngs.camera import Cameras
 from dyngs.config import SceneModel
+from dyngs.data.scene_space import TYPICAL_EXTENT
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork, RestFrame, network_of
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.renderable import Renderable, TimeStep
+from dyngs.models.renderable import Renderable, TimeStep, near_plane
 from dyngs.models.views import background_colour
 from dyngs.state import Role, State, prefixed, with_role
 from dyngs.tensor_checks import require_moments
@@ -209,14 +210,21 @@ def _number(time: float | TimeStep | None) -> float | None:
 
 def drawn_as_trained(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
     """Return a restored scene with the colours of the checkpoint, drawn as the model is."""
-    colour, background = network_of(checkpoint.part("model.colour")), background_colour(checkpoint.info.background)
-    return replace(scene, colour=colour, options=render_options(model), background=background)
+    info = checkpoint.info
+    colour = network_of(checkpoint.part("model.colour"))
+    options = render_options(model, info.extent, info.world_scale)
+    return replace(scene, colour=colour, options=options, background=background_colour(info.background))
 
 
-def render_options(model: SceneModel) -> RenderOptions:
-    """Return how a model wants to be drawn."""
+def render_options(model: SceneModel, extent: float = TYPICAL_EXTENT, world_scale: float = 1.0) -> RenderOptions:
+    """Return how a model is drawn.
+
+    Args:
+        extent: of the scene, scene units.
+        world_scale: as ``Capture.world_scale``.
+    """
     return RenderOptions(
-        near=model.near,
+        near=near_plane(extent) if model.near == "auto" else model.near / world_scale,
         eps2d=model.eps2d,
         mode=model.rasterize_mode,
         alpha_min=model.alpha_min,

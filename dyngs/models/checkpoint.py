@@ -7,6 +7,10 @@ from pathlib import Path
 
 from torch import Tensor
 
+from dyngs.config import DataConfig
+from dyngs.data.capture import Capture
+from dyngs.data.read import read_capture
+from dyngs.data.scene_space import expressed
 from dyngs.state import part_of
 
 OTHER_CONFIG = "was its config changed? Otherwise train anew"
@@ -18,10 +22,19 @@ class CheckpointInfo:
     """Metadata of a checkpoint."""
 
     step: int
-    extent: float  # of the scene, world units
-    world_offset: tuple[float, float, float]  # add it to the means to get the capture's own coordinates
+    extent: float  # of the scene, scene units
+    world_offset: tuple[float, float, float]  # as ``Capture.world_offset``
     background: str  # resolved choice: "white", "black" or "random"
     rasterize_mode: str  # how the Gaussians want to be drawn
+    world_scale: float = 1.0  # as ``Capture.world_scale``
+
+
+def read_capture_of(data: DataConfig, info: CheckpointInfo) -> Capture:
+    """Return the capture of a run in the scene coordinates that the run was trained in.
+
+    Those of ``read_capture`` may differ: the capture has changed since, or another version of dyngs trained the run.
+    """
+    return expressed(read_capture(data), info.world_scale, info.world_offset)
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,20 @@ T = TypeVar("T")
 Images = TypeVar("Images", bound="Rendering")
 
 
+NEAR_FRACTION = 0.04
+"""Distance of the near plane, in extents of the scene. 3DGS: 0.2 units, where scenes have an extent of about 5."""
+
+
+def near_plane(extent: float) -> float:
+    """Return the distance of the near plane of a scene of this extent, in the same unit."""
+    return NEAR_FRACTION * extent
+
+
 @dataclass(frozen=True)
 class DrawOptions:
     """How any scene is drawn."""
 
-    near: float = 0.2  # what is nearer to the camera is not drawn, world units (3DGS: 0.2)
+    near: float = 0.2  # what is nearer to the camera is not drawn, scene units (3DGS: 0.2)
     # none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha)
     depth: Literal["none", "accumulated", "expected"] = "none"
 

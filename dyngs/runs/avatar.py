@@ -125,7 +125,8 @@ def read_avatar(path: Path) -> LoadedRun:
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else printable(str(error), 120)
         raise DyngsError(f"{path}: not a valid avatar ({why}){_ADVICE}") from None
-    scene = replace(scene, options=render_options(model), background=background_colour(info.background))
+    options = render_options(model, info.extent, info.world_scale)
+    scene = replace(scene, options=options, background=background_colour(info.background))
     return LoadedRun(Config(data=DataConfig(root=path), model=model), scene, info.step, 0.0, info)
 
 

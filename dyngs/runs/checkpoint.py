@@ -102,13 +102,14 @@ def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
     """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or OverflowError."""
     step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
     extent, background, mode = float(header["extent"]), header["background"], header["rasterize_mode"]
+    scale = float(header.get("world_scale", 1.0))  # earlier versions trained in the unit of the files
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step <= MAX_STEP:
         raise ValueError(f"its step is {step!r:.60}")
-    if not all(math.isfinite(value) for value in (extent, x, y, z)) or extent < 0:
-        raise ValueError("its extent or its world_offset is no such number")
+    if not all(math.isfinite(value) for value in (extent, x, y, z, scale)) or extent < 0 or scale <= 0:
+        raise ValueError("its extent, world_offset or world_scale is not valid")
     if background not in BACKGROUNDS or mode not in {mode.value for mode in RasterizeMode}:
         raise ValueError(f"its background is {background!r:.60}, its rasterize_mode {mode!r:.60}")
-    return CheckpointInfo(step, extent, (x, y, z), background, mode)
+    return CheckpointInfo(step, extent, (x, y, z), background, mode, scale)
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:

@@ -16,7 +16,6 @@ from dyngs.camera import Cameras
 from dyngs.camera_paths.aim import up_direction
 from dyngs.config import Config, DataConfig, HumanModel, StaticModel
 from dyngs.data.capture import Capture, Split, View
-from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError, counted
 from dyngs.files.wrong_place import command_for
 from dyngs.gaussians.scene import GaussianScene
@@ -24,7 +23,7 @@ from dyngs.human.avatar.loose import past_motion, remembering
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.motion.motion import MotionClip, captured_motion, motion_clip, same_bodies
 from dyngs.human.template.body_reader import load_template
-from dyngs.models.checkpoint import CheckpointInfo
+from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, training_cameras
 from dyngs.runs.avatar import SUFFIX as AVATAR_SUFFIX
@@ -47,10 +46,13 @@ T = TypeVar("T")
 
 
 class Captured:
-    """The capture that a scene was trained on; read when it is first needed, and only once, if not ``capture``."""
+    """The capture that a scene was trained on; read when it is first needed, and only once, if not ``capture``.
 
-    def __init__(self, data: DataConfig, capture: Capture | None = None) -> None:
-        self.data = data
+    It is in the scene coordinates of ``info``.
+    """
+
+    def __init__(self, data: DataConfig, info: CheckpointInfo, capture: Capture | None = None) -> None:
+        self.data, self._info = data, info
         self._found: Capture | DyngsError | None = capture
         self._kept: dict[str, Any] = {}
 
@@ -59,7 +61,7 @@ class Captured:
         """The capture. Raises DyngsError where it cannot be read."""
         if self._found is None:
             try:
-                self._found = read_capture(self.data)
+                self._found = read_capture_of(self.data, self._info)
             except DyngsError as error:
                 self._found = error
         if isinstance(self._found, DyngsError):
@@ -146,9 +148,16 @@ class Opened(LoadedRun):
         return np.asarray(self.info.world_offset if self.edited is None else self.edited.offset, np.float64)
 
     @property
+    def file_unit(self) -> Similarity:
+        """From scene coordinates to those of the capture's files less their offset."""
+        return Similarity(scale=self.info.world_scale)
+
+    @property
     def frame(self) -> Similarity:
         """From the scene, as it is drawn, to the frame it was given, else to the capture's files less their offset."""
-        return Similarity(inverse(self.turned)) if self.edited is None else self.edited.similarity
+        if self.edited is not None:
+            return self.edited.similarity
+        return Similarity(inverse(self.turned), self.info.world_scale)
 
     @property
     def world(self) -> Similarity:
@@ -273,7 +282,7 @@ class Opened(LoadedRun):
 
         played = None if person.played is None else there(person.played)
         scene = replace(person, clip=there(person.clip), played=played)
-        info = replace(self.info, world_offset=self.edited.offset)
+        info = replace(self.info, world_offset=self.edited.offset, world_scale=1.0)
         return replace(self, renderable=scene, info=info, edited=None, stated_up=None)
 
     def _person_for(self, wanted: str) -> tuple[HumanScene, HumanModel]:
@@ -325,7 +334,7 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
 def open_run(folder: Path, capture: Capture | None = None, data_root: Path | None = None) -> Opened:
     """Open a run folder at its newest checkpoint, see ``load_run``; ``capture`` is its own, if it is read already."""
     run = load_run(folder, data_root)
-    edited, captured = read_frame(folder), Captured(run.config.data, capture)
+    edited, captured = read_frame(folder), Captured(run.config.data, run.info, capture)
     opened = Opened(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
     if edited is None:
         return opened

@@ -36,17 +36,22 @@ def turned(
     """
     if rotation == _NO_TURN and scale == 1 and shift is None:
         return gaussians
-    wide = torch.tensor(rotation, dtype=torch.float64, device="cpu")
-    matrix = rotation_matrices(wide)
-    means = scale * (gaussians.means.double() @ matrix.T)
+    means, quats, sh = gaussians.means.double(), gaussians.quats, gaussians.sh
+    if rotation != _NO_TURN:
+        wide = torch.tensor(rotation, dtype=torch.float64, device="cpu")
+        matrix = rotation_matrices(wide)
+        means = means @ matrix.T
+        quats = quat_product(wide, quats.double()).to(quats.dtype)
+        sh = turned_harmonics(sh, matrix)
+    means = scale * means
     if shift is not None:
         means = means + shift.double()
     return Gaussians(
         means=means.to(gaussians.means.dtype),
-        quats=quat_product(wide, gaussians.quats.double()).to(gaussians.quats.dtype),
+        quats=quats,
         log_scales=gaussians.log_scales + float(np.log(scale)),
         logit_opacities=gaussians.logit_opacities,
-        sh=turned_harmonics(gaussians.sh, matrix),
+        sh=sh,
     )
 
 

@@ -158,6 +158,7 @@ class _Info(_Part):
     world_offset: tuple[float, float, float]
     background: str
     rasterize_mode: str
+    world_scale: float = 1.0
 
 
 class _Entry(_Part):

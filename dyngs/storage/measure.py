@@ -14,12 +14,11 @@ from dyngs.camera import Cameras
 from dyngs.config import Config
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import GaussianScene, render_options
 from dyngs.kinds import restored_model, restored_scene
-from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.storage.file import decoded, encoded
@@ -70,7 +69,7 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Renderable, max_
     of 255. None: what lowers their PSNR by ``LOSS_DB``, if it is independent of the scene's own errors.
     """
     try:
-        capture = read_capture(config.data)
+        capture = read_capture_of(config.data, checkpoint.info)
     except DyngsError:
         return StoragePlan(assumed_precision(scene.gaussians) if isinstance(scene, GaussianScene) else _ASSUMED)
     coarseness = None
@@ -78,7 +77,9 @@ def storage_plan(config: Config, checkpoint: Checkpoint, scene: Renderable, max_
         coarseness = coarseness_of(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     shots = _shots(config, capture, scene, COMPARED)
-    options = render_options(config.model) if isinstance(scene, GaussianScene) else scene.options
+    info, options = checkpoint.info, scene.options
+    if isinstance(scene, GaussianScene):
+        options = render_options(config.model, info.extent, info.world_scale)
 
     @torch.no_grad()
     def images(drawn: Renderable) -> list[Tensor]:

@@ -12,13 +12,13 @@ import torch
 from dyngs.api.train import num_cores
 from dyngs.config.io import load_resolved
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.errors import DyngsError, counted
 from dyngs.evaluate.report import scene_of_split, split_views
 from dyngs.evaluate.view_scores import Drawing
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.metrics import load_lpips
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU
@@ -104,7 +104,7 @@ class _Session:
     def __init__(self, runs: VariantRuns, plan: Plan, meter: MemoryMeter, log: Callable[[str], None]) -> None:
         config = load_resolved(runs.run_dir)
         self._runs, self._plan, self._meter, self._log = runs, plan, meter, log
-        self._capture = read_capture(config.data)
+        self._capture = read_capture_of(config.data, load_run(runs.run_dir).info)
         self._loader = ImageLoader(split_views(self._capture, plan.split), config.data)
         self._loader.device = plan.device
         self._background = evaluation_background(config.data.background, self._capture.has_alpha)[1].to(plan.device)

@@ -15,6 +15,7 @@ from dyngs.conventions import num_sh_terms
 from dyngs.errors import DyngsError
 from dyngs.export.scene_file import num_bytes_exact, write_scene_file
 from dyngs.kinds import assemble, restored_model
+from dyngs.models.checkpoint import read_capture_of
 from dyngs.ops.native import kernel_threads
 from dyngs.prune.stage import prune_
 from dyngs.runs.checkpoint import (
@@ -115,7 +116,7 @@ class VariantRuns:
         changes = [f"train.steps={checkpoint.info.step}", *self._where]
         config = load_resolved(source, [*changes, *_pruning_overrides(wanted, load_resolved(source).prune)])
         with kernel_threads(self.threads or num_cores()):
-            trainer = assemble(config, restored=True)
+            trainer = assemble(config, read_capture_of(config.data, checkpoint.info), restored=True)
             trainer.restore(checkpoint)
             prune_(trainer)
             return trainer.checkpoint(), config

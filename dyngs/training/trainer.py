@@ -177,7 +177,8 @@ class Trainer(Generic[M]):
     @property
     def info(self) -> CheckpointInfo:
         x, y, z = (float(value) for value in self.capture.world_offset)
-        return CheckpointInfo(self.done, self.extent, (x, y, z), self.background, self.model.rasterize_mode.value)
+        mode = self.model.rasterize_mode.value
+        return CheckpointInfo(self.done, self.extent, (x, y, z), self.background, mode, self.capture.world_scale)
 
     def checkpoint(self) -> Checkpoint:
         state = self.model.state()

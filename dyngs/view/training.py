@@ -112,7 +112,7 @@ def opened_training(trainer: Trainer[Any]) -> Opened:
     """Return the scene of a trainer with the views that it is trained on."""
     config, views = trainer.config, trainer.images.views
     shown, cameras = captured_views(views, config.data, trainer.images), cameras_for_paths(views, config.data)
-    captured = Captured(config.data, trainer.capture)
+    captured = Captured(config.data, trainer.info, trainer.capture)
     captured.once("views", lambda: shown)
     captured.once("cameras", lambda: cameras)
     with torch.no_grad():

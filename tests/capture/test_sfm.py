@@ -11,10 +11,10 @@ import pycolmap
 import pytest
 from skimage.transform import resize_local_mean
 
+from dyngs.api.load import read_capture
 from dyngs.capture.sfm import SfmResult, estimate_poses
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.data.capture import all_views
-from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
 from dyngs.errors import DyngsError
 from dyngs.export.video import VideoWriter

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, body_frames, moved, numbered, read_body_file, rows_of, with_fitted_body
 from dyngs.data.capture import BodyFrames, Capture, Splits, View
-from dyngs.data.read import read_capture
 from dyngs.errors import DyngsError
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tiny_captures import opengl_pose
 
 from dyngs.data.body_frames import body_frames, of_one_clip
-from dyngs.data.capture import Capture, PointCloud, View
+from dyngs.data.capture import Capture, PointCloud, View, all_views
 from dyngs.data.geometry import (
     cam_from_opengl,
     camera_center,
@@ -21,7 +21,16 @@ from dyngs.data.geometry import (
     projected,
     times_seen,
 )
-from dyngs.data.scene_space import FAR_PER_BASELINE, depth_bounds, outside_of_cube, points_in_frusta, recenter, shifted
+from dyngs.data.scene_space import (
+    FAR_PER_BASELINE,
+    SMALLEST_EXTENT,
+    depth_bounds,
+    expressed,
+    extent_of,
+    normalised,
+    outside_of_cube,
+    points_in_frusta,
+)
 from dyngs.errors import DyngsError
 
 
@@ -90,54 +99,99 @@ def capture_at(offset: np.ndarray, radius: float = 4.0, count: int = 6) -> Captu
     return Capture(Path(), "colmap", {"train": views[:-1], "test": views[-1:]}, points)
 
 
+def scaled(capture: Capture, factor: float) -> Capture:
+    """Return the capture as if its files had a unit of length ``1 / factor`` as long."""
+    capture = expressed(capture, 1 / factor, np.zeros(3))
+    return capture.replace(world_scale=1.0)
+
+
+def file_centers(capture: Capture) -> np.ndarray:
+    """Return the camera centres (V, 3) in the coordinates of the files."""
+    centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
+    return capture.world_scale * centers + capture.world_offset
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-5e6, 5e6), min_size=3, max_size=3).filter(lambda xs: np.linalg.norm(xs) > 2e5))
 def test_far_world_comes_to_the_origin_and_back(offset: list[float]) -> None:
-    """The scene keeps its shape to 1e-8 units (float64 at 1e6 has 1e-10), and adding the offset restores it."""
+    """The scene keeps its shape to 1e-8 units (float64 at 1e6 has 1e-10), and the offset restores it."""
     before = capture_at(np.array(offset))
-    after = recenter(before)
+    after = normalised(before)
     assert np.linalg.norm(after.world_offset - offset) < 10
-    near = capture_at(np.zeros(3))
-    for split in ("train", "test"):
-        for moved, view in zip(after.splits[split], near.splits[split], strict=True):
-            center = camera_center(moved.cam_from_world) + after.world_offset - offset
-            np.testing.assert_allclose(center, camera_center(view.cam_from_world), atol=1e-8)
-            np.testing.assert_array_equal(moved.cam_from_world[:3, :3], view.cam_from_world[:3, :3])
+    np.testing.assert_allclose(file_centers(after), file_centers(before), rtol=0, atol=1e-8)
+    for moved, view in zip(all_views(after.splits), all_views(before.splits), strict=True):
+        np.testing.assert_array_equal(moved.cam_from_world[:3, :3], view.cam_from_world[:3, :3])
     assert after.points is not None
     assert before.points is not None
-    np.testing.assert_allclose(after.points.xyz + after.world_offset, before.points.xyz, rtol=0, atol=1e-8)
+    xyz = after.world_scale * after.points.xyz + after.world_offset
+    np.testing.assert_allclose(xyz, before.points.xyz, rtol=0, atol=1e-8)
 
 
-def test_projection_does_not_change() -> None:
-    before = capture_at(np.array([1e6, -2e6, 3e5]))
-    after = recenter(before)
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 300.0])
+def test_projection_does_not_change(scale: float) -> None:
+    before = scaled(capture_at(np.array([1e6, -2e6, 3e5])), scale)
+    after = normalised(before)
     assert before.points is not None
     assert after.points is not None
     for old, new in zip(before.splits["train"], after.splits["train"], strict=True):
         wanted = before.points.xyz @ old.cam_from_world[:3, :3].T + old.cam_from_world[:3, 3]
         found = after.points.xyz @ new.cam_from_world[:3, :3].T + new.cam_from_world[:3, 3]
-        np.testing.assert_allclose(found, wanted, atol=1e-8)
+        np.testing.assert_allclose(found * after.world_scale, wanted, atol=1e-8 * scale)
 
 
-@pytest.mark.parametrize(("distance", "radius", "moves"), [(5.0, 4.0, False), (9e4, 40, False), (9e4, 4.0, True)])
+@pytest.mark.parametrize("scale", [2.0**-13, 2.0**-4, 2.0**10])
+@pytest.mark.parametrize("offset", [0.0, 5e7])
+def test_power_of_two_scale_gives_the_same_scene_coordinates(scale: float, offset: float) -> None:
+    before = capture_at(np.array([offset, 0.0, 0.0]))
+    one, other = normalised(before), normalised(scaled(before, scale))
+    assert other.world_scale == scale * one.world_scale
+    np.testing.assert_array_equal(other.world_offset, scale * one.world_offset)
+    for a, b in zip(all_views(one.splits), all_views(other.splits), strict=True):
+        np.testing.assert_array_equal(a.cam_from_world, b.cam_from_world)
+    assert one.points is not None
+    assert other.points is not None
+    np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 0.05, 0.7, 1.0, 1e5])
+def test_extent_of_a_normalised_scene(scale: float) -> None:
+    capture = normalised(scaled(capture_at(np.zeros(3)), scale))
+    centers = np.array([camera_center(view.cam_from_world) for view in all_views(capture.splits)])
+    assert SMALLEST_EXTENT <= extent_of(centers) < 2 * SMALLEST_EXTENT
+
+
+@pytest.mark.parametrize(("distance", "radius", "moves"), [(5.0, 4.0, False), (350, 4.0, False), (900, 4.0, True)])
 def test_only_far_scenes_move(distance: float, radius: float, moves: bool) -> None:
     capture = capture_at(np.array([distance, 0, 0]), radius)
-    assert (recenter(capture) is not capture) == moves
+    assert normalised(capture).world_offset.any() == moves
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-9])
 def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
-    """All centres coincide, so the spread is no measure; random points around the origin must stay in its view."""
+    """All centres coincide, so nothing tells a length; random points around the origin must stay in its view."""
     view = capture_at(np.zeros(3)).splits["train"][0]
     moved = [view.cam_from_world + np.diag([jitter * i, 0, 0], 1) for i in range(5)]
     views = tuple(View(str(i), view.image_path, pose, np.eye(3), 1, 1) for i, pose in enumerate(moved))
     capture = Capture(Path(), "blender", {"train": views})
-    assert recenter(capture) is capture
+    assert normalised(capture) is capture
 
 
-def test_offsets_add_up() -> None:
-    twice = shifted(shifted(capture_at(np.zeros(3)), np.array([1.0, 2, 3])), np.array([10.0, 0, 0]))
-    np.testing.assert_array_equal(twice.world_offset, [11, 2, 3])
+def test_fixed_camera_gets_its_unit_from_the_points() -> None:
+    before = scaled(capture_at(np.zeros(3)), 1e-3)
+    view = before.splits["train"][0]
+    capture = normalised(before.replace(splits={"train": (view,)}))
+    assert capture.points is not None
+    depth = np.median(np.linalg.norm(capture.points.xyz - camera_center(capture.splits["train"][0].cam_from_world)))
+    assert 1 < depth < 20
+
+
+def test_capture_in_the_coordinates_of_its_files_and_back() -> None:
+    before = capture_at(np.array([3e4, 0.0, 0.0]), radius=0.01)
+    after = normalised(before)
+    assert after.world_scale != 1
+    assert after.world_offset.any()
+    np.testing.assert_allclose(file_centers(expressed(after, 1.0, np.zeros(3))), file_centers(before), atol=1e-11)
+    assert expressed(after, after.world_scale, after.world_offset) is after
 
 
 def test_inverse_of_a_pose() -> None:
@@ -160,9 +214,18 @@ def test_infinite_position_is_an_error() -> None:
         checked_pose(pose, "here")
 
 
-def test_bodies_move_with_the_cameras() -> None:
-    body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[1e6, 2.0, 3.0]], np.zeros(10))
+def test_bodies_move_and_scale_with_the_cameras() -> None:
+    body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[1e6, 2.0, 3.0]], np.zeros(10), scale=0.5)
     capture = Capture(Path("x"), "blender", {}).replace(body=of_one_clip(body))
-    moved = shifted(capture, np.array([1e6, 0.0, 0.0]))
+    moved = expressed(capture, 0.5, np.array([1e6, 0.0, 0.0]))
     assert moved.body is not None
-    assert moved.body["train"].trans.tolist() == [[0.0, 2.0, 3.0]]
+    assert moved.body["train"].trans.tolist() == [[0.0, 4.0, 6.0]]
+    assert moved.body["train"].scale.tolist() == [1.0]
+
+
+def test_unit_of_people_is_the_metre() -> None:
+    body = body_frames(Path("b"), [0], np.zeros((1, 72)), [[0.1, 2.0, 3.0]], np.zeros(10), scale=1e-3)
+    capture = normalised(capture_at(np.zeros(3)).replace(body=of_one_clip(body)))
+    assert capture.world_scale == 2.0**-10
+    assert capture.body is not None
+    assert capture.body["train"].scale.tolist() == [1.024]

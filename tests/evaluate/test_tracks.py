@@ -181,7 +181,7 @@ def test_the_true_motion_of_the_benchmark_follows_the_true_tracks(
     pairs = list(
         zip(capture.splits["test"], training_cameras(capture.splits["test"], trainer.config.data), strict=True)
     )
-    truth = read_true_tracks(root, capture.world_offset)
+    truth = read_true_tracks(capture)
     found = track_scores(opaque, truth, pairs, all_views(capture.splits))
     assert found.error_px is not None
     assert found.motion_px is not None

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from dyngs.section import Positive, Section
+from dyngs.section import Length, Section
 
 
 class PointsInit(Section):
@@ -29,8 +29,10 @@ class PointsInit(Section):
     num_random: int = Field(
         default=20_000, ge=1, description="number of random points; auto: where there are no others"
     )
-    half_extent: Positive = Field(
-        default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
+    half_extent: Length = Field(
+        default="auto",
+        description="half the side of their cube around the origin (Blender scenes), in the unit of the capture; auto: "
+        "a quarter of the scene extent, 1.3 in NeRF-synthetic scenes",
     )
 
 
@@ -41,8 +43,10 @@ class RandomInit(Section):
     num_random: int = Field(
         default=20_000, ge=1, description="number of random points; auto: where there are no others"
     )
-    half_extent: Positive = Field(
-        default=1.3, description="half the side of their cube around the origin, world units (Blender scenes)"
+    half_extent: Length = Field(
+        default="auto",
+        description="half the side of their cube around the origin (Blender scenes), in the unit of the capture; auto: "
+        "a quarter of the scene extent, 1.3 in NeRF-synthetic scenes",
     )
 
 
@@ -50,7 +54,7 @@ class SceneInit(Section):
     """Go on from a scene that was trained before; a model of a still scene."""
 
     num_random: ClassVar[int] = 1
-    half_extent: ClassVar[float] = 1.0
+    half_extent: ClassVar[Length] = "auto"
     """Of a placeholder, where a checkpoint is read instead."""
 
     kind: Literal["scene"] = Field(default="scene", description="the Gaussians of a scene (`dyngs train --from`)")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from stage_videos import camera, corner, write_videos
 
+from dyngs.api.load import read_capture
 from dyngs.capture.multi_video.estimate import poses_of_videos
 from dyngs.capture.sfm_work import SfmOptions
 from dyngs.data.capture import all_views
-from dyngs.data.read import read_capture
 from dyngs.data.times import static_cameras
 from dyngs.errors import DyngsError
 from dyngs.export.video import VideoWriter

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tiny_captures import edit_json, opengl_pose, pixel_of, random_pixels, write_frames, write_image
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View
 from dyngs.data.images.images import read_image
-from dyngs.data.read import read_capture
 from dyngs.data.readers.blender import BODY_FORMAT, FORMAT, read_blender, read_body_json, read_nerfstudio
 from dyngs.data.readers.transforms import view_name
 from dyngs.errors import DyngsError

@@ -9,9 +9,9 @@ import pytest
 import torch
 from tiny_captures import opengl_pose, random_pixels, write_colmap, write_image
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.images.lens import distort
-from dyngs.data.read import read_capture
 from dyngs.data.readers.colmap import check_model_file, find_model, is_colmap, pinhole_and_lens, read_colmap
 from dyngs.errors import DyngsError
 

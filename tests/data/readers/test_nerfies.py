@@ -11,10 +11,10 @@ import pytest
 import torch
 from tiny_captures import SIDE_PIXELS, edit_json, pixel_of, random_pixels, write_image, write_nerfies
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.images.lens import distort
-from dyngs.data.read import read_capture
 from dyngs.data.readers.nerfies import read_nerfies
 from dyngs.errors import DyngsError
 

@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_captures import write_colmap, write_image
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
-from dyngs.data.read import read_capture
 from dyngs.data.readers.neuman import FORMAT, read_neuman
 from dyngs.errors import DyngsError
 

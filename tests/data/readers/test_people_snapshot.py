@@ -12,9 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.images.maps import cut_out
-from dyngs.data.read import read_capture
 from dyngs.data.readers.people_snapshot import FORMAT, read_people_snapshot
 from dyngs.errors import DyngsError
 

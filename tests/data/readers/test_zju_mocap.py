@@ -12,10 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_captures import pixel_of, random_pixels, side_poses, write_image
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
-from dyngs.data.read import read_capture
 from dyngs.data.readers.zju_mocap import FORMAT, read_zju_mocap
 from dyngs.errors import DyngsError
 

@@ -11,6 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from dyngs.api.load import read_capture
 from dyngs.capture.inspection.report import inspect_capture
 from dyngs.cli import main
 from dyngs.cli.data import SYNTHETIC_SCENES
@@ -18,7 +19,6 @@ from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.geometry import camera_center
 from dyngs.data.people_set import PEOPLE_FILE
-from dyngs.data.read import read_capture
 from dyngs.data.synthetic import raytrace
 from dyngs.data.synthetic.captures import (
     POINTS_PER_THING,

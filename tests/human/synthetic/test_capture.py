@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import cam_from_opengl
-from dyngs.data.read import read_capture
 from dyngs.data.synthetic.raytrace import CAMERA_ANGLE_X
 from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
@@ -382,7 +382,7 @@ def test_a_walk_is_seen_once_per_time_and_its_true_tracks_lie_on_the_person(tmp_
     assert [view.time for view in train] == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert [view.time for view in test] == [0.125, 0.625]
     assert len({view.cam_from_world.tobytes() for view in (*train, *test)}) == 7
-    tracks = read_true_tracks(capture.root, np.zeros(3))
+    tracks = read_true_tracks(capture)
     assert tracks is not None
     assert tracks.points.shape == (9, POINTS, 3)
     for view in (*train, *test):

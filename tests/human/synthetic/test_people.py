@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
+from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.loader import ImageLoader
 from dyngs.data.people_set import captures_in
-from dyngs.data.read import read_capture
 from dyngs.data.tracks import read_true_tracks
 from dyngs.errors import DyngsError
 from dyngs.human.synthetic.keypoints import KEYPOINTS_FILE, NUM_KEYPOINTS
@@ -74,7 +73,7 @@ def test_depth_and_silhouettes_agree_between_views(root: Path) -> None:
 def test_key_points_lie_in_the_person(root: Path) -> None:
     for data in captures_in(DataConfig(root=root, test_every=0)):
         capture = read_capture(data)
-        found = read_true_tracks(capture.root, np.zeros(3), KEYPOINTS_FILE)
+        found = read_true_tracks(capture, KEYPOINTS_FILE)
         assert found is not None
         assert found.points.shape == (1, NUM_KEYPOINTS, 3)
         assert found.visible.shape == (3, NUM_KEYPOINTS)
