@@ -30,7 +30,8 @@ def look_at_point(cameras: Cameras) -> np.ndarray:
         return point
     mean_axis = axes.mean(axis=0)
     forward = unit(mean_axis) if np.linalg.norm(mean_axis) > 1e-6 else axes[0]
-    return middle + 3.0 * (spread if spread > 1e-9 else 1.0) * forward
+    apart = spread > 1e-6 * float(np.abs(centers).max())  # more than poses in float32 are rounded by
+    return middle + 3.0 * (spread if apart else 1.0) * forward
 
 
 def up_direction(cameras: Cameras) -> np.ndarray:
@@ -57,7 +58,7 @@ def _mean_up(poses: np.ndarray) -> np.ndarray:
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return the OpenCV camera-to-world pose (4, 4) at ``eye``, z towards ``target``, y away from ``up``."""
     forward = target - eye
-    forward = unit(forward) if np.linalg.norm(forward) > 1e-12 else perpendicular(up)
+    forward = unit(forward) if np.linalg.norm(forward) > 1e-12 * np.linalg.norm(eye) else perpendicular(up)
     right = np.cross(forward, up)
     right = unit(right) if np.linalg.norm(right) > 1e-6 * np.linalg.norm(up) else perpendicular(forward)
     pose = np.eye(4)

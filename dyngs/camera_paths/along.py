@@ -40,7 +40,7 @@ def path_along(
         found = CameraPath(with_poses(cameras, _smoothed(poses[order], way, steps, up)))
         return CameraPath(found.cameras, times=tuple(steps.tolist()))
     features = _features(poses, look_at_point(cameras))
-    features, first = np.unique(features.round(9), axis=0, return_index=True)
+    features, first = np.unique(_rounded(features), axis=0, return_index=True)
     given = np.argsort(first)  # np.unique sorts; back to the order of the capture
     order = _walk(features[given])
     visited = poses[first[given][order]]
@@ -57,6 +57,12 @@ def _features(poses: np.ndarray, target: np.ndarray) -> np.ndarray:
     centers = poses[:, :3, 3]
     reach = float(np.linalg.norm(centers - target, axis=1).mean())
     return np.concatenate([centers, reach * poses[:, :3, 2]], axis=1)
+
+
+def _rounded(features: np.ndarray) -> np.ndarray:
+    """Return ``features`` (V, D) to nine digits of the largest, so that equal poses are equal in any unit of length."""
+    step = 1e-9 * (float(np.abs(features).max()) or 1.0)
+    return step * (features / step).round()
 
 
 def _walk(features: np.ndarray) -> np.ndarray:
@@ -95,7 +101,7 @@ def _untangled(way: np.ndarray, between: np.ndarray) -> bool:
         turned = between[way[i], way[i + 1 :]] + np.append(between[way[i + 1], way[i + 2 :]], 0.0)
         gain = between[way[i], way[i + 1]] + stays - turned
         best = int(gain.argmax())
-        if gain[best] > 1e-9:
+        if gain[best] > 1e-9 * between.max():
             way[i + 1 : i + 2 + best] = way[i + 1 : i + 2 + best][::-1].copy()
             changed = True
     return changed

@@ -67,7 +67,7 @@ class Orbit:
             near /= near.sum(axis=1, keepdims=True)
             radii, heights = near @ self.radii, near @ self.heights
         smallest = 0.1 * float(np.hypot(self.radii, self.heights).mean())
-        radii = np.maximum(radii, max(smallest, 1e-6))
+        radii = np.maximum(radii, smallest)
         turned = azimuths + self.middle
         arms = np.cos(turned)[:, None] * self.level[0] + np.sin(turned)[:, None] * self.level[1]
         return self.center + heights[:, None] * self.up + radii[:, None] * arms
@@ -82,7 +82,7 @@ def orbit_of(cameras: Cameras, up: np.ndarray | None = None) -> Orbit:
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
     radii = np.linalg.norm(flat, axis=1)
-    beside = np.flatnonzero(radii > 1e-6)
+    beside = np.flatnonzero(radii > 1e-6 * np.linalg.norm(offsets, axis=1).max())
     axis_x = unit(flat[beside[0]]) if len(beside) else perpendicular(up)
     level = np.stack([axis_x, np.cross(up, axis_x)])
     angles = np.arctan2(flat @ level[1], flat @ level[0])
@@ -129,12 +129,17 @@ def spiral_path(
 
 
 def frame_orbit_for_points(
-    means: np.ndarray, num_frames: int, size: tuple[int, int] = (960, 720), up: tuple[float, float, float] = (0, 0, 1)
+    means: np.ndarray,
+    num_frames: int,
+    size: tuple[int, int] = (960, 720),
+    up: tuple[float, float, float] = (0, 0, 1),
+    least: float = 0.0,
 ) -> Cameras:
     """Return an orbit around a set of points whose robust extent fills the image.
 
     The centre is the median. The extent is the sphere around it that holds 99% of the points (N, 3) within the 1st to
-    99th percentile of every axis, so that outliers have no effect; those that are not finite are ignored.
+    99th percentile of every axis, so that outliers have no effect; those that are not finite are ignored. It is
+    ``least`` at least, such as the size of what the points stand for; 1 where both are 0.
 
     Raises:
         DyngsError: no finite point, or a zero up direction.
@@ -149,7 +154,7 @@ def frame_orbit_for_points(
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     points = inside if len(inside) else points
     center = np.median(points, axis=0)
-    extent = max(float(np.quantile(np.linalg.norm(points - center, axis=1), 0.99)), 1e-3)
+    extent = max(float(np.quantile(np.linalg.norm(points - center, axis=1), 0.99)), least) or 1.0
     width, height = size
     half_fov = math.radians(25.0)
     focal = 0.5 * max(width, height) / math.tan(half_fov)

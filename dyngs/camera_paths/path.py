@@ -101,11 +101,25 @@ def write_path(file: Path, path: CameraPath, world_offset: np.ndarray | None = N
     for i in range(len(cameras)):
         pose, k = cameras.cam_from_world[i].detach().cpu().double().numpy().copy(), cameras.intrinsics[i].tolist()
         if world_offset is not None:
-            pose[:3, 3] -= pose[:3, :3] @ world_offset
+            pose = world_pose(pose, world_offset)
         frame = {"cam_from_world": pose.tolist(), "fl_x": k[0][0], "fl_y": k[1][1], "cx": k[0][2], "cy": k[1][2]}
         frames.append(frame if path.times is None else frame | {"time": path.times[i]})
     document = {"width": cameras.width, "height": cameras.height, "fps": path.fps, "frames": frames}
     write_text(file, json.dumps(document, indent=1) + "\n")
+
+
+def world_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return a ``cam_from_world`` pose (4, 4) with ``offset`` (3,) added to the camera's centre, in float64.
+
+    Its rotation is made orthonormal: readers do that, and a far camera must not move by it.
+    """
+    if not np.any(offset):
+        return pose
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    moved = np.eye(4)
+    moved[:3, :3] = left @ right
+    moved[:3, 3] = pose[:3, 3] - moved[:3, :3] @ offset
+    return moved
 
 
 def read_path(file: Path, world_offset: np.ndarray | None = None) -> CameraPath:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from dyngs.errors import DyngsError, counted
 from dyngs.export.splat_files import splats_at, up_of
 from dyngs.runs.opened import open_scene
@@ -20,13 +22,18 @@ def merged(
 ) -> SplatFile:
     """Return the contents with those of more files or runs, whose up is brought to ``up`` (3,) first.
 
-    Harmonics get the largest degree of all. Raises DyngsError: one cannot be read, or moves.
+    Scenes far from the origin lie as in the world. Harmonics get the largest degree of all. Raises DyngsError: one
+    cannot be read, or moves.
     """
     parts = [splat.gaussians.detach()]
     for file in files:
         other, direction = _still(file)
         gaussians = other.gaussians
-        if up is not None and direction is not None:
+        if any(splat.world_offset) and any(other.world_offset):  # then the world says how they lie to each other
+            x, y, z = (np.array(other.world_offset) - splat.world_offset).tolist()
+            between = splat.frame.after(Similarity(shift=(x, y, z))).after(other.frame.inverse())
+            gaussians = between.gaussians(gaussians)
+        elif up is not None and direction is not None:
             gaussians = Similarity(turn_between(tuple(direction), tuple(up))).gaussians(gaussians)
         if splat_options(other) != splat_options(splat):
             tell(f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is")

@@ -154,7 +154,8 @@ def _opened(source: Path, data_root: Path | None) -> _Source:
     if source.is_file() and known_format(source) is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
         opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), source)
-        return _Source(replace(opened, stated_up=splat.up, notes=splat.notes), splat, format_of(source).up)
+        info = replace(opened.info, world_offset=splat.file_offset)
+        return _Source(replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, format_of(source).up)
     return _Source(open_scene(source, data_root=data_root))
 
 
@@ -166,7 +167,7 @@ def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
     count = int(rows.sum())
     if not count:
         points = found.opened.world.points(scene.at(None).means.cpu().numpy())
-        low, high = (", ".join(f"{x:.4g}" for x in end.tolist()) for end in (points.min(0), points.max(0)))
+        low, high = (", ".join(f"{x:.10g}" for x in end.tolist()) for end in (points.min(0), points.max(0)))
         raise DyngsError(
             f"{source}: --crop leaves none of {counted(len(scene), 'Gaussian')}; they lie between {low} and {high}"
         )

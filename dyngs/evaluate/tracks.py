@@ -217,5 +217,5 @@ def _pixels(points: np.ndarray, cameras: Cameras) -> np.ndarray:
     """Return the (P, 2) pixels of ``points`` (P, 3); NaN of those behind the camera."""
     pose, intrinsics = (x[0].cpu().double().numpy() for x in (cameras.cam_from_world, cameras.intrinsics))
     local = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = np.where(local[:, 2:] > 1e-6, local[:, 2:], np.nan)
+    depth = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
     return (local / depth) @ intrinsics[:2].T

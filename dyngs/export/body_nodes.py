@@ -21,7 +21,14 @@ from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
 from dyngs.splats.gltf import EXTENSION, add_gaussians
 from dyngs.splats.similarity import Similarity
-from dyngs.splats.splat_file import SplatFile, require_writable, unit_rotations, with_degree
+from dyngs.splats.splat_file import (
+    SplatFile,
+    header_comments,
+    offset_notes,
+    require_writable,
+    unit_rotations,
+    with_degree,
+)
 
 SUFFIX = ".glb"
 _MOST_DEGREE = 3  # of harmonics in the file
@@ -73,6 +80,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
         meshes.append({"name": node["name"], "primitives": [add_gaussians(document, own)]})
         nodes.append(node)
     document.add_animation("motion", moments * opened.seconds, channels)
+    document.json["asset"]["extras"] = header_comments(splat)
     document.json |= {
         "extensionsUsed": [EXTENSION],
         "scene": 0,
@@ -84,7 +92,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
         document.write(temporary)
     notes = [f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}"]
     notes.append(f"all else and shadows stand as at time {time:g}; a sequence has their motion")
-    return BodiesFile(path, splat, tuple(notes))
+    return BodiesFile(path, splat, (*notes, *offset_notes(splat, "the file states it")))
 
 
 @dataclass(frozen=True)

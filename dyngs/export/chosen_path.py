@@ -99,7 +99,10 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
     times = np.linspace(0, 1, _SAMPLED_TIMES).tolist() if moves else [None]
     means = torch.cat([points_at(scene, time) for time in times]).cpu().numpy()
     x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
-    return frame_orbit_for_points(means, count, size, (x, y, z))
+    least = 0.0
+    if isinstance(scene, GaussianScene):
+        least = float(scene.gaussians.log_scales.detach().amax(1).median().exp())
+    return frame_orbit_for_points(means, count, size, (x, y, z), least)
 
 
 def points_at(scene: Renderable, time: float | None = None) -> Tensor:

@@ -26,7 +26,7 @@ from dyngs.splats.formats import Written, fitted, format_named, moved_file, turn
 from dyngs.splats.rotation import AXES, axis_of, nearest_axis, turn_between
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.sog_levels import write_sog_levels
-from dyngs.splats.splat_file import SplatFile, drawable, from_linear, geo_comment, unit_rotations
+from dyngs.splats.splat_file import SplatFile, drawable, from_linear, geo_comment, offset_notes, unit_rotations
 
 Part = Literal["all", "moving", "still"]
 
@@ -301,7 +301,10 @@ def write_moving(
     data = writer.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
-    notes = (f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",)
+    notes = (
+        f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",
+        *offset_notes(splats[0], "4dgs cannot state it"),
+    )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
         notes = (*notes, "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians")
     return MovingFile(path, splats, notes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from dyngs.ops.patches import MOST_SEGMENTS
 from dyngs.ops.rays import Space
 from dyngs.runs.inputs import inputs_of
 from dyngs.runs.opened import Opened
+from dyngs.splats.ply_header import header_bytes
+from dyngs.splats.similarity import far_offset
 from dyngs.triangles import mesh as triangles
 from dyngs.triangles.scene import TriangleScene
 
@@ -72,16 +75,48 @@ def write_surface(opened: Opened, out: Path, *, time: float = 0.0, cut: Cut | No
     if out.suffix.lower() not in SUFFIXES:
         raise DyngsError(f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}")
     inputs_of(opened).require_output(out)
-    import trimesh
-
     surface = _surface(opened, time, cut)
     vertices = opened.world.points(surface.vertices)
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
-    mesh = trimesh.Trimesh(vertices, surface.faces, vertex_colors=colours, process=False)
+    data = _mesh_bytes(out.suffix.lower(), vertices, surface.faces, colours)
     with atomic_file(out) as temporary:
-        data: Any = mesh.export(file_type=out.suffix.lower()[1:])
-        temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+        temporary.write_bytes(data)
     return surface
+
+
+def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
+    """Return the file of a mesh; vertices (V, 3) too far from the origin for float32 are written with more digits."""
+    import trimesh
+
+    detail = float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
+    offset = far_offset(vertices, detail)
+    if suffix == ".ply" and offset.any():
+        return _double_ply(vertices, faces, colours)
+    mesh: Any = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+    if suffix == ".obj":
+        decimals = 8 if detail == 0 else max(8, 3 - math.floor(math.log10(detail)))
+        return mesh.export(file_type="obj", digits=decimals).encode("utf-8")
+    if suffix == ".ply":
+        return mesh.export(file_type="ply")
+    mesh.vertices = vertices - offset
+    scene: Any = trimesh.Scene()
+    scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(offset))
+    return scene.export(file_type="glb")
+
+
+def _double_ply(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
+    names = ("red", "green", "blue")
+    rows = np.empty(len(vertices), [*((name, "<f8") for name in "xyz"), *((name, "u1") for name in names)])
+    for i, name in enumerate("xyz"):
+        rows[name] = vertices[:, i]
+    for i, name in enumerate(names):
+        rows[name] = colours[:, i]
+    corners = np.empty(len(faces), [("count", "u1"), ("rows", "<i4", 3)])
+    corners["count"] = 3
+    corners["rows"] = faces
+    properties = [*(("double", name) for name in "xyz"), *(("uchar", name) for name in names)]
+    elements = [("vertex", len(rows), properties), ("face", len(faces), [("list uchar int", "vertex_indices")])]
+    return header_bytes(elements) + rows.tobytes() + corners.tobytes()
 
 
 def _surface(opened: Opened, time: float, cut: Cut) -> Surface:

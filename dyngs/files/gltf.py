@@ -141,6 +141,7 @@ class _Extensions(_Part):
 
 class _Asset(_Part):
     version: Annotated[str, Field(pattern=r"^2\.")]
+    extras: object = None
 
 
 class _Document(_Part):

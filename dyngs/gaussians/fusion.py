@@ -96,10 +96,11 @@ def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Te
     """Return columns, rows, and z of ``points`` (N, 3), and which of them lie in the image; others have pixel 0."""
     pose, inner = camera.cam_from_world[0], camera.intrinsics[0]
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    safe = z.clamp_min(1e-6)
+    before = z > 0
+    safe = torch.where(before, z, 1.0)
     column = (inner[0, 0] * x / safe + inner[0, 2]).floor()
     row = (inner[1, 1] * y / safe + inner[1, 2]).floor()
-    inside = (z > 1e-6) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    inside = before & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
     return torch.where(inside, column, 0).long(), torch.where(inside, row, 0).long(), z, inside
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -21,6 +22,8 @@ from dyngs.splats.splat_file import (
     Nonfinite,
     SplatFile,
     drawable,
+    near_origin,
+    offset_notes,
     require_writable,
     unit_rotations,
     with_degree,
@@ -37,11 +40,13 @@ class Format:
     max_degree: int  # largest degree of the harmonics that it holds
     states_mode: bool  # whether it can say that the scene is antialiased
     home: tuple[str, str, str]  # module and the names of its reader and its writer
+    # smallest and largest logarithm of a size that it holds
+    log_scales: tuple[float, float] = (-math.inf, math.inf)
 
     @property
     def holds_comments(self) -> bool:
         """Return whether its files say how they were turned and edited; beside others lies a note about edits."""
-        return self.home[0] == "ply"
+        return self.home[0] in ("ply", "gltf", "usd", "sog")
 
     @property
     def reader(self) -> Callable[[Path], SplatFile]:
@@ -57,13 +62,14 @@ class Format:
 FORMATS = (
     Format("compressed-ply", (".compressed.ply",), "-y", 3, True, ("ply", "read_ply", "write_compressed")),
     Format("ply", (".ply",), "-y", 4, True, ("ply", "read_ply", "write_ply")),
-    Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz")),
+    Format("spz", (".spz",), "y", 3, True, ("spz", "read_spz", "write_spz"), (-10.0, 5.9375)),
     Format("splat", (".splat",), "-y", 0, False, ("antimatter", "read_antimatter", "write_antimatter")),
     Format("sog", (".sog",), "-y", 3, True, ("sog", "read_sog", "write_sog")),
     Format("glb", (".glb",), "y", 3, False, ("gltf", "read_gltf", "write_gltf")),
     Format("usd", (".usdc", ".usd", ".usda"), "y", 4, False, ("usd", "read_usd", "write_usd")),
 )
 """All formats; a suffix that ends another one stands after it."""
+_MOST_LOST = 0.01  # fraction of the Gaussians that may be of a size that a format does not hold, without a note
 
 
 @dataclass(frozen=True)
@@ -123,9 +129,9 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
         splat = own.reader(path)
         if splat.up is None:
             splat = replace(splat, up=own.up)
-        if not own.holds_comments:
+        if splat.edited == UNMOVED and own.home[0] != "ply":
             splat = replace(splat, edited=read_note(path))
-        return drawable(splat, path, nonfinite)
+        return drawable(near_origin(splat), path, nonfinite)
 
 
 def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
@@ -165,6 +171,13 @@ def fitted(path: Path, own: Format, splat: SplatFile, sh_degree: int | None) -> 
         notes.append(f"harmonics above degree {degree} are left out: {why}")
     if splat.mode is RasterizeMode.ANTIALIASED and not own.states_mode:
         notes.append(f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker")
+    smallest, largest = own.log_scales
+    longest = gaussians.log_scales.amax(1)
+    lost = int(((longest < smallest) | (longest > largest)).sum())
+    if lost > _MOST_LOST * len(gaussians):
+        held = f"{own.name} holds sizes from {math.exp(smallest):.2g} to {math.exp(largest):.2g}"
+        notes.append(f"{held}, those of {lost:,} Gaussians are changed: `dyngs edit --scale` gives another unit")
+    notes += offset_notes(splat, "the file states it" if own.holds_comments else f"{own.name} cannot state it")
     return replace(splat, gaussians=_unit(with_degree(gaussians, degree))), tuple(notes)
 
 

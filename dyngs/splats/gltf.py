@@ -18,7 +18,14 @@ from dyngs.files.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats.rotation import joined, placed
-from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, from_linear
+from dyngs.splats.splat_file import (
+    MOST_GAUSSIANS,
+    SplatFile,
+    described,
+    from_linear,
+    header_comments,
+    stored_comments,
+)
 
 EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
@@ -40,12 +47,13 @@ def read_gltf(path: Path) -> SplatFile:
         found.append(own)
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
-    return SplatFile(joined(found))
+    return described(SplatFile(joined(found), comments=stored_comments(file.document.asset.extras)), path)
 
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
     """Write a .glb with one primitive of Gaussians, harmonics up to degree 3."""
     document = GlbDocument()
+    document.json["asset"]["extras"] = header_comments(splat)
     document.json |= {
         "extensionsUsed": [EXTENSION],
         "scene": 0,

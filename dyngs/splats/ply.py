@@ -46,7 +46,8 @@ _MOST_LOG = 20.0
 def read_ply(path: Path) -> SplatFile:
     """Read a .ply, plain or compressed, binary or ascii, whatever its values are; properties may have any order.
 
-    Scalar types other than float32 are converted; other properties, and elements other than ``vertex``, are skipped.
+    Means of a plain .ply are float64. Scalar types other than float32 are converted; other properties, and elements
+    other than ``vertex``, are skipped.
     """
     with open(path, "rb") as file:
         header = read_header(file, path)
@@ -91,8 +92,8 @@ def _degree(header: PlyHeader, path: Path) -> int:
 
 
 def _gaussians(rows: np.ndarray, degree: int) -> Gaussians:
-    def columns(names: Sequence[str]) -> torch.Tensor:
-        out = np.empty((len(rows), len(names)), dtype=np.float32)
+    def columns(names: Sequence[str], dtype: type[np.floating] = np.float32) -> torch.Tensor:
+        out = np.empty((len(rows), len(names)), dtype=dtype)
         with np.errstate(over="ignore"):  # doubles beyond float32 become Inf and are reported as such
             for i, name in enumerate(names):
                 out[:, i] = rows[name]
@@ -101,7 +102,7 @@ def _gaussians(rows: np.ndarray, degree: int) -> Gaussians:
     terms = num_sh_terms(degree) - 1
     rest = columns([f"f_rest_{i}" for i in range(3 * terms)]).reshape(len(rows), 3, terms).transpose(1, 2)
     return Gaussians(
-        means=columns(("x", "y", "z")),
+        means=columns(("x", "y", "z"), np.float64),
         quats=unit_rotations(columns(_ROT)),
         log_scales=columns(_SCALE),
         logit_opacities=columns(("opacity",))[:, 0],

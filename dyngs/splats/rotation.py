@@ -56,7 +56,10 @@ def turned(
 
 
 def placed(gaussians: Gaussians, world: np.ndarray) -> Gaussians | None:
-    """Return the Gaussians where an affine matrix (4, 4) puts them, None where that distorts or mirrors them."""
+    """Return the Gaussians where an affine matrix (4, 4) puts them, None where that distorts or mirrors them.
+
+    Their means are float64: the matrix may put them far away.
+    """
     from scipy.spatial.transform import Rotation
 
     linear = world[:3, :3]
@@ -69,7 +72,7 @@ def placed(gaussians: Gaussians, world: np.ndarray) -> Gaussians | None:
         scale = 1.0
     x, y, z, w = Rotation.from_matrix(linear / scale).as_quat(canonical=True).tolist()
     shift = torch.from_numpy(world[:3, 3].copy()) if world[:3, 3].any() else None
-    return turned(gaussians, (w, x, y, z), scale, shift)
+    return turned(gaussians.replace(means=gaussians.means.double()), (w, x, y, z), scale, shift)
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:

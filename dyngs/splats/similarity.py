@@ -16,6 +16,9 @@ from dyngs.splats.rotation import inverse, product, turned
 
 _STRAIGHT = 1e-4  # second singular value of points, over the first, below which they lie on a line
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
+_FAR = 10.0  # distance from the origin over the spread, up to which points are not far away
+_FARTHEST = 1e30  # coordinates beyond this are mistakes
+_COARSE = 0.05  # largest rounding of coordinates to float32, relative to the detail of a scene
 
 
 @dataclass(frozen=True)
@@ -107,3 +110,21 @@ def fitted(points: np.ndarray, wanted: np.ndarray) -> Similarity:
     found = Similarity((w, x, y, z), float((spread * signs).sum() / np.square(here).sum()))
     x, y, z = (middles[1] - found.points(middles[0])).tolist()
     return replace(found, shift=(x, y, z))
+
+
+def far_offset(points: np.ndarray, detail: float) -> np.ndarray:
+    """Return (3,) to be subtracted from points (N, 3) that are too far from the origin for float32; 0 if none are.
+
+    ``detail``: the smallest length that counts, such as the size of a usual Gaussian. All in float64.
+    """
+    points = points[(np.abs(points) < _FARTHEST).all(axis=1)]
+    if not len(points):
+        return np.zeros(3)
+    middle = np.median(points, axis=0)
+    distance = float(np.linalg.norm(middle))
+    spread = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.9))
+    if distance <= _FAR * spread or distance * 2**-24 <= _COARSE * detail:
+        return np.zeros(3)
+    # Multiples of a power of two: subtracting them from float32 and adding them again is exact.
+    step = 2.0 ** np.ceil(np.log2(max(spread, detail, distance * 2**-40)))
+    return step * np.round(middle / step)

@@ -24,7 +24,7 @@ from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.order import morton_order
 from dyngs.splats.packing import codebook, largest_and_others, logit, nearest_entries, palette, with_largest
-from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile
+from dyngs.splats.splat_file import MOST_GAUSSIANS, SplatFile, described, header_comments, stored_comments
 
 _PER_ROW = 64
 _MOST_META_BYTES = 1 << 20
@@ -64,8 +64,13 @@ class _Rest(_Part):
     files: _Two
 
 
+class _Asset(_Part):
+    comments: object = None
+
+
 class _Meta(_Part):
     version: int
+    asset: _Asset = _Asset()
     count: PositiveInt
     antialias: bool = False
     means: _Means
@@ -123,7 +128,7 @@ def sog_parts(splat: SplatFile) -> Iterator[tuple[str, bytes]]:
     sh0 = draw("sh0.webp", np.concatenate([nearest_entries(colours, base), alpha], axis=1))
     meta = {
         "version": 2,
-        "asset": {"generator": "dyngs"},
+        "asset": {"generator": "dyngs", "comments": header_comments(splat)},
         "count": n,
         "antialias": splat.mode is RasterizeMode.ANTIALIASED,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": means},
@@ -191,7 +196,8 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
         logit_opacities=torch.from_numpy(logit(base[:, 3].astype(np.float32) / 255)),
         sh=torch.from_numpy(sh),
     )
-    return SplatFile(gaussians, RasterizeMode.ANTIALIASED if meta.antialias else RasterizeMode.CLASSIC)
+    mode = RasterizeMode.ANTIALIASED if meta.antialias else RasterizeMode.CLASSIC
+    return described(SplatFile(gaussians, mode, comments=stored_comments(meta.asset.comments)), path)
 
 
 def _rest(path: Path, archive: zipfile.ZipFile, rest: _Rest, labels: np.ndarray) -> np.ndarray:

@@ -19,8 +19,8 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.ops.checks import finite_rows
 from dyngs.splats.packing import logit
-from dyngs.splats.rotation import AXES
-from dyngs.splats.similarity import UNMOVED, Similarity, similarity_of
+from dyngs.splats.rotation import AXES, inverse
+from dyngs.splats.similarity import UNMOVED, Similarity, far_offset, similarity_of
 
 Nonfinite = Literal["error", "skip"]
 
@@ -63,11 +63,42 @@ class SplatFile:
     turned: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     edited: Similarity = UNMOVED  # by `dyngs edit`, after ``turned``: its inverse gives the frame of before
     notes: tuple[str, ...] = ()  # a line about each thing that was changed in reading
+    # (3,) float64, added to the means it gives the positions of the file, where those are too far away for float32
+    file_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def frame(self) -> Similarity:
         """From the axes of the capture, less ``world_offset``, to those of the file."""
         return self.edited.after(Similarity(self.turned))
+
+
+def near_origin(splat: SplatFile) -> SplatFile:
+    """Return the contents, whose means may be float64, with float32 means: less an offset where they are far away."""
+    means = splat.gaussians.means.double()
+    sizes = splat.gaussians.log_scales.amax(1)
+    sizes = sizes[sizes.isfinite()]
+    offset = far_offset(means.numpy(), float(sizes.median().exp()) if len(sizes) else 0.0)
+    gaussians = splat.gaussians.replace(means=(means - torch.from_numpy(offset)).float())
+    if not offset.any():
+        return replace(splat, gaussians=gaussians)
+    x, y, z = offset.tolist()
+    note = f"the scene is far from the origin: {x:.12g} {y:.12g} {z:.12g} is subtracted from its positions"
+    near = replace(splat, gaussians=gaussians, file_offset=(x, y, z), notes=(*splat.notes, note))
+    if splat.edited != UNMOVED:
+        return replace(near, edited=Similarity(shift=(-x, -y, -z)).after(splat.edited))
+    x, y, z = (Similarity(inverse(splat.turned)).points(offset) + splat.world_offset).tolist()
+    return replace(near, world_offset=(x, y, z))
+
+
+def offset_notes(splat: SplatFile, remark: str) -> tuple[str, ...]:
+    """Return a line about the offset of a scene that lies far away, in the axes of its file; none of other scenes.
+
+    ``remark`` is about the format.
+    """
+    if splat.edited != UNMOVED or not any(splat.world_offset):
+        return ()
+    offset = " ".join(f"{x:.12g}" for x in splat.frame.points(np.array(splat.world_offset)))
+    return (f"the scene is far from the origin: {offset} is subtracted from its positions ({remark})",)
 
 
 def splat_options(splat: SplatFile) -> RenderOptions:
@@ -194,6 +225,11 @@ def header_comments(splat: SplatFile) -> list[str]:
         notes.append("edited: " + " ".join(repr(float(x)) for x in splat.edited.numbers))
     kept = (c for c in splat.comments if c.isascii() and c.isprintable() and not c.startswith(_OURS))
     return [*notes, *kept]
+
+
+def stored_comments(value: object) -> tuple[str, ...]:
+    """Return the comments that a file of ours holds as a list of JSON; none where ``value`` is anything else."""
+    return tuple(x for x in value if isinstance(x, str)) if isinstance(value, list) else ()
 
 
 def described(splat: SplatFile, path: Path) -> SplatFile:

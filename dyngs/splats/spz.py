@@ -28,7 +28,7 @@ _ANTIALIASED = 1
 _MOST_RATIO = 1032  # largest compression of deflate
 _MOST_BYTES = 1 << 31
 _COLOUR_SCALE = 0.15
-_FRACTION_BITS = 12
+_FRACTION_BITS, _MOST_FRACTION_BITS = 16, 24
 _ROOT_HALF = float(np.sqrt(0.5))
 _TOP = (1 << 9) - 1
 
@@ -67,8 +67,10 @@ def write_spz(path: Path, splat: SplatFile) -> None:
     """
     gaussians = splat.gaussians
     means = gaussians.means.double().numpy()
-    extent = max(float(np.abs(means).max()), 1e-6)
-    fraction_bits = min(_FRACTION_BITS + 4, 22 - int(np.floor(np.log2(extent))))
+    extent = float(np.abs(means).max())
+    octave = int(np.floor(np.log2(max(extent, 2.0**-_MOST_FRACTION_BITS))))
+    # As fine as needed: more bits for scenes smaller than 1, fewer for what would leave 24 bits.
+    fraction_bits = min(22 - octave, max(_FRACTION_BITS, _FRACTION_BITS - octave), _MOST_FRACTION_BITS)
     if fraction_bits < 0:
         raise DyngsError(f"a .spz holds positions up to 8e6, these reach {extent:.2g}")
     fixed = np.clip(np.round(means * (1 << fraction_bits)), -(1 << 23) + 1, (1 << 23) - 1).astype("<i4")
@@ -155,7 +157,7 @@ def _splat(
     path: Path, parts: Mapping[str, np.ndarray], version: int, degree: int, fraction_bits: int, flags: int
 ) -> SplatFile:
     count = len(parts["alphas"])
-    if fraction_bits > 24:
+    if fraction_bits > _MOST_FRACTION_BITS:
         raise DyngsError(
             f"{path}: positions with {fraction_bits} bits after the point do not exist; the file is damaged"
         )

@@ -23,7 +23,7 @@ from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.splats import usd_child
 from dyngs.splats.rotation import joined, placed
-from dyngs.splats.splat_file import SplatFile, from_linear
+from dyngs.splats.splat_file import SplatFile, described, from_linear, header_comments
 
 _SECONDS = 600.0  # of wall time; the child has less of processor time
 _NAMES = ("means", "scales", "opacities", "quats", "sh", "degree", "world")
@@ -56,7 +56,8 @@ def read_usd(path: Path) -> SplatFile:
     if not count:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
     found = [_gaussians(path, {name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
-    return SplatFile(joined(found), up=_UP.get(str(read["up"]), "y"))
+    up = _UP.get(str(read["up"]), "y")
+    return described(SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())), path)
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
@@ -69,6 +70,7 @@ def write_usd(path: Path, splat: SplatFile) -> None:
     axes = {"y": geom.Tokens.y, "z": geom.Tokens.z}
     geom.SetStageUpAxis(stage, axes.get(splat.up or "y", geom.Tokens.y))
     geom.SetStageMetersPerUnit(stage, 1.0)
+    layer.customLayerData = {"dyngs": vt.StringArray(header_comments(splat))}
     prim = vol.ParticleField3DGaussianSplat.Define(stage, "/Gaussians")
     stage.SetDefaultPrim(prim.GetPrim())
     prim.CreatePositionsAttr(vt.Vec3fArray.FromNumpy(gaussians.means.numpy()))

@@ -36,7 +36,9 @@ def main() -> int:
 
 
 def arrays_of(path: Path) -> dict[str, np.ndarray]:
-    """Return the attributes of all prims of Gaussians as ``0.means`` and so on, their ``world`` matrices, and ``up``.
+    """Return the attributes of all prims of Gaussians as ``0.means`` and so on, with their ``world`` matrices.
+
+    And ``up`` and ``comments`` of the stage.
 
     Raises RefusedError: it refers to other files, holds no Gaussians, or is damaged.
     """
@@ -52,6 +54,9 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
         prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == PRIM]
         up = str(geom.GetStageUpAxis(stage))
         found = {"up": np.array(up), "count": np.array(len(prims))}
+        comments = layer.customLayerData.get("dyngs")
+        is_own = isinstance(comments, import_module("pxr.Vt").StringArray)
+        found["comments"] = np.array(list(comments) if is_own else [], dtype=str)
         for i, prim in enumerate(prims):
             found |= {f"{i}.{name}": values for name, values in _attributes(prim, geom).items()}
     except tf.ErrorException as error:

@@ -53,7 +53,7 @@ def look_point(camera: Cameras, center: np.ndarray, extent: float) -> np.ndarray
     """Return the point (3,) on the axis of one camera to orbit around: as far away as ``center`` (3,) is deep."""
     (pose,) = world_from_cam(camera)
     eye, forward = pose[:3, 3], pose[:3, 2]
-    return eye + max(float((center - eye) @ forward), 0.1 * extent, 1e-3) * forward
+    return eye + max(float((center - eye) @ forward), 0.1 * extent) * forward
 
 
 def nearest_camera(

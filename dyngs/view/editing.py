@@ -122,17 +122,20 @@ class Editing:
         """Lines of markdown about the picks, the box and what is left; options of `dyngs edit` that say the same."""
         world, lines = world_of(self.whole), list[str]()
         points = [world.points(point) for point in self.points]
+        size = float(self.size.max())
         for name, point in zip("AB", points, strict=False):
-            lines.append(f"{name}: `{_told(point)}`")
+            lines.append(f"{name}: `{_told(point, size)}`")
         if len(points) == 2:
             length = float(np.linalg.norm(points[1] - points[0]))
             lines.append(f"distance: **{length:.4g} {'m' if self.whole.scaled else 'units'}**")
-            lines.append(f'`--scale "{_told(points[0])} {_told(points[1])} LENGTHm"`')
-        lines.append(f"box: `--crop {_told(self.box.low)} {_told(self.box.high)}`")
+            lines.append(f'`--scale "{_told(points[0], size)} {_told(points[1], size)} LENGTHm"`')
+        lines.append(f"box: `--crop {_told(self.box.low, size)} {_told(self.box.high, size)}`")
         total = counted(len(self.whole.scene), "Gaussian")
         lines.append(f"{len(self.rows):,} of {total} left" if self.steps else total)
         return "\n\n".join(lines)
 
 
-def _told(point: np.ndarray) -> str:
-    return ",".join(f"{x:.4g}" for x in point)
+def _told(point: np.ndarray, size: float) -> str:
+    """Return "x,y,z" with four digits, and as many more as a scene of ``size`` is far away from the origin."""
+    digits = 4 + math.ceil(math.log10(max(float(np.abs(point).max()) / size, 1)))
+    return ",".join(f"{x:.{digits}g}" for x in point)

@@ -93,7 +93,9 @@ class Frusta:
 
 def distinct(poses: np.ndarray) -> list[int]:
     """Return the indices of the first view from each pose of (V, 4, 4), ascending: a fixed camera is shown once."""
-    _, first = np.unique(poses.round(6).reshape(len(poses), -1), axis=0, return_index=True)
+    relative = poses.copy()
+    relative[:, :3, 3] /= np.abs(poses[:, :3, 3]).max(initial=0.0) or 1.0
+    _, first = np.unique(relative.round(6).reshape(len(poses), -1), axis=0, return_index=True)
     return sorted(first.tolist())
 
 

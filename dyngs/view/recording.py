@@ -10,6 +10,7 @@ import numpy as np
 
 from dyngs.camera import Cameras
 from dyngs.camera_paths.keyframes import Keyframes, interpolate_keyframes
+from dyngs.camera_paths.path import world_pose
 from dyngs.splats.similarity import Similarity
 
 
@@ -51,8 +52,7 @@ class Recording:
         width, height = size
         keys: list[dict[str, Any]] = []
         for key, start in zip(self.keyframes, self.starts(), strict=True):
-            pose = key.camera.cam_from_world[0].double().cpu().numpy().copy()
-            pose[:3, 3] -= pose[:3, :3] @ world_offset
+            pose = world_pose(key.camera.cam_from_world[0].double().cpu().numpy(), world_offset)
             focal = float(key.camera.intrinsics[0, 1, 1]) * height / key.camera.height
             entry: dict[str, Any] = {"at": start, "cam_from_world": pose.tolist(), "fl_x": focal}
             keys.append(entry if key.time is None else entry | {"time": key.time})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -257,6 +258,17 @@ def test_other_words_are_no_times(text: str) -> None:
         parse_times(text)
     assert repr(text) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_far_cameras_come_back_to_where_they_were(tmp_path: Path) -> None:
+    cameras, offset = ring_of(6, np.array([0.5, 0.0, 1.0])), np.array([500_123.25, 4_600_321.5, 117.0])
+    ring = CameraPath(replace(cameras, cam_from_world=cameras.cam_from_world.float()))
+    write_path(tmp_path / "p.json", ring, offset)
+    back = read_path(tmp_path / "p.json", offset).cameras
+    torch.testing.assert_close(back.centers, ring.cameras.centers, rtol=0, atol=2e-6)
+    pose = np.array(json.loads((tmp_path / "p.json").read_text())["frames"][0]["cam_from_world"])
+    centre = -np.linalg.inv(pose[:3, :3]) @ pose[:3, 3]
+    np.testing.assert_allclose(centre, offset + ring.cameras.centers[0].double().numpy(), rtol=0, atol=2e-6)
 
 
 def test_no_file_and_no_json(tmp_path: Path) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from moving_scene import row_of_balls, write_moving_run
+from scaled_files import FAR
 from splat_scenes import cameras_turned, cloud, seen
 
 from dyngs.conventions import RasterizeMode
@@ -14,6 +16,7 @@ from dyngs.edit.merge import merged
 from dyngs.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.splats.formats import upright, write_splats
+from dyngs.splats.similarity import Similarity
 from dyngs.splats.splat_file import SplatFile
 
 
@@ -33,6 +36,18 @@ def test_files_and_runs_are_added(tmp_path: Path) -> None:
     as_they_are = merged(first, None, (path,), told.append).gaussians.select(torch.arange(40, 70))
     turned = cameras_turned((0.0, 1.0, 0.0, 0.0))
     torch.testing.assert_close(seen(as_they_are, turned), seen(other.gaussians), rtol=0, atol=5e-5)
+
+
+def test_scenes_far_from_the_origin_lie_as_in_the_world(tmp_path: Path) -> None:
+    """Two files of one survey, less an offset of each, turned for viewers in different ways."""
+    first, other = cloud(20, 0), cloud(30, 0, seed=1)
+    splat = SplatFile(Similarity((0.0, 1.0, 0.0, 0.0)).gaussians(first), world_offset=FAR, turned=(0.0, 1.0, 0.0, 0.0))
+    x, y, z = FAR
+    path = write_splats(tmp_path / "b.ply", SplatFile(other, world_offset=(x + 3, y - 2, z + 1), up="z")).path
+    both = merged(splat, (0.0, -1.0, 0.0), (path,), lambda _: None)
+    world = splat.frame.inverse().points(both.gaussians.means.numpy())
+    np.testing.assert_allclose(world[:20], first.means.numpy(), atol=1e-6)
+    np.testing.assert_allclose(world[20:], other.means.numpy() + np.array([3, -2, 1]), atol=1e-6)
 
 
 def test_other_low_pass_filters_are_told(tmp_path: Path) -> None:

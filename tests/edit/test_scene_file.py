@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import MOVING_ROWS, moved_x, row_of_balls, write_moving_run
+from scaled_files import FAR, write_far_ply
 from splat_scenes import cloud, readable
 
 from dyngs.edit.crop import Box, Sphere
@@ -95,6 +96,17 @@ def test_a_run_with_an_offset_is_meant_in_the_coordinates_of_its_capture(tmp_pat
     edit_scene(run, tmp_path / "a.ply", edits, tell=silent)
     found = read_splats(tmp_path / "a.ply").gaussians.means.norm(dim=1)
     torch.testing.assert_close(found, 2 * row_of_balls().means[2:].norm(dim=1), rtol=0, atol=1e-5)
+
+
+def test_a_file_far_from_the_origin_is_edited_in_its_own_coordinates(tmp_path: Path) -> None:
+    source, whole = tmp_path / "far.ply", cloud(200, 0)
+    positions = write_far_ply(source, whole)
+    corner = np.array(FAR)
+    edits = Edits(region=Box(corner, corner + 100), frame=Frame(origin=FAR, scale=2.0))
+    edit_scene(source, tmp_path / "part.ply", edits, tell=silent)
+    inside = positions[(positions > corner).all(axis=1)] - corner
+    found = read_splats(tmp_path / "part.ply").gaussians.means.double().numpy()
+    np.testing.assert_allclose(found, 2 * inside, rtol=0, atol=1e-5)
 
 
 def test_a_moving_run(tmp_path: Path) -> None:

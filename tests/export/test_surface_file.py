@@ -31,6 +31,21 @@ def test_balls_side_by_side(tmp_path: Path, suffix: str) -> None:
     assert 1.8 < np.ptp(mesh.vertices[:, 0]) < 3.2
 
 
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_mesh_far_from_the_origin_is_the_mesh_moved(tmp_path: Path, suffix: str) -> None:
+    offset, found = (500_123.25, 4_600_321.5, 117.0), []
+    for name, where in (("near", (0.0, 0.0, 0.0)), ("far", offset)):
+        (tmp_path / name).mkdir()
+        run = write_moving_run(tmp_path / name, moves=False, offset=where)
+        out = tmp_path / f"{name}{suffix}"
+        assert main(["export", str(run), "--format", "mesh", "--cells", "32", "--out", str(out)]) == 0
+        found.append(mesh_of(out))
+    near, far = found
+    np.testing.assert_array_equal(far.faces, near.faces)
+    np.testing.assert_allclose(far.vertices - offset, near.vertices, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(far.visual.vertex_colors, near.visual.vertex_colors)
+
+
 def test_a_moving_scene_has_a_mesh_for_each_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, out = write_moving_run(tmp_path), tmp_path / "meshes"
     assert main(["export", str(run), "--format", "mesh", "--cells", "24", "--times", "0:1:2", "--out", str(out)]) == 0

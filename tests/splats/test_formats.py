@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scaled_files import FAR, write_far_ply
 from splat_scenes import cameras_turned, cloud, psnr, readable, seen
 
 from dyngs.conventions import RasterizeMode
 from dyngs.errors import DyngsError
+from dyngs.files.gltf import GlbDocument
 from dyngs.files.limits import VARIABLE
 from dyngs.gaussians import Gaussians
 from dyngs.splats.edit_note import note_path
@@ -31,6 +33,7 @@ from dyngs.splats.formats import (
     upright,
     write_splats,
 )
+from dyngs.splats.gltf import add_gaussians
 from dyngs.splats.similarity import UNMOVED, Similarity
 from dyngs.splats.splat_file import SplatFile, splat_options
 
@@ -206,6 +209,55 @@ def test_the_original_place_is_known_from_a_ply(tmp_path: Path) -> None:
         assert "mine" in back.comments
         again = read_splats(write_splats(path, replace(back, comments=(*back.comments, "caf\xe9", "two\rlines"))).path)
         assert again.comments == back.comments  # nothing twice, nothing that breaks the header
+
+
+@every
+def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path) -> None:
+    """In the axes of the capture in the file, in those of the file for people."""
+    path, turn = tmp_path / f"a{kind.suffixes[0]}", Similarity((0.0, 1.0, 0.0, 0.0))
+    splat = SplatFile(cloud(20, 0), world_offset=FAR, up=kind.up, turned=turn.turn)
+    written = write_splats(path, splat)
+    line = " ".join(f"{x:.12g}" for x in turn.points(np.array(FAR)))
+    end = "the file states it" if kind.holds_comments else f"{kind.name} cannot state it"
+    assert written.notes == (f"the scene is far from the origin: {line} is subtracted from its positions ({end})",)
+    back = read_splats(path)
+    if kind.holds_comments:
+        assert (back.world_offset, back.turned) == (FAR, turn.turn)
+
+
+def test_doubles_far_from_the_origin_show_the_same(tmp_path: Path) -> None:
+    near = cloud(400, 1)
+    positions = write_far_ply(tmp_path / "far.ply", near)
+    back = read_splats(tmp_path / "far.ply")
+    assert back.world_offset == back.file_offset
+    np.testing.assert_allclose(back.gaussians.means.double().numpy() + back.file_offset, positions, rtol=0, atol=1e-6)
+    assert "is subtracted from its positions" in back.notes[0]
+    x, y, z = (np.array(back.file_offset) - FAR).tolist()
+    moved = Similarity(shift=(x, y, z)).gaussians(back.gaussians)
+    assert psnr(seen(moved), seen(near)) > 70
+    again = read_splats(write_splats(tmp_path / "near.ply", back).path)
+    assert (again.world_offset, again.file_offset) == (back.world_offset, (0.0, 0.0, 0.0))
+    torch.testing.assert_close(again.gaussians.means, back.gaussians.means, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("suffix", [".glb", pytest.param(".usda", marks=without_usd)])
+def test_nodes_far_from_the_origin_lose_nothing(suffix: str, tmp_path: Path) -> None:
+    """Of other programs, which say nothing of an offset."""
+    path, near = tmp_path / f"a{suffix}", cloud(100, 0)
+    write_splats(path, SplatFile(near, up="y"))
+    if suffix == ".glb":
+        document = GlbDocument()
+        meshes = [{"primitives": [add_gaussians(document, near)]}]
+        document.json |= {"nodes": [{"mesh": 0, "translation": FAR}], "meshes": meshes}
+        document.write(path)
+    else:
+        head = 'def ParticleField3DGaussianSplat "Gaussians"\n{\n'
+        moved = f"double3 xformOp:translate = {FAR}\n"
+        order = 'uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+        path.write_text(path.read_text().replace(head, head + moved + order))
+    back = read_splats(path)
+    found = back.gaussians.means.double().numpy() + back.world_offset
+    np.testing.assert_allclose(found, near.means.double().numpy() + FAR, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", readable(), ids=str)

@@ -13,7 +13,7 @@ from dyngs.camera import Cameras
 from dyngs.errors import DyngsError
 from dyngs.gaussians.filters import filtered
 from dyngs.gaussians.rendering import RenderOptions, render
-from dyngs.splats.similarity import Similarity, fitted
+from dyngs.splats.similarity import Similarity, far_offset, fitted
 
 _LENGTH = (0.3**2 + 0.7**2 + 0.2**2 + 0.6**2) ** 0.5
 ODD = Similarity((0.3 / _LENGTH, -0.7 / _LENGTH, 0.2 / _LENGTH, 0.6 / _LENGTH), 2.5, (3.0, -1.0, 0.5))
@@ -93,3 +93,20 @@ def test_least_squares_never_mirror() -> None:
 def test_points_that_leave_it_open(points: np.ndarray, wanted: np.ndarray, said: str) -> None:
     with pytest.raises(DyngsError, match=said):
         fitted(points, wanted)
+
+
+def test_points_near_the_origin_keep_their_coordinates() -> None:
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    for factor in (1e-4, 1.0, 1e3):
+        assert not far_offset(factor * (points + np.array([5.0, 0, 0])), 1e-3 * factor).any()
+    assert not far_offset(points + np.array([5000.0, 3000.0, 0.0]), 0.02).any(), "float32 is fine enough"
+    assert not far_offset(np.full((3, 3), np.nan), 1.0).any()
+
+
+@pytest.mark.parametrize("factor", [1e-4, 1.0, 2.0**10])
+def test_points_far_from_the_origin_come_near_it_in_any_unit(factor: float) -> None:
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    far = factor * (points + np.array([5e5, -4.6e6, 100.0]))
+    offset = far_offset(far, 0.02 * factor)
+    assert np.abs(far - offset).max() < 10 * factor
+    np.testing.assert_array_equal((far.astype(np.float32) - offset).astype(np.float32) + offset, far.astype(np.float32))

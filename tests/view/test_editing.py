@@ -73,6 +73,12 @@ def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, [x, 0, 0], atol=0.02)
 
 
+def test_coordinates_far_from_the_origin_are_told_to_a_thousandth_of_the_box(tmp_path: Path) -> None:
+    opened = open_run(write_moving_run(tmp_path, moves=False, offset=(500_000.0, 4_600_000.0, 0.0)))
+    work = editing(opened, (500_000.5, 4_600_000.0, 0.0))
+    assert "box: `--crop 499999.9,4599999.4,-0.6 500001.1,4600000.6,0.6`" in work.said
+
+
 def test_distances_are_in_metres_where_the_scene_has_a_scale(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path, moves=False)
     edit_scene(run, tmp_path / "scaled", Edits(frame=Frame(scale=2.5)), tell=lambda _: None)

@@ -24,7 +24,8 @@ class OrbitCamera {
     const { camFromWorld: m, intrinsics, width, height } = views[this.index];
     const eye = eyeOf(m);
     const forward = [m[8], m[9], m[10]];
-    this.distance = Math.max(dot(plus(target, eye, -1), forward), 0.05 * Math.hypot(...plus(target, eye, -1)), 1e-6);
+    const away = plus(target, eye, -1);
+    this.reach = this.distance = Math.max(dot(away, forward), 0.05 * Math.hypot(...away)) || 1;
     this.target = plus(eye, forward, this.distance);
     this.pitch = Math.asin(Math.min(Math.max(-dot(forward, this.up), -1), 1));
     this.yaw = Math.atan2(-dot(forward, this.north), -dot(forward, this.east));
@@ -55,7 +56,7 @@ class OrbitCamera {
   }
 
   zoom(factor) {
-    this.distance = Math.min(Math.max(this.distance * factor, 1e-6), 1e9);
+    this.distance = Math.min(Math.max(this.distance * factor, 1e-6 * this.reach), 1e6 * this.reach);
   }
 
   // The view into a canvas of `width` x `height`: the image of the capture fits into it.

@@ -115,6 +115,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     if opened.captured is not None and opened.missing is not None:
         up = "" if opened.person is not None else f", {opened.stated_up or 'z'} up"
         notes.append(f"without the capture ({opened.missing}) the page begins with a view from outside{up}")
+    if any(opened.world_offset):
+        offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
+        notes.append(f"the scene is far from the origin: {offset} is subtracted from its positions")
     if opened.person is not None:
         notes += opened.person.left_out
     curves = header.get("curves", {})
@@ -133,7 +136,7 @@ def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists)
         told = add_triangles(opened.renderable, lists)
     else:
         apart = float((views[0].centers[0] - views[0].centers.new_tensor(target)).norm())
-        pixel = max(apart, 1e-6) / float(views[0].intrinsics[0, 1, 1])
+        pixel = (apart or 1.0) / float(views[0].intrinsics[0, 1, 1])
         told = add_scene(opened.scene, lists, TOLERANCE * pixel) | _drawn(opened.scene.options)
     return told | _shown(opened, time, views, target)
 
