@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from scaled_captures import scaled_capture
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -137,7 +138,9 @@ def write_moving_run(
     standing: bool = False,
 ) -> Path:
     """A run with a capture beside it: of five balls the second and fourth go 1 along x over time, if ``moves``."""
-    root = write_timed_capture(folder / "capture", standing=standing)
+    root = write_timed_capture(folder / "at_origin" if any(offset) else folder / "capture", standing=standing)
+    if any(offset):
+        root = scaled_capture(root, folder / "capture", 1.0, offset)
     model = DynamicModel(deform=SLIDING) if moves else StaticModel()
     config = Config(data=DataConfig.model_validate({"root": root}), model=model, train=TrainConfig(steps=7))
     save_config(config, folder / "run" / RESOLVED_NAME)
