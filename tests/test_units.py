@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scaled_captures import scaled_capture
 from tiny_field_people import NETWORKS, SIZES, field_people
 from tiny_fields import busy_config, write_tiny_capture
@@ -19,8 +21,9 @@ from dyngs.cli import main
 from dyngs.config import Config
 from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.evaluate.report import evaluate_run
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
-from dyngs.runs.checkpoint import latest_checkpoint
+from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 
 SHORT = ["train.steps=12", "run.threads=1", "init.num_random=200", "train.initial_downscale=1"]
 PEOPLE = ["train.steps=3", "run.threads=1"]
@@ -143,7 +146,7 @@ def test_python_users_see_the_unit_of_the_files(captures: Path, tmp_path: Path) 
 def test_what_leaves_a_run_is_in_the_unit_of_the_capture(captures: Path, tmp_path: Path) -> None:
     scale = 2.0**-10
     scaled = scaled_capture(captures / "still", tmp_path / "scaled", scale)
-    files, frames, poses = [], [], []
+    files, frames, poses, meshes, edited = [], [], [], [], []
     for name, root, unit in (("one", captures / "still", 1.0), ("other", scaled, scale)):
         run = trained("static", root, tmp_path / name)
         assert main(["export", str(run), "--out", str(tmp_path / f"{name}.ply"), "--up", "keep"]) == 0
@@ -156,11 +159,21 @@ def test_what_leaves_a_run_is_in_the_unit_of_the_capture(captures: Path, tmp_pat
         frames.append({file.name: file.read_bytes() for file in out.glob("*.png")})
         assert main(["export", str(run), "--format", "cameras", "--out", str(tmp_path / f"{name}_cameras.json")]) == 0
         document = json.loads((tmp_path / f"{name}_cameras.json").read_text())
+        mesh = tmp_path / f"{name}_mesh.ply"
+        assert main(["export", str(run), "--format", "mesh", "--cells", "32", "--out", str(mesh)]) == 0
+        meshes.append(trimesh.load(mesh, process=False).vertices / unit)
+        out = tmp_path / f"{name}_twice"
+        assert main(["edit", str(run), "--scale", "2", "--out", str(out)]) == 0
+        assert main(["export", str(out), "--out", str(tmp_path / f"{name}_twice.ply"), "--up", "keep"]) == 0
+        edited.append(dyngs.load(tmp_path / f"{name}_twice.ply").at(0.0).means / unit)
         poses.append(np.array([x["transform_matrix"] for x in document["frames"]])[:, :3, 3] / unit)
     torch.testing.assert_close(files[1].means, scale * files[0].means, rtol=0, atol=0)
     torch.testing.assert_close(files[1].scales, scale * files[0].scales)
     assert frames[0] == frames[1]
     np.testing.assert_array_equal(poses[0], poses[1])
+    np.testing.assert_allclose(meshes[0], meshes[1], rtol=1e-6)
+    torch.testing.assert_close(edited[0], edited[1])
+    torch.testing.assert_close(edited[0].square().sum(1), 4 * files[0].means.square().sum(1), rtol=1e-4, atol=0)
 
 
 def test_run_of_an_earlier_version_is_evaluated_in_its_own_unit(captures: Path, tmp_path: Path) -> None:
@@ -169,14 +182,8 @@ def test_run_of_an_earlier_version_is_evaluated_in_its_own_unit(captures: Path, 
     run = trained("static", scaled, tmp_path / "run")
     assert latest_checkpoint(run).info.world_scale != 1
     before = dyngs.load(run)
-    from dyngs.evaluate.report import evaluate_run
-
     psnr = evaluate_run(run).psnr
     checkpoint = latest_checkpoint(run)
-    from dataclasses import replace
-
-    from dyngs.runs.checkpoint import save_checkpoint
-
     unit = checkpoint.info.world_scale
     gaussians = before.gaussians
     tensors = checkpoint.tensors | {

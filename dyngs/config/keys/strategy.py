@@ -71,7 +71,7 @@ class McmcStrategy(Section):
         default=5e5, ge=0, description="strength of the noise on positions, times their learning rate; 0: none"
     )
     opacity_reg: float = Field(default=0.01, ge=0, description="weight of the mean opacity")
-    scale_reg: float = Field(default=0.01, ge=0, description="weight of the mean scale, world units")
+    scale_reg: float = Field(default=0.01, ge=0, description="weight of the mean scale, scene units")
 
     @property
     def growth_limit(self) -> int:

@@ -122,8 +122,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
         notes += opened.person.left_out
     curves = header.get("curves", {})
     if curves.get("error"):
-        fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {curves['error']:.2g}"
-        notes.append(f"splines are fitted to the motion ({fit} world units)")
+        error = opened.frame.scale * curves["error"]
+        fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {error:.2g} units"
+        notes.append(f"splines are fitted to the motion ({fit})")
     moved = field_scene_of(opened.renderable)
     if moved is not None and bodies_of(moved.field) is not None:
         notes.append("shadows of bodies that turn are left out")
