@@ -27,7 +27,6 @@ from dyngs.evaluate.report import split_views
 from dyngs.evaluate.view_scores import right_half_scores
 from dyngs.files.write import write_image
 from dyngs.gaussians.colour.affine import fitted_affine, recoloured
-from dyngs.gaussians.scene import render_options
 from dyngs.metrics import psnr
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import load_run
@@ -62,7 +61,7 @@ def scores(run: Path) -> list[str]:
     capture = read_capture(config.data)
     images = ImageLoader(split_views(capture, "test"), config.data)
     _, background = evaluation_background(config.data.background, capture.has_alpha)
-    options = render_options(config.model)
+    options = loaded.scene.options
     shown = []
     for image in (images[i] for i in range(len(images))):
         rendering = loaded.scene.render(image.cameras, image.time, options=options, background=background)

@@ -127,7 +127,7 @@ MUTATIONS = (
     ("data/geometry.py", "error > ROTATION_TOLERANCE or determinant <= 0", "error > ROTATION_TOLERANCE", "data/test_geometry.py data/readers/test_blender.py"),
     ("data/geometry.py", "np.diag([1.0, -1.0, -1.0, 1.0])", "np.diag([1.0, 1.0, 1.0, 1.0])", "data/readers/test_blender.py"),
     ("data/scene_space.py", "1 / far + unit[:, 3] * (1 / near - 1 / far)", "1 / near + unit[:, 3] * (1 / near - 1 / far)", "data/test_scene_space.py"),
-    ("data/scene_space.py", "capture.world_offset + offset", "capture.world_offset - offset", "data/test_scene_space.py"),
+    ("data/scene_space.py", "factor * (capture.points.xyz - shift)", "factor * (capture.points.xyz + shift)", "data/test_scene_space.py"),
     ("data/times.py", "max(gaps) < _EVEN * min(gaps)", "max(gaps) >= min(gaps)", "data/test_times.py"),
     ("data/times.py", "len({known.get(view.name) for view in seen} - {None}) == len(seen)", "True", "data/test_times.py"),
     ("data/images/lens.py", "k1, k2, _, _, k3", "k1, k2, k3, _, _", "data/images/test_lens.py"),

@@ -21,18 +21,20 @@ import numpy as np
 import torch
 import trimesh
 
+import dyngs
 from dyngs.api.train import train
 from dyngs.capture.silhouettes import points_in_silhouettes
-from dyngs.config import DataConfig, PointsInit
+from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import PointCloud, Split, Splits, View
 from dyngs.data.geometry import camera_center, inverse_rigid
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
+from dyngs.data.scene_space import cube_half_side
 from dyngs.evaluate.report import split_views
 from dyngs.files.write import write_image
-from dyngs.gaussians.scene import render_options, require_gaussians
+from dyngs.gaussians.scene import require_gaussians
 from dyngs.metrics import psnr
 from dyngs.runs.checkpoint import load_run
 
@@ -107,8 +109,9 @@ def far_points(view: View, centre: np.ndarray, scale: float, kind: str, seed: in
 def with_sky(capture: Path, out: Path, kind: str) -> None:
     """Write a copy of ``capture`` before a sky."""
     shutil.copytree(capture, out)
-    splits = read_capture(DataConfig(root=out)).splits
-    near = points_in_silhouettes(splits["train"], DataConfig(root=out), PointsInit(num_random=5000))
+    splits = dyngs.read_capture(DataConfig(root=out)).splits
+    half_side = cube_half_side("auto", splits["train"], 1.0)
+    near = points_in_silhouettes(splits["train"], DataConfig(root=out), 5000, half_side)
     centres = np.stack([camera_center(view.cam_from_world) for view in splits["train"]])
     centre = centres.mean(0)
     scale = float(np.linalg.norm(centres - centre, axis=1).mean())
@@ -154,8 +157,8 @@ def scores(run: Path, capture: Path) -> str:
     for image, cut in zip(
         _images(config.data, "test"), _images(config.data.model_copy(update={"root": capture}), "test"), strict=True
     ):
-        black, options = torch.zeros(3, device="cpu"), render_options(config.model)
-        shown = loaded.scene.render(image.cameras, None, options=options, background=black).rgb[0]
+        black = torch.zeros(3, device="cpu")
+        shown = loaded.scene.render(image.cameras, None, background=black).rgb[0]
         assert cut.alpha is not None
         is_sky = (cut.alpha < 0.01).float()
         found.append([psnr(shown, image.composite(black), mask) for mask in (None, is_sky, 1 - is_sky)])

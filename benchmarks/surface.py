@@ -61,7 +61,7 @@ def main() -> None:
         opened = open_run(path)
         with tempfile.TemporaryDirectory() as folder:
             surface = write_surface(opened, Path(folder) / "mesh.ply")
-        mesh = trimesh.Trimesh(surface.vertices + opened.world_offset, surface.faces, process=False)
+        mesh = trimesh.Trimesh(opened.world.points(surface.vertices), surface.faces, process=False)
         points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
         near, far, score = scored(np.asarray(points), true_points(opened))
         print(f"| {path} | {len(surface.faces):,} | {near:.2%} | {far:.2%} | {score:.3f} |", flush=True)

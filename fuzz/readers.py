@@ -135,12 +135,12 @@ def read_known_tracks(root: Path) -> object:
     import numpy as np
     from moving_scene import camera, still_scene
 
-    from dyngs.data.capture import View
+    from dyngs.data.capture import Capture, View
     from dyngs.data.tracks import read_true_tracks
     from dyngs.evaluate.tracks import track_scores
 
     views = [View(name, Path(name), np.eye(4), np.eye(3), 8, 8, time=t) for name, t in (("a", 0.0), ("b", 1.0))]
-    tracks = read_true_tracks(root, np.zeros(3))
+    tracks = read_true_tracks(Capture(root, "blender", {}))
     return vars(track_scores(still_scene(), tracks, [(view, camera()) for view in views], views))
 
 
@@ -225,20 +225,18 @@ def read_splats(root: Path) -> object:
 
 def read_a_run(root: Path) -> object:
     """Read a run, and render it at two times."""
-    from dyngs.gaussians.scene import render_options
     from dyngs.runs.checkpoint import load_run, seconds_at
 
     run = load_run(root)
-    return seconds_at(root, 7), run.info, played(run.scene, render_options(run.config.model))
+    return seconds_at(root, 7), run.info, played(run.scene, run.scene.options)
 
 
 def read_a_person(root: Path) -> object:
     """Read an avatar and render it."""
-    from dyngs.gaussians.scene import render_options
     from dyngs.runs.avatar import read_avatar
 
     run = read_avatar(only(root))
-    return run.info, played(run.scene, render_options(run.config.model))
+    return run.info, played(run.scene, run.scene.options)
 
 
 def read_a_preset(root: Path) -> object:

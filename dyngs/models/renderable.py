@@ -36,7 +36,7 @@ def near_plane(extent: float) -> float:
 class DrawOptions:
     """How any scene is drawn."""
 
-    near: float = 0.2  # what is nearer to the camera is not drawn, scene units (3DGS: 0.2)
+    near: float = 0.2  # what is nearer to the camera is not drawn, in the unit of the scene (3DGS: 0.2)
     # none, accumulated (sum of weight times depth) or expected (that, divided by the sum of weights: alpha)
     depth: Literal["none", "accumulated", "expected"] = "none"
 
