@@ -25,12 +25,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.api.load import read_capture
 from dyngs.api.train import train
 from dyngs.config import Config, PointsInit, RandomInit, StaticModel
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import CaptureStyle, DynamicOptions, is_in_image, write_dynamic_capture
 from dyngs.data.synthetic.raytrace import Primitive, Sheet, is_seen
 from dyngs.data.synthetic.raytrace import Scene as TrueScene
@@ -176,7 +176,8 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     model = StaticModel(sh_degree=config.model.sh_degree)
     init, sizes = RandomInit(num_random=100), config.train.model_copy(update={"initial_downscale": 1})
     config = config.model_copy(update={"model": model, "init": init, "train": sizes})
-    trainer, capture = assemble(config), read_capture(config.data)
+    capture = read_capture(config.data)  # in the unit of the files, in which the true motion is
+    trainer = assemble(config, capture)
     points, colours, labels = surface_points(name, capture.splits["train"], seed)
     start = replace(surroundings(capture), points=points, points_rgb=colours)
     generator = torch.Generator().manual_seed(seed)

@@ -61,7 +61,7 @@ MUTATIONS = (
     ("gaussians/mcmc.py", "opacities > self.options.min_opacity", "opacities < self.options.min_opacity", "gaussians/test_mcmc.py"),
     ("gaussians/mcmc.py", "(1 + self.growth) * n", "(2 + self.growth) * n", "gaussians/test_mcmc.py"),
     ("gaussians/mcmc.py", "NOISE_STEEPNESS = 100.0", "NOISE_STEEPNESS = -100.0", "gaussians/test_mcmc.py"),
-    ("gaussians/init.py", "EXTENT_MARGIN = 1.1", "EXTENT_MARGIN = 1.3", "gaussians/test_init.py"),
+    ("data/scene_space.py", "EXTENT_MARGIN = 1.1", "EXTENT_MARGIN = 1.3", "gaussians/test_init.py"),
     ("gaussians/init.py", "order[seen < min(MIN_VIEWS", "order[seen > min(MIN_VIEWS", "gaussians/test_init.py"),
     ("gaussians/schedule.py", "(1 - REWIND) * tuned", "REWIND * tuned", "gaussians/test_schedule.py"),
     ("gaussians/filters.py", "FILTER_VARIANCE = 0.2", "FILTER_VARIANCE = 0.3", "gaussians/test_filters.py"),

@@ -44,6 +44,7 @@ WITHOUT_MIRROR = {
     "test_quality.py": "about training as a whole, on small captures",
     "test_reference.py": "about the reference that the kernels are tested against",
     "test_numerics.py": "the table of docs/numerics.md",
+    "test_units.py": "about every kind of model, and all that leaves a run",
 }
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef

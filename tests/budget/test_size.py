@@ -34,7 +34,7 @@ def config_of(capture: Path, run_dir: Path, budget: BudgetConfig) -> Config:
     return Config(
         data=DataConfig(root=capture),
         model=StaticModel(sh_degree=1),
-        init=RandomInit(num_random=500),
+        init=RandomInit(num_random=500, half_extent=1.3),
         optim=OptimConfig(rate_factor=1),
         train=TrainConfig(steps=12, log_every=4),
         budget=budget,

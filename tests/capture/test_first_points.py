@@ -11,6 +11,7 @@ import pytest
 import torch
 from room_surfaces import distances_to_surface
 
+import dyngs
 from dyngs.capture.first_points import (
     OVERLAPPING,
     TIME_STEPS,
@@ -109,7 +110,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], PointClo
     """A corner that eight cameras see, and points on its surfaces: of random ones, those nearest to them."""
     options = DynamicOptions(size=96, num_times=1, num_cameras=8, num_val=0, num_test=0, samples=1)
     folder = tmp_path_factory.mktemp("room") / "capture"
-    views = list(read_capture(write_dynamic_capture("room", folder, options)).splits["train"])
+    views = list(dyngs.read_capture(write_dynamic_capture("room", folder, options)).splits["train"])
     xyz = RNG.uniform((-1.5, -1.5, 0), (1.5, 1.5, 2), (6000, 3))
     near = np.argsort(distances_to_surface(xyz, views, views[0].time or 0.0))[:400]
     image = ImageLoader(views[:1])[0].rgb_premultiplied.numpy()
@@ -161,7 +162,7 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> DataConfig:
 
 
 def train_views(options: DataConfig) -> list[View]:
-    return list(read_capture(options).splits["train"])
+    return list(dyngs.read_capture(options).splits["train"])  # in the unit of the true surfaces
 
 
 def test_points_lie_on_the_surfaces(furnished: DataConfig) -> None:

@@ -285,7 +285,7 @@ configs = st.builds(
         | st.builds(MlpField, lr=rates, move_scales=st.booleans())
         | st.builds(ControlNodesField, rigidity=rates),
     ),
-    init=st.builds(RandomInit, half_extent=rates),
+    init=st.builds(RandomInit, half_extent=st.just("auto") | st.floats(1e-30, 1e9)),
     strategy=st.builds(McmcStrategy, noise=rates) | st.builds(DefaultStrategy, prune_opacity=fractions),
     optim=st.builds(OptimConfig, lr_means=rates, lr_scales=rates),
     train=st.builds(TrainConfig, steps=st.integers(1, 10**9), ssim_weight=fractions),

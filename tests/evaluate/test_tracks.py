@@ -19,7 +19,6 @@ from dyngs.camera import Cameras
 from dyngs.config import FreeField
 from dyngs.config.io import load_config
 from dyngs.data.capture import View, all_views
-from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.data.synthetic.scenes import SceneName
 from dyngs.data.tracks import TrueTracks, read_true_tracks
@@ -177,7 +176,7 @@ def test_the_true_motion_of_the_benchmark_follows_the_true_tracks(
     opaque = trainer.model.scene.with_gaussians(
         gaussians.replace(logit_opacities=gaussians.logit_opacities.detach() + 5)
     )
-    capture = read_capture(trainer.config.data)
+    capture = trainer.capture
     pairs = list(
         zip(capture.splits["test"], training_cameras(capture.splits["test"], trainer.config.data), strict=True)
     )

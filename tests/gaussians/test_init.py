@@ -88,7 +88,7 @@ def test_points_that_are_not_finite_are_left_out() -> None:
     ("scene", "options", "half"),
     [
         (_with_points(np.ones((9, 3))), RandomInit(num_random=4000, half_extent=2.0), 2.0),
-        (Surroundings(_views(), around_origin=True), PointsInit(num_random=4000), 1.3),
+        (Surroundings(_views(), around_origin=True), PointsInit(num_random=4000), 1.1),
     ],
 )
 def test_random_points_fill_their_cube(scene: Surroundings, options: PointsInit | RandomInit, half: float) -> None:
