@@ -75,6 +75,7 @@ class View:
         video: the video frame that ``image_path`` is decoded from.
         silhouette: mask of the person, which becomes the image's alpha.
         depth_path: depth map, in any unit, see ``images.maps``.
+        depth_scale: scene units in the unit of the files, which that of the depth map may be.
         motion_mask_path: white = moves; if ``motion_mask_labels``, all but 0 does.
         flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
         exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one capture.
@@ -94,6 +95,7 @@ class View:
     video: VideoFrame | None = None
     silhouette: Silhouette | None = None
     depth_path: Path | None = None
+    depth_scale: float = 1.0
     motion_mask_path: Path | None = None
     motion_mask_labels: bool = False
     flow_path: Path | None = None

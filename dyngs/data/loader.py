@@ -422,7 +422,7 @@ class ImageLoader:
             maps["moves"] = area_downscale(moves[..., None], *size)[..., 0]
         if self._with_maps and view.depth_path is not None:
             positions = image_maps.nearest_positions(*size, None if lens_map is None else lens_map.grid)
-            maps["depth"] = _nearest(image_maps.read_depth(view.depth_path), positions)
+            maps["depth"] = view.depth_scale * _nearest(image_maps.read_depth(view.depth_path), positions)
             if lens_map is not None:
                 maps["depth"] *= _nearest(lens_map.valid.float(), image_maps.nearest_positions(*size))
         if self._with_maps and view.flow_path is not None:

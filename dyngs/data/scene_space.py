@@ -162,7 +162,7 @@ def expressed(capture: Capture, scale: float, offset: Sequence[float] | np.ndarr
         center = camera_center(pose) - shift if shift.any() else None
         translation = pose[:3, 3] if center is None else -pose[:3, :3] @ center
         pose[:3, 3] = factor * translation
-        return replace(view, cam_from_world=pose)
+        return replace(view, cam_from_world=pose, depth_scale=factor * view.depth_scale)
 
     points = capture.points and PointCloud(factor * (capture.points.xyz - shift), capture.points.rgb)
     body = capture.body and {name: moved(x, shift, factor) for name, x in capture.body.items()}

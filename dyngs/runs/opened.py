@@ -240,7 +240,9 @@ class Opened(LoadedRun):
             motion = motion.for_joints(len(scene.skeleton.joints))
         is_fit = bool((motion.scale != 1).any())
         if is_fit:
-            motion = replace(motion, trans=motion.trans - motion.trans.new_tensor(self.info.world_offset))
+            trans = motion.trans - motion.trans.new_tensor(self.info.world_offset)
+            unit = self.info.world_scale
+            motion = replace(motion, trans=trans / unit, scale=motion.scale / unit)
         clip = motion_clip(motion)
         if scene.hold is not None:
             clip = replace(clip, past=past_motion(clip, np.arange(len(clip)) / motion.fps))

@@ -15,6 +15,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.files.write import write_image
 
 RADIUS, FOCAL, SIDE, DISTANCE = 0.4, 60.0, 64, 4.0
+HALF_SIDE = 1.3  # of the cube in which points are drawn
 
 
 def _views(folder: Path, alpha: float = 0.0) -> list[View]:
@@ -39,29 +40,28 @@ def _views(folder: Path, alpha: float = 0.0) -> list[View]:
 
 def test_points_lie_in_the_ball_with_its_colour(tmp_path: Path) -> None:
     views = _views(tmp_path)
-    found = points_in_silhouettes(views, DataConfig(root=tmp_path), PointsInit(num_random=10_000))
+    found = points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
     assert found is not None
     # The hull of six views is larger than the ball, up to the corners of the cube around it; a pixel is 1/15.
     assert np.abs(found.xyz).max() < RADIUS * 1.15 + 1 / 15
     assert np.linalg.norm(found.xyz, axis=1).max() < RADIUS * 3**0.5
     assert (found.rgb == (255, 128, 0)).all()
     assert len(found.xyz) >= ENOUGH, "150 of 10,000 in the cube lie in the hull: more were drawn"
-    again = points_in_silhouettes(views, DataConfig(root=tmp_path), PointsInit(num_random=10_000))
+    again = points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
     assert again is not None
     assert np.array_equal(found.xyz, again.xyz)
 
 
 def test_images_without_silhouettes_say_nothing(tmp_path: Path) -> None:
-    assert points_in_silhouettes(_views(tmp_path, alpha=1.0), DataConfig(root=tmp_path), PointsInit()) is None
+    assert points_in_silhouettes(_views(tmp_path, alpha=1.0), DataConfig(root=tmp_path), 500, HALF_SIDE) is None
 
 
 def test_silhouettes_that_hold_nothing_or_most_say_nothing(tmp_path: Path) -> None:
     views, options = _views(tmp_path), DataConfig(root=tmp_path)
-    far = PointsInit(num_random=500, half_extent=1e-3)
-    assert points_in_silhouettes(views, options, far) is None, "the whole cube is inside"
+    assert points_in_silhouettes(views, options, 500, 1e-3) is None, "the whole cube is inside"
     for view in views[:2]:
         write_image(view.image_path, np.zeros((SIDE, SIDE, 4), np.float32))
-    assert points_in_silhouettes(views, options, PointsInit(num_random=500)) is None
+    assert points_in_silhouettes(views, options, 500, HALF_SIDE) is None
 
 
 def test_a_still_blender_scene_begins_in_its_silhouettes(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def test_published_protocols() -> None:
     blender = load_config(packaged_preset("blender"), [ROOT])
     assert blender.train.steps == 30_000
     assert blender.data.background == "white"
-    assert blender.init == RandomInit(num_random=100_000, half_extent=1.3)
+    assert blender.init == RandomInit(num_random=100_000)
     assert (blender.strategy, blender.optim) == (DefaultStrategy(), OptimConfig())
     colmap = load_config(packaged_preset("colmap"), [ROOT])
     assert (colmap.train.steps, colmap.data.test_every, colmap.data.longest_side) == (30_000, 8, 1600)

@@ -88,7 +88,7 @@ def test_nothing_to_turn_leaves_everything_and_moves_with_the_cameras() -> None:
     same = about_pelvis(body, np.array([0.1, -0.2, 0.3]))
     assert np.array_equal(same.poses, body.poses)
     assert np.array_equal(same.trans, body.trans)
-    assert np.array_equal(moved(body, np.array([1e6, -2.0, 3.0])).trans, body.trans - [1e6, -2.0, 3.0])
+    assert np.array_equal(moved(body, np.array([1e6, -2.0, 3.0]), 0.5).trans, 0.5 * (body.trans - [1e6, -2.0, 3.0]))
 
 
 def test_rows_in_any_order_and_shape() -> None:

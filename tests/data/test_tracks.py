@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dyngs.data.capture import View
+from dyngs.data.capture import Capture, View
 from dyngs.data.tracks import TRACKS_FILE, TrueTracks, read_tracks, read_true_tracks, write_true_tracks
 from dyngs.errors import DyngsError
 
@@ -67,13 +67,14 @@ def some_tracks() -> TrueTracks:
     return TrueTracks(points, times, views, np.array([2, 0]), random.random((2, 4)) < 0.5)
 
 
-def test_tracks_are_read_as_written_in_the_recentred_world(tmp_path: Path) -> None:
-    assert read_true_tracks(tmp_path, np.zeros(3)) is None
+def test_tracks_are_read_as_written_in_scene_coordinates(tmp_path: Path) -> None:
+    capture = Capture(tmp_path, "blender", {}, world_scale=0.5, world_offset=np.array([1.0, 2.0, 3.0]))
+    assert read_true_tracks(capture) is None
     tracks = some_tracks()
     write_true_tracks(tmp_path, tracks)
-    found = read_true_tracks(tmp_path, np.array([1.0, 2.0, 3.0]))
+    found = read_true_tracks(capture)
     assert found is not None
-    np.testing.assert_allclose(found.points, tracks.points - [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(found.points, 2 * (tracks.points - [1.0, 2.0, 3.0]))
     for name in ("times", "views", "moments", "visible"):
         np.testing.assert_array_equal(getattr(found, name), getattr(tracks, name))
 
@@ -95,11 +96,11 @@ def test_arrays_that_do_not_fit_together_are_refused(
 ) -> None:
     write_true_tracks(tmp_path, replace(some_tracks(), **changes))
     with pytest.raises(DyngsError, match=message) as refused:
-        read_true_tracks(tmp_path, np.zeros(3))
+        read_true_tracks(Capture(tmp_path, "blender", {}))
     assert "\n" not in str(refused.value)
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / TRACKS_FILE).write_bytes(b"no zip")
     with pytest.raises(DyngsError, match=r"true_tracks\.npz"):
-        read_true_tracks(tmp_path, np.zeros(3))
+        read_true_tracks(Capture(tmp_path, "blender", {}))

@@ -135,7 +135,8 @@ def test_options_are_those_of_training() -> None:
     options = render_options(model)
     assert (options.mode, options.eps2d, options.near) == (RasterizeMode.ANTIALIASED, 0.1, 0.05)
     assert options.depth == "none"
-    assert render_options(StaticModel()) == RenderOptions()
+    assert render_options(StaticModel(), extent=5.0) == RenderOptions(near=0.2)
+    assert render_options(model, extent=5.0, world_scale=0.5).near == 0.1, "a number is in the unit of the capture"
     cut = render_options(StaticModel(alpha_min=0.02, transmittance_min=0.01))
     assert (cut.alpha_min, cut.transmittance_min) == (0.02, 0.01)
 

@@ -25,9 +25,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_capture_is_read_once_and_only_when_it_is_needed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = opened_module.read_capture
+    read = opened_module.read_capture_of
     calls = []
-    monkeypatch.setattr(opened_module, "read_capture", lambda data: calls.append(data) or read(data))
+    monkeypatch.setattr(opened_module, "read_capture_of", lambda *of: calls.append(of) or read(*of))
     opened = open_scene(folder)
     assert opened.background.tolist() == [1, 1, 1]
     assert opened.world_offset.tolist() == [1, 2, 3]

@@ -34,7 +34,7 @@ def facts_of(capture: Capture) -> tuple[tuple[str, str], ...]:
     lenses = Counter(view.lens.model for view in views)
     focal_px = [float(f) for view in views for f in (view.intrinsics[0, 0], view.intrinsics[1, 1])]
     fov_deg = [float(np.degrees(2 * np.arctan2(0.5 * view.width, view.intrinsics[0, 0]))) for view in views]
-    centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3)
+    centers = np.array([camera_center(view.cam_from_world) for view in views]).reshape(-1, 3) * capture.world_scale
     masked = sum(view.mask_path is not None for view in views)
     file = "" if capture.points_file is None else f" ({capture.points_file.name})"
     facts = [

@@ -133,32 +133,32 @@ def write_body(
     found: CapturedMotion,
     body: BodyTemplate,
     betas: np.ndarray,
-    world_offset: np.ndarray,
-    fps: float | None = None,
+    capture: Capture,
 ) -> None:
     """Write the body parameters of a clip, also readable as a motion: rows are named by their frame numbers.
 
-    ``betas`` (B,) are of the shape space of the template ``body``; ``fps`` frames per second, None where nobody knows.
+    They are in the coordinates of the files of ``capture``. ``betas`` (B,) are of the shape space of the template
+    ``body``.
     """
     clip = found.clip
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
             poses=clip.poses.reshape(len(clip), -1).cpu().numpy(),
-            trans=clip.trans.double().cpu().numpy() + world_offset,
+            trans=capture.world_scale * clip.trans.double().cpu().numpy() + capture.world_offset,
             betas=betas.astype(np.float32),
-            scale=clip.scale.cpu().numpy(),
+            scale=capture.world_scale * clip.scale.cpu().numpy(),
             surface_model_type=body.name,
             fitted_to="" if body.name == "anny" else body.fingerprint,
             gender="neutral",
             up_axis="y",
             frames=np.asarray(found.frames, dtype=np.int64),
-            mocap_frame_rate=np.float64(FRAME_RATE if fps is None else fps),
+            mocap_frame_rate=np.float64(FRAME_RATE if capture.fps is None else capture.fps),
         )
 
 
 def write_split(
-    out: Path, split: Split, shown: Iterator[tuple[View, Image, Image]], rows: Mapping[int, int], offset: np.ndarray
+    out: Path, split: Split, shown: Iterator[tuple[View, Image, Image]], rows: Mapping[int, int], capture: Capture
 ) -> None:
     """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha, undistorted.
 
@@ -167,7 +167,7 @@ def write_split(
     Args:
         shown: views with their images, and with these as they are without such masks.
         rows: frame numbers to rows of the body parameters.
-        offset: (3,) added to all positions.
+        capture: that the views are of.
     """
     frames: list[dict[str, object]] = []
     for view, image, photo in shown:
@@ -181,7 +181,7 @@ def write_split(
         camera = image.cameras
         intrinsics = camera.intrinsics[0].double().numpy()
         pose = opengl_from_cam(view.cam_from_world).copy()
-        pose[:3, 3] += offset
+        pose[:3, 3] = capture.world_scale * pose[:3, 3] + capture.world_offset
         entry: dict[str, object] = {"file_path": name, "frame": row, "camera": view.camera_id}
         entry |= {} if view.silhouette is None else {"silhouette_path": mask}
         entry |= {} if view.time is None else {"time": view.time}
@@ -299,11 +299,11 @@ def write_fitted_capture(
                     continue
                 rows, photos = clips.get(split, clips["train"]).rows, [replace(x, silhouette=None) for x in views]
                 shown = zip(views, _in_order(views, full), _in_order(photos, full), strict=True)
-                write_split(folder, split, shown, rows, capture.world_offset)
+                write_split(folder, split, shown, rows, capture)
             clips = {split: replace(clip, frames=tuple(range(len(clip.frames)))) for split, clip in clips.items()}
         for split, clip in clips.items():
             path = folder / f"body_{split}.npz"
-            write_body(path, clip, body, betas.numpy(), capture.world_offset, capture.fps)
+            write_body(path, clip, body, betas.numpy(), capture)
         write_image(folder / OVERLAYS_NAME, _overlays(capture, options, shaped, found))
         said = {"template": name, "betas": [round(beta, 4) for beta in betas.tolist()]}
         said |= _report(found, new_poses, tuple(by_avatar.values()))

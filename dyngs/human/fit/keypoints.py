@@ -257,8 +257,7 @@ def read_joints(path: Path, capture: Capture, body: BodyTemplate) -> Joints3D:
             f"{path}: no joints for any frame of the capture; name them by their numbers or by the names of images "
             f"({first_few(sorted(map(str, found.joints)))} in the file, {views[0].name} in the capture)"
         )
-    offset = capture.world_offset
-    return {frame: _placed_in_3d(found, joints, view, offset) for frame, (joints, view) in frames.items()}
+    return {frame: _placed_in_3d(found, joints, view, capture) for frame, (joints, view) in frames.items()}
 
 
 def _read(path: Path, body: BodyTemplate) -> _Found:
@@ -387,13 +386,13 @@ def _by_frame(path: Path, found: _Found, views: Sequence[View]) -> dict[int, tup
     return frames
 
 
-def _placed_in_3d(found: _Found, joints: np.ndarray, view: View, offset: np.ndarray) -> Tensor:
-    """Return the joints (55, 4) of a frame in the recentred world of the cameras."""
+def _placed_in_3d(found: _Found, joints: np.ndarray, view: View, capture: Capture) -> Tensor:
+    """Return the joints (55, 4) of a frame in the scene coordinates of ``capture``."""
     placed = torch.zeros(len(JOINT_NAMES), 4, device="cpu")
-    positions = joints[:, :3] - offset
+    positions = (joints[:, :3] - capture.world_offset) / capture.world_scale
     if found.space == "camera":
         rotation, shift = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
-        positions = (joints[:, :3] - shift) @ rotation
+        positions = (joints[:, :3] / capture.world_scale - shift) @ rotation
     for row, name in enumerate(ORDERS[found.order]):
         if name in JOINT_NAMES and joints[row, 3] > 0:
             confidence = min(joints[row, 3], 1.0) * (1.0 if name in JOINTS else INNER)

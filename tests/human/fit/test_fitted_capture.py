@@ -206,7 +206,7 @@ def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
     images, photos = ImageLoader(views), ImageLoader([replace(view, silhouette=None) for view in views])
     shown = ((view, images[i], photos[i]) for i, view in enumerate(views))
     rows = {view.frame: row for row, view in enumerate(views) if view.frame is not None}
-    write_split(tmp_path / "out", "train", shown, rows, np.zeros(3))
+    write_split(tmp_path / "out", "train", shown, rows, capture)
     found, _ = read_views(read_frame_file(tmp_path / "out/transforms_train.json"))
     assert len(found) == len(views)
     for i, view in enumerate(found.values()):
@@ -254,6 +254,8 @@ def test_a_fit_far_from_the_origin_is_written_exactly(data: DataConfig, tmp_path
     assert capture.body is not None
     clip = captured_motion(data.root, capture.body["train"], capture.splits["train"], body.joints)
     offset = np.array([500_000.0, 4_600_000.0, 120.0])
-    write_body(tmp_path / "body.npz", clip, body, np.zeros(10), offset)
-    near = moved(read_body_file(tmp_path / "body.npz"), offset)
+    far = capture.replace(world_offset=offset, world_scale=0.25)
+    write_body(tmp_path / "body.npz", clip, body, np.zeros(10), far)
+    near = moved(read_body_file(tmp_path / "body.npz"), offset, 4.0)
     np.testing.assert_allclose(near.trans, clip.clip.trans.numpy(), rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(near.scale, clip.clip.scale.numpy())
