@@ -227,7 +227,7 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
 
 def test_doubles_far_from_the_origin_show_the_same(tmp_path: Path) -> None:
     near = cloud(400, 1)
-    positions = write_far_ply(tmp_path / "far.ply", near)
+    positions = write_far_ply(tmp_path / "far.ply", SplatFile(near))
     back = read_splats(tmp_path / "far.ply")
     assert back.world_offset == back.file_offset
     np.testing.assert_allclose(back.gaussians.means.double().numpy() + back.file_offset, positions, rtol=0, atol=1e-6)
