@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from scaled_captures import scaled_capture
 from torch import Tensor
 
 from dyngs.camera import Cameras
@@ -114,13 +115,8 @@ def camera(width: int = 20, height: int = 14) -> Cameras:
     return Cameras(pose[None], intrinsics[None], width, height)
 
 
-def write_timed_capture(
-    root: Path, *, standing: bool = False, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> Path:
-    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``, moved by ``offset``.
-
-    ``standing``: all test images from one pose.
-    """
+def write_timed_capture(root: Path, *, standing: bool = False) -> Path:
+    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test images from one pose."""
     options = StillOptions(size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1)
     write_still_capture(root, options)
     for split, times in (("train", TRAIN_TIMES), ("test", TEST_TIMES)):
@@ -129,11 +125,7 @@ def write_timed_capture(
         for frame, time in zip(document["frames"], times, strict=True):
             frame["time"] = time
             if standing and split == "test":
-                first = document["frames"][0]["transform_matrix"]
-                frame["transform_matrix"] = [list(row) for row in first]
-        for frame in document["frames"]:
-            for row, shift in zip(frame["transform_matrix"], offset, strict=False):
-                row[3] += shift
+                frame["transform_matrix"] = document["frames"][0]["transform_matrix"]
         file.write_text(json.dumps(document))
     return root
 
@@ -146,7 +138,9 @@ def write_moving_run(
     standing: bool = False,
 ) -> Path:
     """A run with a capture beside it: of five balls the second and fourth go 1 along x over time, if ``moves``."""
-    root = write_timed_capture(folder / "capture", standing=standing, offset=offset)
+    root = write_timed_capture(folder / "at_origin" if any(offset) else folder / "capture", standing=standing)
+    if any(offset):
+        root = scaled_capture(root, folder / "capture", 1.0, offset)
     model = DynamicModel(deform=SLIDING) if moves else StaticModel()
     config = Config(data=DataConfig.model_validate({"root": root}), model=model, train=TrainConfig(steps=7))
     save_config(config, folder / "run" / RESOLVED_NAME)

@@ -34,7 +34,7 @@ from dyngs.splats.formats import (
 )
 from dyngs.splats.rotation import axis_of
 from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.splat_file import SplatFile, splat_options
+from dyngs.splats.splat_file import SplatFile, drawing_options
 from dyngs.static.scene import StaticScene
 
 Tell = Callable[[str], None]
@@ -153,7 +153,7 @@ def write_part(opened: Opened, rows: torch.Tensor, out: Path, time: float | None
 def _opened(source: Path, data_root: Path | None) -> _Source:
     if source.is_file() and known_format(source) is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
-        opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), source)
+        opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), source)
         info = replace(opened.info, world_offset=splat.file_offset)
         return _Source(replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, format_of(source).up)
     return _Source(open_scene(source, data_root=data_root))

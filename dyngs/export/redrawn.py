@@ -18,12 +18,11 @@ from dyngs.metrics import psnr
 from dyngs.runs.opened import Opened
 from dyngs.splats.formats import Written, read_splats
 from dyngs.splats.rotation import AXES
-from dyngs.splats.splat_file import SplatFile, splat_options
+from dyngs.splats.splat_file import SplatFile, drawing_options, splat_options
 
 VIEWS = 4
 _LONGEST_SIDE = 240
 _LEAST_FRACTION = 0.002  # cameras that see the scene in fewer pixels than this are replaced by an orbit
-_NEAR = 0.05  # near plane of an orbit over its distance, where the default would be too far for a small scene
 FAINT = 30.0  # dB, below which a line about the difference is a warning
 
 
@@ -70,9 +69,7 @@ def compare_splats(splat: SplatFile, written: Written) -> Redrawn:
     Raises DyngsError: the file cannot be read.
     """
     cameras, moved = around(splat), written.splat.frame.after(splat.frame.inverse())
-    distance = float((cameras.centers[0] - splat.gaussians.means.mean(0)).norm())
-    options = splat_options(splat)
-    options = replace(options, near=min(options.near, _NEAR * distance))
+    options = drawing_options(splat)
     with torch.no_grad():
         wanted = render(splat.gaussians, cameras, options, background=_black(splat.gaussians.means)).rgb
     return compare(wanted, moved.cameras(cameras), read_splats(written.path), options.near * moved.scale)

@@ -21,8 +21,10 @@ T = TypeVar("T")
 Images = TypeVar("Images", bound="Rendering")
 
 
-NEAR_FRACTION = 0.04
-"""Distance of the near plane, in extents of the scene. 3DGS: 0.2 units, where scenes have an extent of about 5."""
+NEAR_FRACTION = 0.01
+"""Distance of the near plane, in extents of the scene, as in gsplat; 3DGS has 0.2 units, 0.04 extents of its scenes.
+Long walks show things at 0.02 extents. Held-out PSNR does not tell 0.01 from 0.04 (cup 29.6 and 29.1 dB, fox 32.2 and
+32.0, lego 32.6 and 32.6; two seeds of the cup differ by 0.5)."""
 
 
 def near_plane(extent: float) -> float:

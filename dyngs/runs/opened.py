@@ -33,7 +33,7 @@ from dyngs.runs.frame import RunFrame, read_frame
 from dyngs.splats.formats import all_suffixes, known_format, read_splats
 from dyngs.splats.rotation import AXES, inverse
 from dyngs.splats.similarity import UNMOVED, Similarity
-from dyngs.splats.splat_file import Nonfinite, splat_options
+from dyngs.splats.splat_file import Nonfinite, drawing_options
 from dyngs.static.scene import StaticScene
 
 FRAME_RATE = 30.0
@@ -324,7 +324,7 @@ def open_scene(path: Path, *, nonfinite: Nonfinite = "error", data_root: Path | 
         other = command_for(path)
         raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
     splat = read_splats(path, nonfinite=nonfinite)
-    opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=splat_options(splat)), path)
+    opened = opened_scene(StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), path)
     scaled = splat.edited.scale != 1
     opened = replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
     if splat.edited != UNMOVED:  # then its own frame is the one that people mean

@@ -17,6 +17,7 @@ from dyngs.errors import DyngsError
 from dyngs.files.limits import require_at_most
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
+from dyngs.models.renderable import near_plane
 from dyngs.ops.checks import finite_rows
 from dyngs.splats.packing import logit
 from dyngs.splats.rotation import AXES, inverse
@@ -105,6 +106,15 @@ def splat_options(splat: SplatFile) -> RenderOptions:
     """Return the render options stated in a splat file: its mode, and its low-pass filter if any."""
     options = RenderOptions(mode=splat.mode)
     return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
+
+
+def drawing_options(splat: SplatFile) -> RenderOptions:
+    """Return ``splat_options`` with a near plane that suits the size of the scene."""
+    means = splat.gaussians.means.double().numpy()
+    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    # Of a scene that cameras surround, about their extent.
+    extent = 2 * float(np.quantile(distances, 0.9))
+    return replace(splat_options(splat), near=near_plane(extent)) if extent else splat_options(splat)
 
 
 def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:

@@ -186,8 +186,7 @@ def test_the_cameras_know(run: Opened) -> None:
 
 
 def test_without_a_capture_nothing_is_turned(run: Opened) -> None:
-    lost_data = run.config.data.model_copy(update={"root": Path("no")})
-    lost = replace(run, captured=Captured(lost_data, run.info))
+    lost = replace(run, captured=Captured(run.config.data.model_copy(update={"root": Path("no")}), run.info))
     assert up_of(lost) is None
     how, line = writing_of(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
