@@ -30,9 +30,9 @@ def write_scaled(path: Path, source: Path, factor: float) -> Path:
     return write_splats(path, SplatFile(scaled(splat.gaussians, factor), splat.mode, splat.eps2d, up=splat.up)).path
 
 
-def write_far_ply(path: Path, gaussians: Gaussians, offset: Sequence[float] = FAR) -> np.ndarray:
+def write_far_ply(path: Path, splat: SplatFile, offset: Sequence[float] = FAR) -> np.ndarray:
     """Write a .ply with doubles, ``offset`` (3,) from where the Gaussians are; return its positions (N, 3)."""
-    write_ply(path, SplatFile(gaussians))
+    write_ply(path, splat)
     with path.open("rb") as file:
         header = read_header(file, path)
         rows = header.read_element(file, path)

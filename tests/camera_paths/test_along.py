@@ -35,6 +35,15 @@ def test_a_shaken_walk_becomes_smooth() -> None:
     assert steps.max() < 2.5 * steps.mean(), "at even speed"
 
 
+@pytest.mark.parametrize("factor", [1e-9, 1e-4, 1e3])
+def test_a_path_is_the_same_in_any_unit(factor: float) -> None:
+    poses = _walk(40, shake=0.05)[np.random.default_rng(2).permutation(40)]
+    scaled = poses.copy()
+    scaled[:, :3, 3] *= factor
+    wanted, found = (path_along(cameras_at(x), 30).cameras for x in (poses, scaled))
+    np.testing.assert_allclose(found.centers.numpy() / factor, wanted.centers.numpy(), rtol=0, atol=1e-4)
+
+
 def test_photos_in_any_order_become_a_walk() -> None:
     poses = _walk(40)
     mixed = np.random.default_rng(2).permutation(40)

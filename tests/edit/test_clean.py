@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scaled_files import FACTORS, scaled
 from splat_scenes import cloud
 
 from dyngs.api.train import train
@@ -52,6 +53,12 @@ def test_files_without_cameras() -> None:
     assert "3 of 204 Gaussians go; without the cameras of a run" in told[-1]
     with pytest.raises(DyngsError, match="nothing would be left"):
         cleaned_file(spoiled().select(torch.tensor([200, 202])), told.append)
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_the_same_goes_in_any_unit(factor: float) -> None:
+    wanted = cleaned_file(spoiled(), lambda _: None)
+    assert torch.equal(cleaned_file(scaled(spoiled(), factor), lambda _: None), wanted)
 
 
 def test_what_contributes_least_goes_first() -> None:

@@ -100,7 +100,7 @@ def test_a_run_with_an_offset_is_meant_in_the_coordinates_of_its_capture(tmp_pat
 
 def test_a_file_far_from_the_origin_is_edited_in_its_own_coordinates(tmp_path: Path) -> None:
     source, whole = tmp_path / "far.ply", cloud(200, 0)
-    positions = write_far_ply(source, whole)
+    positions = write_far_ply(source, SplatFile(whole))
     corner = np.array(FAR)
     edits = Edits(region=Box(corner, corner + 100), frame=Frame(origin=FAR, scale=2.0))
     edit_scene(source, tmp_path / "part.ply", edits, tell=silent)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import TEST_TIMES, TRAIN_TIMES, write_moving_run
+from scaled_files import FACTORS, write_scaled
 
 from dyngs.api.train import train
 from dyngs.camera_paths.path import CameraPath, write_path
@@ -24,6 +26,7 @@ from dyngs.kinds import assemble
 from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
 from dyngs.splats.formats import write_splats
 from dyngs.splats.splat_file import SplatFile
+from dyngs.static.scene import StaticScene
 
 MODEL = HumanModel(resolution=24, sh_degree=0, fit=False)
 TRAIN = TrainConfig(steps=1)
@@ -163,6 +166,27 @@ def test_a_bare_file_is_in_view_and_upright(path: str, up: str, tmp_path: Path) 
     assert torch.equal(opened.background, torch.zeros(3))
     assert (choose_path(opened, PathOptions(path)).times, opened.notes) == (None, ())
     assert opened.scene.is_static
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Path) -> None:
+    source = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians(), up="z")).path
+    frames, centers = [], []
+    for file, unit in ((source, 1.0), (write_scaled(tmp_path / "b.ply", source, factor), factor)):
+        opened = open_scene(file)
+        cameras = choose_path(opened, PathOptions("orbit", num_frames=3, size=(80, 60))).cameras
+        options = replace(opened.renderable.options, near=0.1 * unit)
+        frames.append(opened.renderable.render(cameras, options=options).rgb)
+        centers.append(cameras.centers / unit)
+    torch.testing.assert_close(centers[1], centers[0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(frames[1], frames[0], rtol=0, atol=2e-3)
+
+
+def test_a_single_gaussian_is_in_view_whole() -> None:
+    one = opened_scene(StaticScene(gaussians=some_gaussians(1)))
+    size = math.exp(-3)
+    distance = float((orbit_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
+    assert size < distance < 10 * size
 
 
 def test_an_unknown_path_is_named(tmp_path: Path) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from scaled_files import scaled
 from seen_ball import HIGH, LOW, RADIUS, views
 from torch import Tensor
 
@@ -18,6 +20,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.fusion import Mesh, fused
 from dyngs.gaussians.surface import largest_pieces, num_holes, opaque_box, surface_of
 from dyngs.models.surface import Surface
+from dyngs.splats.similarity import Similarity
 from dyngs.static.scene import StaticScene
 
 COUNT = 3000
@@ -64,6 +67,20 @@ def test_a_ball_of_gaussians_has_the_surface_of_a_ball() -> None:
     sides = surface().vertices[:, 0]
     assert surface().colours[sides > 0.1, 0].min() > 0.7
     assert surface().colours[sides < -0.1, 2].min() > 0.7
+
+
+@pytest.mark.parametrize("factor", [2.0**-20, 2.0**-13, 2.0**10])
+def test_the_surface_is_the_same_in_any_unit(factor: float) -> None:
+    """But for the rounding of the logarithms of sizes."""
+    whole = ball()
+    options = replace(whole.options, near=factor * whole.options.near)
+    scene = replace(whole, gaussians=scaled(whole.gaussians, factor), options=options)
+    moved = [Similarity(scale=factor).cameras(one) for one in cameras()]
+    found = surface_of(scene, moved, (factor * LOW, factor * HIGH), cells=30)
+    np.testing.assert_array_equal(found.faces, surface().faces)
+    np.testing.assert_allclose(found.vertices / factor, surface().vertices, rtol=0, atol=1e-3)
+    box, own = opaque_box(scene.gaussians), opaque_box(whole.gaussians)
+    torch.testing.assert_close(torch.stack(box) / factor, torch.stack(own))
 
 
 def test_what_hardly_shows_has_no_surface() -> None:

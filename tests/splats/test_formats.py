@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scaled_files import FAR, write_far_ply
+from scaled_files import FAR, scaled, write_far_ply
 from splat_scenes import cameras_turned, cloud, psnr, readable, seen
 
 from dyngs.conventions import RasterizeMode
@@ -227,7 +227,7 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
 
 def test_doubles_far_from_the_origin_show_the_same(tmp_path: Path) -> None:
     near = cloud(400, 1)
-    positions = write_far_ply(tmp_path / "far.ply", near)
+    positions = write_far_ply(tmp_path / "far.ply", SplatFile(near))
     back = read_splats(tmp_path / "far.ply")
     assert back.world_offset == back.file_offset
     np.testing.assert_allclose(back.gaussians.means.double().numpy() + back.file_offset, positions, rtol=0, atol=1e-6)
@@ -293,6 +293,29 @@ def test_large_scenes_keep_their_place_in_spz(tmp_path: Path) -> None:
     torch.testing.assert_close(back.gaussians.means, far.means, rtol=0, atol=0.1)
     with pytest.raises(DyngsError, match=r"a\.spz: not written: a \.spz holds positions up to 8e6"):
         write_splats(tmp_path / "a.spz", SplatFile(scene.replace(means=scene.means * 1e8)))
+
+
+def test_spz_holds_small_scenes_and_says_where_it_does_not(tmp_path: Path) -> None:
+    """Its steps are absolute: sizes from 4.5e-5 to 380."""
+    scene = cloud(400)
+    shown = {}
+    for factor in (1e-3, 1e-4):
+        written = write_splats(tmp_path / "a.spz", SplatFile(scaled(scene, factor)))
+        back = read_splats(written.path)
+        shown[factor] = psnr(seen(scaled(back.gaussians, 1 / factor)), seen(scene))
+        assert bool(written.notes) is (factor == 1e-4)
+    assert shown[1e-3] > LEAST_PSNR["spz"]
+    assert written.notes[0].startswith("spz holds sizes from 4.5e-05 to 3.8e+02, those of ")
+
+
+@every
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_files_hold_scenes_of_any_unit(kind: Format, factor: float, tmp_path: Path) -> None:
+    scene = cloud(degree=min(1, kind.max_degree))
+    written = write_splats(file_of(kind, tmp_path), SplatFile(scaled(scene, factor)))
+    back = scaled(read_splats(written.path).gaussians, 1 / factor)
+    least = LEAST_PSNR[kind.name] if kind.name != "spz" or factor < 1 else 30
+    assert psnr(seen(back), seen(scene)) > min(least, 90)
 
 
 def test_quaternions_need_not_be_of_unit_length(tmp_path: Path) -> None:

@@ -33,6 +33,8 @@ def test_a_window_shows_the_whole_image(aspect: float) -> None:
 
 def test_the_point_to_orbit_lies_on_the_axis_as_deep_as_the_scene() -> None:
     assert look_point(looking((0, -4, 0)), np.array([1.0, 0, 1]), 1.0) == pytest.approx([0, 0, 0], abs=1e-6)
+    small = look_point(looking((0, -4e-5, 0)), np.array([1e-5, 0, 1e-5]), 1e-5)
+    assert small == pytest.approx([0, 0, 0], abs=1e-10)
     behind = look_point(looking((0, -4, 0)), np.array([0.0, -9, 0]), 2.0)
     assert behind == pytest.approx([0, -3.8, 0], abs=1e-6)
 

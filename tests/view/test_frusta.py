@@ -11,7 +11,10 @@ def test_a_fixed_camera_is_shown_once() -> None:
     poses = np.tile(np.eye(4), (6, 1, 1))
     poses[[1, 3], 0, 3] = 1.0
     poses[5, 2, 3] = 2.0
-    assert distinct(poses) == [0, 1, 5]
+    for unit in (1.0, 1e-4, 1e-9, 1e3):
+        relative = poses.copy()
+        relative[:, :3, 3] *= unit
+        assert distinct(relative) == [0, 1, 5]
 
 
 def test_frusta_are_as_small_as_the_cameras_stand_close() -> None:

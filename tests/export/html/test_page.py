@@ -15,6 +15,7 @@ import torch
 from browser import Browser, Page, needs_browser
 from moving_scene import camera, still_scene, write_moving_run
 from numpy.typing import NDArray
+from scaled_files import FACTORS, scaled
 from scene_kinds import KINDS, onlooker, scene_of_kind
 from scene_pages import from_afar, large, levels_of_a_cloud, served, shown, sliding_scene, wait_for_line, write
 from small_triangles import bent
@@ -280,6 +281,20 @@ def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Opened, tmp_path: 
     assert "<title>run</title>" in text
     written = write_page(replace(moving_run, stated_up="-y"), tmp_path / "a.html")
     assert written.header["up"] == [0.0, -1.0, 0.0]
+
+
+@pytest.mark.parametrize("factor", [1e-7, *FACTORS])
+def test_a_page_begins_with_the_same_view_in_any_unit(factor: float, tmp_path: Path) -> None:
+    headers = []
+    for unit in (1.0, factor):
+        opened = opened_scene(StaticScene(gaussians=scaled(still_scene().gaussians, unit)))
+        headers.append(write_page(opened, tmp_path / "a.html").header)
+    wanted, found = headers
+    np.testing.assert_allclose(np.array(found["target"]) / factor, wanted["target"], atol=1e-5)
+    for a, b in zip(found["views"], wanted["views"], strict=True):
+        pose = np.array(a["camFromWorld"]).reshape(4, 4)
+        pose[:3, 3] /= factor
+        np.testing.assert_allclose(pose, np.array(b["camFromWorld"]).reshape(4, 4), atol=1e-4)
 
 
 def test_without_the_capture_a_page_begins_outside(tmp_path: Path) -> None:
