@@ -66,7 +66,7 @@ from dyngs.runs.inputs import inputs_of
 from dyngs.runs.lock import Held, writing
 from dyngs.runs.log import RunLog
 from dyngs.runs.progress import Progress
-from dyngs.training.clock import Stopwatch
+from dyngs.training.clock import SaveTimer, Stopwatch
 from dyngs.training.events import Evaluated, Event, Listener, Saved, StepDone
 from dyngs.training.extend import told, with_length
 from dyngs.training.limits import require_possible, shared
@@ -164,9 +164,11 @@ def train(
         config, choices, capture = _chosen(config, begins=resumed is None)
         run = _Run(config, folder, resumed, asked, capture=capture, held=held, processes=processes, threads=threads)
         write_choices(run.folder, choices)
-        run.run(listeners)
+        lines = run.run(listeners)
         folder = run.folder
         note_asked(folder, asked)
+        for line in lines:
+            print(line, flush=True)
     return folder
 
 
@@ -223,6 +225,7 @@ class _Run:
             watch.pause(-seconds_at(folder, resumed.info.step))
         self.limited = LimitedRun(folder, config, self.loop, trainer) if isinstance(trainer, Trainer) else None
         self._config, self._saved = config, self.loop.trainer.done
+        self._save_timer = SaveTimer(config.train.save_minutes, watch.seconds)
         self._gaussians = self.limited if config.model.made_of_gaussians else None
         if self._gaussians is not None:
             _tell_memory(self._gaussians.trainer, processes.local_size)
@@ -239,8 +242,8 @@ class _Run:
         """The configuration as saved; limits may change the number of steps."""
         return self._config if self.limited is None else self.limited.config
 
-    def run(self, listeners: Sequence[Listener]) -> None:
-        """Step until the end, or until interrupted, and keep the limits."""
+    def run(self, listeners: Sequence[Listener]) -> list[str]:
+        """Step until the end, or until interrupted, and keep the limits; return a line for each limit."""
         options, loop, done = self.config.train, self.loop, self.loop.trainer.done
         with (
             RunLog(self.folder, done, every=options.log_every, tensorboard=options.tensorboard) as log,
@@ -268,8 +271,7 @@ class _Run:
                 raise KeyboardInterrupt(
                     f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {as_word(self.folder)}"
                 )
-        for line in self._reached():
-            print(line, flush=True)
+        return list(self._reached())
 
     def _set_limits(self, run: LimitedRun, resumed: Checkpoint | None) -> None:
         budget, speed = run.config.budget, None
@@ -310,12 +312,14 @@ class _Run:
                 options, step = self.config.train, event.step
                 evaluates = options.eval_every > 0 and step % options.eval_every == 0
                 is_last = step == options.steps or event.is_last
-                if evaluates or is_last or (options.save_every > 0 and step % options.save_every == 0):
+                is_due = options.save_every > 0 and step % options.save_every == 0
+                if evaluates or is_last or is_due or self._save_timer.is_due(event.seconds):
                     self._save()
                 if evaluates and event.loop.trainer.has_test_views:
                     self._evaluate(step)
 
     def _save(self) -> None:
+        begin = self.loop.watch.seconds
         checkpoint = self.loop.trainer.checkpoint()
         for part, limit in self.limits.items():
             kept = {f"{part}.{name}": x for name, x in limit.state().items()}
@@ -332,6 +336,7 @@ class _Run:
                 f"{self.folder}; go on with `{again}`"
             )
         self._saved = self.loop.trainer.done
+        self._save_timer.saved(begin, self.loop.watch.seconds)
         self.loop.tell(Saved(self._saved, path))
 
     def _follow(self, folder: Path) -> None:
